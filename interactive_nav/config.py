@@ -1,0 +1,92 @@
+"""The environment's settings: one frozen dataclass, checked on construction."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+BACKENDS = ("auto", "warp", "jax", "native")
+OBSERVATIONS = ("goal", "velocity", "waypoints")
+COLLISIONS = ("boxes", "hulls")
+
+
+@dataclasses.dataclass(frozen=True)
+class NavConfig:
+    """Settings of an interactive navigation environment (defaults: reference benchmark, section 11)."""
+
+    backend: str = "auto"
+    """Physics: warp (MJX-Warp, NVIDIA), jax (MJX-JAX), native (C MuJoCo on CPU threads), or auto."""
+    num_objects: int = 10
+    """Small objects strewn about at random each episode."""
+    observations: tuple[str, ...] = OBSERVATIONS
+    """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity."""
+    k_int: float = 0.1
+    """Interaction penalty per control step in which the robot touches a movable object."""
+    success_reward: float = 10.0
+    """Reward of reaching the goal."""
+    episode_steps: int = 1000
+    """Control steps before an episode is cut."""
+    control_dt_s: float = 0.1
+    """Control period."""
+    sim_dt_s: float = 0.02
+    """Physics timestep; must divide the control period."""
+    collision: str = "boxes"
+    """Furniture collides as boxes (any backend, any mix of scenes) or hulls (native, one scene)."""
+    success_distance_m: float | None = None
+    """Planar distance to the goal that counts as success; none: the robot's body width."""
+    min_goal_distance_m: float = 1.0
+    """Least planar distance between start and goal."""
+    max_goal_distance_m: float = math.inf
+    """Largest geodesic distance between start and goal; infinite: any."""
+    num_waypoints: int = 10
+    """Waypoints along the shortest path in the observation."""
+    waypoint_spacing_m: float = 0.2
+    """Arc length between waypoints."""
+    nav_cell_m: float = 0.1
+    """Cell side of the navigation grid."""
+    max_goals: int = 1024
+    """Goal cells per scene: a uniform draw of the free cells, so that tables stay small."""
+    solver_iterations: int = 10
+    """Newton iterations of the constraint solver per physics step."""
+    contacts_per_env: int = 0
+    """MJX-Warp contact slots per env; 0: measured when the environment is built, with head room."""
+    constraints_per_env: int = 0
+    """MJX-Warp constraint rows per env; 0: measured likewise."""
+    sleep: bool = True
+    """Native backend: objects at rest sleep until touched."""
+    threads: int = 0
+    """Native backend: threads; 0: all cores."""
+
+    def __post_init__(self) -> None:
+        def refuse(field: str, expected: str) -> None:
+            raise ValueError(f"{field} is {getattr(self, field)!r}, expected {expected}")
+
+        object.__setattr__(self, "observations", tuple(self.observations))
+        if self.backend not in BACKENDS:
+            refuse("backend", f"one of {', '.join(BACKENDS)}")
+        if self.collision not in COLLISIONS:
+            refuse("collision", f"one of {', '.join(COLLISIONS)}")
+        unknown = [o for o in self.observations if o not in OBSERVATIONS]
+        if unknown or not self.observations or len(set(self.observations)) != len(self.observations):
+            refuse("observations", f"a choice from {', '.join(OBSERVATIONS)}")
+        for field in ("episode_steps", "num_waypoints", "max_goals", "solver_iterations"):
+            if getattr(self, field) < 1:
+                refuse(field, "at least 1")
+        for field in ("num_objects", "contacts_per_env", "constraints_per_env", "threads", "k_int"):
+            if not getattr(self, field) >= 0:
+                refuse(field, "0 or more")
+        for field in ("control_dt_s", "sim_dt_s", "waypoint_spacing_m", "nav_cell_m", "max_goal_distance_m"):
+            if not getattr(self, field) > 0:
+                refuse(field, "a positive number")
+        if self.min_goal_distance_m < 0 or self.min_goal_distance_m >= self.max_goal_distance_m:
+            refuse("min_goal_distance_m", f"0 or more and less than max_goal_distance_m ({self.max_goal_distance_m})")
+        if self.success_distance_m is not None and not self.success_distance_m > 0:
+            refuse("success_distance_m", "a positive number or none")
+        ratio = self.control_dt_s / self.sim_dt_s
+        if abs(ratio - round(ratio)) > 1e-6:
+            refuse("sim_dt_s", f"a divisor of control_dt_s ({self.control_dt_s} s)")
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps per control step."""
+        return round(self.control_dt_s / self.sim_dt_s)

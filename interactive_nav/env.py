@@ -1,0 +1,331 @@
+"""InteractiveNav, a Brax environment: keys and actions in, states out; wiring only.
+
+`reset` and `step` are pure, jit-able and vmap-able; every constant is made in `__init__`. Episodes follow
+section IV of Interactive Gibson (Xia et al. 2019); where paper and code differ, `docs/design.md` says which
+is meant.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env, State
+
+from interactive_nav import metrics as scores
+from interactive_nav.config import NavConfig
+from interactive_nav.navigation import geodesic_at, waypoints_at
+from interactive_nav.observation import observe, parts, rotation_from_quat, waypoints_in_body
+from interactive_nav.physics import PhysicsState, StepSignals, make_physics
+from interactive_nav.physics.base import TOUCH_FORCE_N
+from interactive_nav.placement import draw_episode
+from interactive_nav.reward import interactive_navigation_reward
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scene import Scene
+from interactive_nav.tables import build_tables
+from interactive_nav.types import EpisodeStart, NavInfo
+from interactive_nav.world import build_world, parking_spot
+
+STILL_M = 1e-4
+"""A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
+
+EPISODE_METRICS = (
+    "success",
+    "path_efficiency",
+    "effort_efficiency",
+    "kinematic_effort",
+    "dynamic_effort",
+    "ins_0.5",
+    "robot_path_m",
+    "shortest_path_m",
+    "object_displacement_kg_m",
+    "force_sum_n",
+    "episode_steps",
+    "nonfinite",
+    "interaction_steps",
+    "structure_steps",
+    "overflow_steps",
+    "objects_dropped",
+)
+REWARD_TERMS = ("reward/success", "reward/potential", "reward/interaction")
+
+
+class InteractiveNav(Env):
+    """A robot reaches a goal in a cluttered home; pushing things aside is allowed and costs something.
+
+    Observation: f32 (29,) by default, see `interactive_nav.observation`.
+    Action: f32 (A,) in [-1, 1], one per actuator (wheels: left, right).
+    Reward: success + potential + interaction, see `interactive_nav.reward`.
+    Done: success, time limit (then `info["truncation"]` is 1) or a non-finite state.
+    Metrics: `EPISODE_METRICS` are the episode's scores on its last step and 0 before, so that their sum
+    over an episode is the score; `REWARD_TERMS` are each step's reward terms.
+    """
+
+    def __init__(self, robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig):
+        """Builds models, tables and the physics backend.
+
+        Args:
+            robot: the robot's spec.
+            scenes: loaded scenes, at least one.
+            config: settings.
+
+        Raises:
+            ValueError: settings that do not fit each other or the backend.
+            SceneError: a scene with no room.
+        """
+        self.robot, self.scenes, self.config = robot, scenes, config
+        self.world = build_world(robot, scenes, config)
+        self.tables = build_tables(self.world, config)
+        self.physics = make_physics(self.world, config)
+        self.success_distance_m = config.success_distance_m or robot.body_width_m
+        self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
+        self._num_small = len(self.world.small_objects)
+        self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
+
+    @property
+    def backend(self) -> str:
+        """Physics backend in use: warp, jax or native."""
+        return self.physics.name
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation."""
+        sizes = parts(self.config.num_waypoints)
+        return sum(size for name, size in sizes.items() if name in self.config.observations)
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions."""
+        return self.robot.action_size
+
+    @property
+    def dt(self) -> float:
+        """Control period, s."""
+        return self.config.control_dt_s
+
+    def reset(self, rng: jax.Array) -> State:
+        """Draws an episode.
+
+        Args:
+            rng: one PRNG key; consumed.
+
+        Returns:
+            The first state of the episode.
+        """
+        rng, key = jax.random.split(rng)
+        start = draw_episode(
+            key,
+            self.tables,
+            self._small_radius_m,
+            self.robot.footprint_radius_m,
+            self.config.min_goal_distance_m,
+            self.config.max_goal_distance_m,
+            0.35 * self.config.nav_cell_m,
+        )
+        return self.reset_to(start, rng)
+
+    def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
+        """The first state of a given episode (fixed evaluation episodes, tests).
+
+        Args:
+            start: what `draw_episode` returns; leaves of one environment.
+            rng: key that the state carries for its next episode.
+        """
+        physics = self._initial_physics(start)
+        pos_w, rotation = self._robot_pose(physics)
+        scene, goal = start.scene_index, start.goal_index
+        geodesic = geodesic_at(self.tables, scene, goal, pos_w[:2])
+        waypoints_b = self._waypoints(scene, goal, pos_w, rotation)
+        zero, count = jnp.zeros(()), jnp.zeros((), jnp.int32)
+        slots = self.world.layout.num_slots
+        nav = NavInfo(
+            scene_index=scene,
+            goal_index=goal,
+            goal_xy_w=start.goal_xy_w,
+            start_xy_w=start.start_xy_w,
+            robot_pos_w=pos_w,
+            yaw_rad=_yaw(rotation),
+            waypoints_b=waypoints_b,
+            object_pos_w=self._object_positions(scene, physics),
+            geodesic_m=geodesic,
+            shortest_path_m=geodesic,
+            robot_path_m=zero,
+            object_path_m=jnp.zeros(slots),
+            force_sum_n=zero,
+            interaction_steps=count,
+            structure_steps=count,
+            overflow_steps=count,
+            objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
+            step_count=count,
+        )
+        info = {"nav": nav, "rng": rng, "truncation": zero, "time_out": zero}
+        obs = self._observe(physics, nav, rotation)
+        names = (*EPISODE_METRICS, *REWARD_TERMS)
+        return State(physics, obs, zero, zero, {name: zero for name in names}, info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one environment by one control period.
+
+        Args:
+            state: what `reset` or `step` returned.
+            action: (A,) in [-1, 1]; clipped, non-finite entries count as 0.
+        """
+        nav: NavInfo = state.info["nav"]
+        action = jnp.where(jnp.isfinite(action), action, 0.0)
+        ctrl = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
+        physics, signals = self.physics.step(nav.scene_index, state.pipeline_state, ctrl)
+        broken = signals.nonfinite > 0
+        nav, rotation = self._advance(nav, physics, signals, broken)
+
+        success = ~broken & (jnp.linalg.norm(nav.goal_xy_w - nav.robot_pos_w[:2]) < self.success_distance_m)
+        interacts = self._touches(nav.scene_index, signals)
+        reward, terms = interactive_navigation_reward(
+            success.astype(jnp.float32),
+            state.info["nav"].geodesic_m,
+            nav.geodesic_m,
+            interacts.astype(jnp.float32),
+            self.config.k_int,
+            self.config.success_reward,
+        )
+        timed_out = ~success & ~broken & (nav.step_count >= self.config.episode_steps)
+        done = (success | timed_out | broken).astype(jnp.float32)
+        values = self._scores(nav, success, broken)
+        values = {name: done * value for name, value in values.items()}
+        values |= {f"reward/{name}": term for name, term in terms.items()}
+        obs = jnp.where(broken, 0.0, self._observe(physics, nav, rotation))
+        truncation = timed_out.astype(jnp.float32)
+        return state.replace(
+            pipeline_state=physics,
+            obs=obs,
+            reward=reward,
+            done=done,
+            metrics={**state.metrics, **values},
+            info={**state.info, "nav": nav, "truncation": truncation, "time_out": truncation},
+        )
+
+    def _initial_physics(self, start: EpisodeStart) -> PhysicsState:
+        layout = self.world.layout
+        qpos = self.tables.rest_qpos[start.scene_index]
+        yaw, at = start.start_yaw_rad, layout.robot_qpos
+        pose = [*start.start_xy_w, self.robot.spawn_height_m, jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2)]
+        qpos = qpos.at[at : at + 7].set(jnp.stack([jnp.asarray(v, jnp.float32) for v in pose]))
+        if self._num_small:
+            xy = jnp.where(start.small_placed[:, None], start.small_xy_w, self._parking)
+            half, zeros = start.small_yaw_rad / 2, jnp.zeros(self._num_small)
+            columns = [xy[:, 0], xy[:, 1], zeros, jnp.cos(half), zeros, zeros, jnp.sin(half)]
+            address = layout.slot_qpos[: self._num_small, None] + np.arange(7)
+            qpos = qpos.at[address].set(jnp.stack(columns, -1))
+        still = jnp.zeros(self.physics.nv, jnp.float32)
+        return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still)
+
+    def _robot_pose(self, physics: PhysicsState) -> tuple[jax.Array, jax.Array]:
+        at = self.world.layout.robot_qpos
+        return physics.qpos[at : at + 3], rotation_from_quat(physics.qpos[at + 3 : at + 7])
+
+    def _object_positions(self, scene: jax.Array, physics: PhysicsState) -> jax.Array:
+        """(M, 3) centres of mass in the world frame."""
+        layout, tables = self.world.layout, self.tables
+        com = tables.com_m[scene]
+        out = jnp.zeros((layout.num_slots, 3))
+        hinged = np.asarray([kind == "hinge" for kind in layout.slot_kind])
+        free = np.flatnonzero(~hinged)
+        if len(free):
+            pose = physics.qpos[layout.slot_qpos[free][:, None] + np.arange(7)]
+            rotated = jnp.einsum("mij,mj->mi", rotation_from_quat(pose[:, 3:]), com[free])
+            out = out.at[free].set(pose[:, :3] + rotated)
+        swing = np.flatnonzero(hinged)
+        if len(swing):
+            angle = physics.qpos[layout.slot_qpos[swing]]
+            axis, anchor = tables.hinge_axis[scene, swing], tables.hinge_anchor_m[scene, swing]
+            quat = jnp.concatenate([jnp.cos(angle / 2)[:, None], jnp.sin(angle / 2)[:, None] * axis], -1)
+            arm = jnp.einsum("mij,mj->mi", rotation_from_quat(quat), com[swing] - anchor) + anchor
+            rest = rotation_from_quat(tables.hinge_quat_w[scene, swing])
+            out = out.at[swing].set(tables.hinge_pos_w[scene, swing] + jnp.einsum("mij,mj->mi", rest, arm))
+        return out
+
+    def _touches(self, scene: jax.Array, signals: StepSignals) -> jax.Array:
+        occupied = self.tables.mass_kg[scene, 1:] > 0
+        return jnp.any(occupied & (signals.slot_force_n > TOUCH_FORCE_N))
+
+    def _waypoints(self, scene, goal, pos_w, rotation) -> jax.Array:
+        world = waypoints_at(
+            self.tables, scene, goal, pos_w[:2], self.config.num_waypoints, self.config.waypoint_spacing_m
+        )
+        return waypoints_in_body(world, pos_w, rotation)
+
+    def _advance(
+        self, nav: NavInfo, physics: PhysicsState, signals: StepSignals, broken: jax.Array
+    ) -> tuple[NavInfo, jax.Array]:
+        """The task's memory after a step; a broken step leaves positions and totals as they were."""
+        scene, goal = nav.scene_index, nav.goal_index
+        pos_w, rotation = self._robot_pose(physics)
+        rotation = jnp.where(broken, jnp.eye(3), rotation)
+        pos_w = jnp.where(broken, nav.robot_pos_w, pos_w)
+        objects = jnp.where(broken, nav.object_pos_w, self._object_positions(scene, physics))
+        travelled = _moved(pos_w - nav.robot_pos_w)
+        pushed = jnp.where(self.tables.mass_kg[scene, 1:] > 0, _moved(objects - nav.object_pos_w), 0.0)
+        ok = (~broken).astype(jnp.int32)
+        new = nav.replace(
+            robot_pos_w=pos_w,
+            yaw_rad=jnp.where(broken, nav.yaw_rad, _yaw(rotation)),
+            waypoints_b=self._waypoints(scene, goal, pos_w, rotation),
+            object_pos_w=objects,
+            geodesic_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
+            robot_path_m=nav.robot_path_m + travelled,
+            object_path_m=nav.object_path_m + pushed,
+            force_sum_n=nav.force_sum_n + jnp.where(broken, 0.0, signals.force_n),
+            interaction_steps=nav.interaction_steps + ok * self._touches(scene, signals).astype(jnp.int32),
+            structure_steps=nav.structure_steps + ok * (signals.structure_force_n > TOUCH_FORCE_N).astype(jnp.int32),
+            overflow_steps=nav.overflow_steps + (signals.overflow > 0).astype(jnp.int32),
+            step_count=nav.step_count + 1,
+        )
+        return new, rotation
+
+    def _scores(self, nav: NavInfo, success: jax.Array, broken: jax.Array) -> dict[str, jax.Array]:
+        masses = self.tables.mass_kg[nav.scene_index]
+        paths = jnp.concatenate([nav.robot_path_m[None], nav.object_path_m])
+        p_eff = scores.path_efficiency(success, nav.shortest_path_m, nav.robot_path_m)
+        kinematic = scores.kinematic_effort(masses, paths)
+        dynamic = scores.dynamic_effort(self.world.robot_mass_kg, nav.force_sum_n, nav.step_count)
+        e_eff = 0.5 * (kinematic + dynamic)
+        values = {
+            "success": success,
+            "path_efficiency": p_eff,
+            "effort_efficiency": e_eff,
+            "kinematic_effort": kinematic,
+            "dynamic_effort": dynamic,
+            "ins_0.5": scores.interactive_navigation_score(p_eff, e_eff, 0.5),
+            "robot_path_m": nav.robot_path_m,
+            "shortest_path_m": nav.shortest_path_m,
+            "object_displacement_kg_m": jnp.sum(masses[1:] * nav.object_path_m),
+            "force_sum_n": nav.force_sum_n,
+            "episode_steps": nav.step_count,
+            "nonfinite": broken,
+            "interaction_steps": nav.interaction_steps,
+            "structure_steps": nav.structure_steps,
+            "overflow_steps": nav.overflow_steps,
+            "objects_dropped": nav.objects_dropped,
+        }
+        return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+
+    def _observe(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array) -> jax.Array:
+        v = self.world.layout.robot_qvel
+        return observe(
+            self.config.observations,
+            nav.robot_pos_w,
+            rotation,
+            physics.qvel[v : v + 3],
+            physics.qvel[v + 3 : v + 6],
+            nav.goal_xy_w,
+            nav.waypoints_b,
+        )
+
+
+def _yaw(rotation: jax.Array) -> jax.Array:
+    return jnp.arctan2(rotation[1, 0], rotation[0, 0])
+
+
+def _moved(delta: jax.Array) -> jax.Array:
+    """[..., 3] displacement in a control step to metres travelled; below `STILL_M`, 0."""
+    length = jnp.sqrt(jnp.sum(delta**2, -1))
+    return jnp.where(length < STILL_M, 0.0, length)

@@ -1,0 +1,120 @@
+"""Episode totals in, the Interactive Navigation Score out: pure functions on NumPy or JAX arrays.
+
+Interactive Gibson (Xia et al. 2019), section IV. Every function takes any leading batch axes and
+returns arrays of those axes; nothing here reads a simulator.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+Array = Any
+"""A NumPy or JAX array, or a number."""
+
+GRAVITY = 9.81
+"""m/s^2."""
+
+
+def _xp(*values: Any):
+    """`jax.numpy` when any value is a JAX array or tracer, else `numpy`."""
+    return jax.numpy if any(isinstance(v, jax.Array) for v in values) else np
+
+
+def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array) -> Array:
+    """P_eff = 1_suc * L* / l_0, clipped to [0, 1] (paper section IV; with alpha = 1 the INS is SPL).
+
+    A goal is a region, so a robot may succeed on a path shorter than L*: hence the clip. A robot that
+    succeeds without moving scores 1.
+
+    Args:
+        success: [...] 1 or True where the episode reached the goal.
+        shortest_path_m: [...] L*, metres, among static structure only; must not be negative.
+        robot_path_m: [...] l_0, metres travelled.
+
+    Returns:
+        [...] float in [0, 1].
+    """
+    xp = _xp(success, shortest_path_m, robot_path_m)
+    shortest = xp.asarray(shortest_path_m) * 1.0
+    travelled = xp.asarray(robot_path_m) * 1.0
+    moved = travelled > 0.0
+    ratio = xp.where(moved, shortest / xp.where(moved, travelled, 1.0), 1.0)
+    return xp.where(xp.asarray(success) > 0, xp.clip(ratio, 0.0, 1.0), 0.0)
+
+
+def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:
+    """m_0 l_0 / sum_i m_i l_i: the share of moved mass that was the robot's own (paper section IV).
+
+    Args:
+        masses_kg: [..., K+1], index 0 is the robot.
+        path_lengths_m: [..., K+1], metres each centre of mass travelled.
+
+    Returns:
+        [...] float in [0, 1]; 1 where nothing moved at all.
+    """
+    xp = _xp(masses_kg, path_lengths_m)
+    work = xp.asarray(masses_kg) * xp.asarray(path_lengths_m) * 1.0
+    total = work.sum(-1)
+    moved = total > 0.0
+    return xp.where(moved, work[..., 0] / xp.where(moved, total, 1.0), 1.0)
+
+
+def dynamic_effort(robot_mass_kg: Array, force_sum_n: Array, num_steps: Array, gravity: float = GRAVITY) -> Array:
+    """T G / (T G + sum_t F_t) with G = m_0 g (paper section IV).
+
+    Args:
+        robot_mass_kg: [...] m_0.
+        force_sum_n: [...] sum over control steps of the force on everything but the floor, newtons.
+        num_steps: [...] control steps T; with T = 0 and no force the term is 1.
+        gravity: m/s^2.
+
+    Returns:
+        [...] float in (0, 1].
+    """
+    xp = _xp(robot_mass_kg, force_sum_n, num_steps)
+    weight = xp.asarray(robot_mass_kg) * gravity * xp.asarray(num_steps)
+    total = weight + xp.asarray(force_sum_n)
+    some = total > 0.0
+    return xp.where(some, weight / xp.where(some, total, 1.0), 1.0)
+
+
+def effort_efficiency(
+    masses_kg: Array, path_lengths_m: Array, forces_n: Array, num_steps: Array, gravity: float = GRAVITY
+) -> Array:
+    """E_eff, the mean of the kinematic and the dynamic effort term (paper section IV).
+
+    Args:
+        masses_kg: [..., K+1], index 0 is the robot; padded objects have path length 0.
+        path_lengths_m: [..., K+1].
+        forces_n: [..., T] force of every control step, zero-padded after the episode's end.
+        num_steps: [...] control steps of the episode.
+        gravity: m/s^2.
+
+    Returns:
+        [...] float in [0, 1]; a robot that neither moved nor touched anything scores 1.
+    """
+    xp = _xp(masses_kg, path_lengths_m, forces_n, num_steps)
+    dynamic = dynamic_effort(xp.asarray(masses_kg)[..., 0], xp.asarray(forces_n).sum(-1), num_steps, gravity)
+    return 0.5 * (kinematic_effort(masses_kg, path_lengths_m) + dynamic)
+
+
+def interactive_navigation_score(p_eff: Array, e_eff: Array, alpha: float | Array) -> Array:
+    """INS_alpha = alpha P_eff + (1 - alpha) E_eff (paper section IV).
+
+    Args:
+        p_eff: [...] path efficiency.
+        e_eff: [...] effort efficiency; it counts on failures too.
+        alpha: weight of the path term; a Python number outside [0, 1] is refused.
+
+    Returns:
+        [...] float in [0, 1].
+
+    Raises:
+        ValueError: alpha outside [0, 1].
+    """
+    if isinstance(alpha, (int, float)) and not 0.0 <= alpha <= 1.0:
+        raise ValueError(f"alpha is {alpha}, expected a weight in [0, 1]")
+    return alpha * p_eff + (1.0 - alpha) * e_eff

@@ -1,0 +1,56 @@
+"""Physics backends behind one interface: `warp`, `jax` and `native`; `make_physics` picks one."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import jax
+
+from interactive_nav.config import NavConfig
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals
+from interactive_nav.world import World
+
+
+def resolve_backend(name: str) -> str:
+    """`auto` becomes `warp` on an NVIDIA GPU with Warp installed, `native` on a CPU, `jax` elsewhere.
+
+    Raises:
+        ValueError: `warp` without the Warp package.
+    """
+    has_warp = importlib.util.find_spec("warp") is not None
+    if name == "auto":
+        platform = jax.default_backend()
+        if platform == "cpu":
+            return "native"
+        return "warp" if platform == "gpu" and has_warp else "jax"
+    if name == "warp" and not has_warp:
+        raise ValueError(
+            "backend is 'warp' but the package warp-lang is not installed; "
+            "install the gpu extra (pip install '.[gpu]') or choose backend=native"
+        )
+    return name
+
+
+def make_physics(world: World, config: NavConfig) -> Physics:
+    """Builds the backend that the configuration names.
+
+    Raises:
+        ValueError: hull collision on an MJX backend, or a backend that is not installed.
+    """
+    backend = resolve_backend(config.backend)
+    if config.collision == "hulls" and backend != "native":
+        raise ValueError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
+    if backend == "native":
+        from interactive_nav.physics.native import NativePhysics
+
+        return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads)
+    from interactive_nav.physics.mjx_batch import MjxPhysics, measure_buffers
+
+    contacts, constraints = config.contacts_per_env, config.constraints_per_env
+    if backend == "warp" and not (contacts and constraints):
+        measured = measure_buffers(world)
+        contacts, constraints = contacts or measured[0], constraints or measured[1]
+    return MjxPhysics(world, config.substeps, backend, contacts, constraints)
+
+
+__all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

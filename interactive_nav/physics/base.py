@@ -1,0 +1,129 @@
+"""What every physics backend offers: batched states and commands in, stepped states and contact signals out.
+
+The state that travels is small and the same on every backend (`qpos`, `qvel`, the solver's warm start),
+so resets are `jnp.where`, checkpoints are portable and nothing engine-specific leaks into the loop.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax import custom_batching
+
+TOUCH_FORCE_N = 1e-4
+"""A body counts as touched when the robot's net force on it exceeds this in any substep."""
+
+
+@flax.struct.dataclass
+class PhysicsState:
+    """State of one environment's physics (leading batch axes as the caller has them)."""
+
+    qpos: jax.Array
+    """[nq] f32."""
+    qvel: jax.Array
+    """[nv] f32."""
+    qacc_warmstart: jax.Array
+    """[nv] f32."""
+
+
+@flax.struct.dataclass
+class StepSignals:
+    """What one control step did; M movable slots."""
+
+    force_n: jax.Array
+    """[] f32: mean over substeps of the norm of the robot's summed contact force on all but the floor, N."""
+    slot_force_n: jax.Array
+    """[M] f32: largest norm over substeps of the net force on each slot's body, N."""
+    structure_force_n: jax.Array
+    """[] f32: the same for walls and other fixed structure, N."""
+    overflow: jax.Array
+    """[] i32: 1 if a contact or constraint buffer overflowed in any substep."""
+    nonfinite: jax.Array
+    """[] i32: 1 if the new state is not finite or the engine gave up on it."""
+
+
+class Physics(abc.ABC):
+    """A backend: steps N environments at once by `substeps` physics steps."""
+
+    name: str
+    nq: int
+    nv: int
+
+    @abc.abstractmethod
+    def step_batch(
+        self, scene: jax.Array, state: PhysicsState, ctrl: jax.Array
+    ) -> tuple[PhysicsState, StepSignals]:
+        """Steps a batch by one control period.
+
+        Args:
+            scene: [N] i32 index of each environment's scene.
+            state: leaves [N, ...].
+            ctrl: [N, nu] f32 actuator commands, held over the period.
+
+        Returns:
+            The new state and the signals, leaves [N, ...].
+        """
+
+    def step(self, scene: jax.Array, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, StepSignals]:
+        """One environment's `step_batch`; under any number of `vmap`s all environments step in one call."""
+        return _step_single(self, scene, state, ctrl)
+
+
+def _flatten(tree, outer: int, inner: int):
+    return jax.tree.map(lambda x: x.reshape((outer * inner, *x.shape[2:])), tree)
+
+
+def _broadcast(tree, batched, size: int):
+    return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
+
+
+def _step_many(physics: Physics, scene, state, ctrl):
+    """`step_batch`, which a further vmap flattens into a larger batch."""
+
+    @custom_batching.custom_vmap
+    def many(scene, state, ctrl):
+        return physics.step_batch(scene, state, ctrl)
+
+    @many.def_vmap
+    def rule(axis_size, in_batched, scene, state, ctrl):
+        scene, state, ctrl = _broadcast((scene, state, ctrl), tuple(in_batched), axis_size)
+        inner = scene.shape[1]
+        flat = _flatten((scene, state, ctrl), axis_size, inner)
+        out = _step_many(physics, *flat)
+        out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return many(scene, state, ctrl)
+
+
+def _step_single(physics: Physics, scene, state, ctrl):
+    @custom_batching.custom_vmap
+    def single(scene, state, ctrl):
+        out = _step_many(physics, *jax.tree.map(lambda x: x[None], (scene, state, ctrl)))
+        return jax.tree.map(lambda x: x[0], out)
+
+    @single.def_vmap
+    def rule(axis_size, in_batched, scene, state, ctrl):
+        args = _broadcast((scene, state, ctrl), tuple(in_batched), axis_size)
+        out = _step_many(physics, *args)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return single(scene, state, ctrl)
+
+
+def summarise_forces(force_w: jax.Array, xp=jnp):
+    """Contact forces of all substeps to the numbers of `StepSignals`.
+
+    Args:
+        force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
+        xp: numpy or jax.numpy.
+
+    Returns:
+        force_n [...], slot_force_n [..., M], structure_force_n [...].
+    """
+    total = xp.sqrt((force_w.sum(-2) ** 2).sum(-1)).mean(-1)
+    each = xp.sqrt((force_w**2).sum(-1)).max(-2)
+    return total, each[..., :-1], each[..., -1]

@@ -1,0 +1,193 @@
+"""MuJoCo MJX, both of its implementations: `warp` (NVIDIA) and `jax` (any XLA device).
+
+Scenes differ only in model fields, which are stacked once as [scene, ...] tables; each environment takes
+its scene's rows. The engine's data is rebuilt from a template at every control step, so only
+`PhysicsState` is carried.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.world import World
+
+# Fields that only C MuJoCo reads, or that MJX derives again.
+_UNUSED_BY_MJX = {
+    "bvh_aabb",
+    "dof_M0",
+    "dof_length",
+    "body_sameframe",
+    "geom_sameframe",
+    "body_simple",
+    "dof_simplenum",
+}
+BATCHABLE = frozenset(
+    "geom_size geom_pos geom_quat geom_rbound geom_aabb geom_friction body_mass body_inertia body_ipos body_iquat "
+    "body_pos body_quat body_subtreemass body_invweight0 body_gravcomp dof_invweight0 dof_damping dof_frictionloss "
+    "jnt_axis jnt_pos jnt_range qpos0 qpos_spring".split()
+)
+"""Model fields that may differ between scenes under one compiled program."""
+
+
+def differing_fields(models: tuple[mujoco.MjModel, ...]) -> tuple[str, ...]:
+    """Names of model arrays that differ between models of equal structure.
+
+    Raises:
+        ValueError: two models differ in shape, or in a field that cannot be batched.
+    """
+    first, names = models[0], []
+    for name in dir(first):
+        value = None if name.startswith("_") else getattr(first, name, None)
+        if not isinstance(value, np.ndarray) or name in _UNUSED_BY_MJX:
+            continue
+        others = [getattr(m, name) for m in models[1:]]
+        if any(o.shape != value.shape for o in others):
+            raise ValueError(f"model field {name} has shapes {[value.shape, *[o.shape for o in others]]}, expected one")
+        if any(not np.array_equal(o, value) for o in others):
+            if name not in BATCHABLE:
+                raise ValueError(f"model field {name} differs between scenes, but MJX cannot batch it")
+            names.append(name)
+    return tuple(names)
+
+
+class MjxPhysics(Physics):
+    """Steps a batch with `mjx.step` under vmap."""
+
+    def __init__(
+        self, world: World, substeps: int, impl: str, contacts_per_env: int, constraints_per_env: int
+    ):
+        self.name = impl
+        self._world, self._substeps = world, substeps
+        self._contacts, self._constraints = contacts_per_env, constraints_per_env
+        host = world.models[0]
+        self.nq, self.nv = host.nq, host.nv
+        if impl == "jax":
+            # MJX-JAX has no contact sensors between bodies: forces are summed from its contacts instead.
+            host = _without_sensors(world.specs[0])
+        self._host = host
+        self._model = mjx.put_model(host, impl=impl)
+        if impl == "warp":
+            # Warp prints a line per overflow or unconverged solve: ours are counted instead.
+            self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
+        self._fields = differing_fields(world.models)
+        self._tables = {
+            name: jnp.asarray(np.stack([np.asarray(getattr(m, name), np.float32) for m in world.models])).reshape(
+                (len(world.models), *getattr(self._model, name).shape)
+            )
+            for name in self._fields
+        }
+        self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
+        self._slot_of_geom = _slot_of_geom(world, host)
+
+    def step_batch(self, scene, state, ctrl):
+        n = scene.shape[0]
+        if self.name == "warp":
+            template = mjx.make_data(
+                self._host, impl="warp", naconmax=n * self._contacts, njmax=self._constraints
+            )
+        else:
+            template = mjx.make_data(self._host, impl="jax")
+
+        def one(scene, state: PhysicsState, ctrl):
+            model = self._model.replace(**{k: table[scene] for k, table in self._tables.items()})
+            data = template.replace(
+                qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
+            )
+            forces, overflow = [], jnp.asarray(0, jnp.int32)
+            for _ in range(self._substeps):
+                data = mjx.step(model, data)
+                if self.name == "warp":
+                    forces.append(data.sensordata[self._sensors])
+                    overflow |= self._overflowed(data)
+                else:
+                    forces.append(self._forces_from_contacts(model, data))
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), jnp.stack(forces), overflow
+
+        new, forces, overflow = jax.vmap(one)(scene, state, ctrl)
+        force_n, slot_n, structure_n = summarise_forces(forces)
+        finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
+        return new, StepSignals(
+            force_n=force_n,
+            slot_force_n=slot_n,
+            structure_force_n=structure_n,
+            overflow=overflow,
+            nonfinite=(~finite).astype(jnp.int32),
+        )
+
+    def _overflowed(self, data) -> jax.Array:
+        from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType
+
+        dropped = int(
+            OverflowType.NEFC
+            | OverflowType.NJMAX_NNZ
+            | OverflowType.BROADPHASE
+            | OverflowType.NARROWPHASE
+            | OverflowType.CCD
+            | OverflowType.CONTACT_MATCH
+        )
+        return ((data._impl.overflow & dropped) != 0).astype(jnp.int32)
+
+    def _forces_from_contacts(self, model, data) -> jax.Array:
+        """[M + 1, 3] net force of the robot on each slot and the structure, world frame, from MJX-JAX's contacts."""
+        contact = data._impl.contact
+        geom = contact.geom
+        robot = jnp.asarray(self._slot_of_geom == _ROBOT)
+        slot = jnp.asarray(self._slot_of_geom)
+        first, second = geom[:, 0], geom[:, 1]
+        target = jnp.where(robot[first], slot[second], jnp.where(robot[second], slot[first], -1))
+        target = jnp.where(robot[first] & robot[second], -1, target)
+        forces = []
+        for i in range(geom.shape[0]):
+            forces.append(mjx._src.support.contact_force(model, data, i, True)[:3])
+        if not forces:
+            return jnp.zeros((len(self._sensors), 3))
+        # A contact's frame points from its first geom to its second, and its force acts on the second.
+        sign = jnp.where(robot[first], 1.0, -1.0)[:, None]
+        rows = jnp.where(target[:, None] >= 0, jnp.stack(forces) * sign, 0.0)
+        out = jnp.zeros((len(self._sensors), 3))
+        return out.at[jnp.maximum(target, 0)].add(rows)
+
+
+_ROBOT = -2
+
+
+def _slot_of_geom(world: World, model: mujoco.MjModel) -> np.ndarray:
+    """[ngeom] movable slot of each geom; M for the structure, `_ROBOT` for the robot, -1 for the floor."""
+    layout = world.layout
+    slot_of_body = np.full(model.nbody, -1)
+    slot_of_body[layout.slot_body] = np.arange(layout.num_slots)
+    slot_of_body[layout.structure_body] = layout.num_slots
+    slot_of_body[layout.robot_bodies] = _ROBOT
+    return slot_of_body[model.geom_bodyid]
+
+
+def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    spec = spec.copy()
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    return spec.compile()
+
+
+def measure_buffers(world: World, head_room: float = 1.6) -> tuple[int, int]:
+    """Contact slots and constraint rows per environment that the scenes need, measured at rest.
+
+    The small objects are laid out on the floor, everything else rests; `head_room` leaves place for a
+    robot that pushes objects into each other. What overflows all the same is counted in the metrics.
+
+    Returns:
+        (contacts, constraint rows) per environment.
+    """
+    contacts = rows = 0
+    for model, qpos in zip(world.models, world.rest_qpos, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+    extra = 24
+    contacts, rows = int(contacts * head_room) + extra, int(rows * head_room) + 4 * extra
+    return contacts, -(-rows // 16) * 16

@@ -1,0 +1,119 @@
+"""C MuJoCo on CPU threads behind `jax.pure_callback`: the default without a GPU.
+
+With sleep on, objects at rest cost nothing until touched. Which of them sleep is engine state that does
+not travel in `PhysicsState`; it is kept beside the batch as a cache, and dropped for every environment
+whose incoming state is not, to the bit, the one that the batch returned last.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.world import World
+
+_ENGINE_FAILURES = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+    mujoco.mjtWarning.mjWARN_INERTIA,
+)
+_OVERFLOWS = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+
+
+class _Pool:
+    """One `Batch` of a given size, and what it returned last."""
+
+    def __init__(self, models: tuple[mujoco.MjModel, ...], size: int, threads: int, sleep: bool):
+        self.batch = Batch(models[0], nsim=size, nthread=threads, persistent=sleep)
+        self.scene = np.zeros(size, np.int64)
+        self.qpos = np.full((size, models[0].nq), np.nan, np.float32)
+        self.qvel = np.full((size, models[0].nv), np.nan, np.float32)
+        self.state_qpos, self.state_qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.state_warm, self.state_ctrl = self.batch.bind("qacc_warmstart"), self.batch.bind("ctrl")
+
+
+class NativePhysics(Physics):
+    """Steps each environment with its own scene's model, in parallel threads."""
+
+    name = "native"
+
+    def __init__(self, world: World, substeps: int, sleep: bool = True, threads: int = 0):
+        self.nq, self.nv = world.models[0].nq, world.models[0].nv
+        self._substeps = substeps
+        self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
+        self._slots = world.layout.num_slots
+        self._threads, self._sleep = threads, sleep
+        self._models = tuple(copy.copy(m) for m in world.models)
+        for model in self._models:
+            # A failed state must be seen, not silently replaced by the model's default.
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+            if sleep:
+                model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        self._pools: dict[int, _Pool] = {}
+
+    def step_batch(self, scene, state, ctrl):
+        n = scene.shape[0]
+        f32, i32 = jnp.float32, jnp.int32
+        shapes = (
+            PhysicsState(
+                qpos=jax.ShapeDtypeStruct((n, self.nq), f32),
+                qvel=jax.ShapeDtypeStruct((n, self.nv), f32),
+                qacc_warmstart=jax.ShapeDtypeStruct((n, self.nv), f32),
+            ),
+            StepSignals(
+                force_n=jax.ShapeDtypeStruct((n,), f32),
+                slot_force_n=jax.ShapeDtypeStruct((n, self._slots), f32),
+                structure_force_n=jax.ShapeDtypeStruct((n,), f32),
+                overflow=jax.ShapeDtypeStruct((n,), i32),
+                nonfinite=jax.ShapeDtypeStruct((n,), i32),
+            ),
+        )
+        return jax.pure_callback(self._step_host, shapes, scene, state, ctrl, vmap_method="sequential")
+
+    def _step_host(self, scene, state: PhysicsState, ctrl):
+        scene, ctrl = np.asarray(scene), np.asarray(ctrl)
+        qpos, qvel = np.asarray(state.qpos), np.asarray(state.qvel)
+        size = len(scene)
+        pool = self._pools.get(size)
+        if pool is None:
+            pool = self._pools[size] = _Pool(self._models, size, self._threads, self._sleep)
+        batch = pool.batch
+        if len(self._models) > 1 and not np.array_equal(pool.scene, scene):
+            batch.set_models([self._models[s] for s in scene])
+            pool.qpos[pool.scene != scene] = np.nan
+            pool.scene = scene.copy()
+        finite = np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1)
+        known = (qpos == pool.qpos).all(1) & (qvel == pool.qvel).all(1)
+        fresh = np.flatnonzero(~known)
+        if len(fresh):
+            batch.reset(fresh, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+            good = fresh[finite[fresh]]
+            pool.state_qpos[good], pool.state_qvel[good] = qpos[good], qvel[good]
+            pool.state_warm[good] = np.asarray(state.qacc_warmstart)[good]
+        pool.state_ctrl[:] = np.nan_to_num(ctrl)
+        batch.warning[:] = 0
+        sensed = batch.rollout(self._substeps, record=("sensordata",))["sensordata"]
+        raised = batch.warning[:, :, 1] > 0
+        new_qpos, new_qvel = pool.state_qpos.astype(np.float32), pool.state_qvel.astype(np.float32)
+        finite &= np.isfinite(new_qpos).all(1) & np.isfinite(new_qvel).all(1)
+        nonfinite = ~finite | raised[:, [int(w) for w in _ENGINE_FAILURES]].any(1)
+        pool.qpos, pool.qvel = new_qpos, new_qvel
+        pool.qpos[nonfinite] = np.nan
+        force_n, slot_n, structure_n = summarise_forces(sensed[:, :, self._sensors], np)
+        return (
+            PhysicsState(new_qpos.copy(), new_qvel.copy(), pool.state_warm.astype(np.float32)),
+            StepSignals(
+                force_n=force_n.astype(np.float32),
+                slot_force_n=slot_n.astype(np.float32),
+                structure_force_n=structure_n.astype(np.float32),
+                overflow=raised[:, [int(w) for w in _OVERFLOWS]].any(1).astype(np.int32),
+                nonfinite=nonfinite.astype(np.int32),
+            ),
+        )

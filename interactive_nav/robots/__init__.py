@@ -1,0 +1,32 @@
+"""Robots by name: each a typed spec (mass, width, action map, camera) and an MJCF builder."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+
+from interactive_nav.robots.spec import RobotSpec
+from interactive_nav.robots.turtlebot import turtlebot
+
+_FACTORIES: dict[str, Callable[[], RobotSpec]] = {"turtlebot": turtlebot}
+
+
+def robot_names() -> tuple[str, ...]:
+    """Names that `get_robot` answers."""
+    return tuple(sorted(_FACTORIES))
+
+
+def get_robot(name: str) -> RobotSpec:
+    """The robot's spec.
+
+    Raises:
+        ValueError: unknown name; the message lists the known ones.
+    """
+    if name not in _FACTORIES:
+        near = difflib.get_close_matches(str(name), _FACTORIES, 1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ValueError(f"unknown robot '{name}'; {hint}known robots: {', '.join(robot_names())}")
+    return _FACTORIES[name]()
+
+
+__all__ = ["RobotSpec", "get_robot", "robot_names"]

@@ -1,0 +1,168 @@
+"""A scene folder in, a `Scene` of plain arrays out: the one reader of `scene.xml`."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+
+
+@dataclasses.dataclass(frozen=True)
+class Hinge:
+    """A door's joint, in the body's frame."""
+
+    axis: np.ndarray
+    """(3,)"""
+    anchor_m: np.ndarray
+    """(3,)"""
+    range_rad: tuple[float, float] | None
+    damping: float
+    frictionloss: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Movable:
+    """A movable body of a scene; geometry in the body's frame."""
+
+    name: str
+    category: str
+    mass_kg: float
+    inertia: np.ndarray
+    """(3,) principal moments, kg m^2."""
+    com_m: np.ndarray
+    """(3,)"""
+    inertia_quat: np.ndarray
+    """(4,) w x y z."""
+    pos_w: np.ndarray
+    """(3,) rest position, m."""
+    quat_w: np.ndarray
+    """(4,) rest orientation."""
+    friction: float
+    boxes: np.ndarray
+    """[n, 10]: centre (3), quaternion (4), half sizes (3)."""
+    hulls: tuple[np.ndarray, ...]
+    """Vertices [v, 3] of each convex hull."""
+    hinge: Hinge | None
+    """None: a free body."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A scene: its manifest, maps, walls and movable bodies."""
+
+    path: Path
+    name: str
+    split: str
+    digest: str
+    """SHA-256 of scene.xml and maps.npz."""
+    manifest: SceneManifest
+    maps: SceneMaps
+    walls: np.ndarray
+    """[n, 10]: world centre, quaternion, half sizes."""
+    movables: tuple[Movable, ...]
+
+
+def _quat_rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    out = np.zeros(3)
+    mujoco.mju_rotVecQuat(out, vector, quat)
+    return out
+
+
+def _boxes(model: mujoco.MjModel, geoms: list[int]) -> np.ndarray:
+    rows = [np.concatenate([model.geom_pos[g], model.geom_quat[g], model.geom_size[g]]) for g in geoms]
+    return np.asarray(rows).reshape(-1, 10)
+
+
+def _hull(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    mesh = model.geom_dataid[geom]
+    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    return model.mesh_vert[start : start + count] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+
+
+def load_scene(folder: str | Path) -> Scene:
+    """Reads and checks a scene folder.
+
+    Args:
+        folder: holds scene.xml, scene.json, maps.npz.
+
+    Raises:
+        SceneError: a file is missing or unreadable, or scene.xml and scene.json disagree.
+    """
+    folder = Path(folder)
+    manifest, maps = load_manifest(folder), load_maps(folder)
+    xml = folder / "scene.xml"
+    if not xml.is_file():
+        raise SceneError(f"{xml}: no such file; convert the scene again")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(xml))
+    except ValueError as error:
+        raise SceneError(f"{xml}: MuJoCo cannot compile it ({str(error).splitlines()[0]}); convert it again") from error
+    digest = hashlib.sha256(xml.read_bytes() + (folder / "maps.npz").read_bytes()).hexdigest()
+
+    structure = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "structure")
+    if structure < 0:
+        raise SceneError(f"{xml}: no body named 'structure'; convert the scene again")
+    geoms_of = {b: [g for g in range(model.ngeom) if model.geom_bodyid[g] == b] for b in range(model.nbody)}
+    solid = [g for g in geoms_of[structure] if model.geom_contype[g] or model.geom_conaffinity[g]]
+    wrong = [g for g in solid if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_BOX]
+    if wrong:
+        raise SceneError(f"{xml}: geom '{model.geom(wrong[0]).name}' of 'structure' collides but is not a box")
+
+    movables = []
+    for obj in manifest.objects:
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, obj.name)
+        if body < 0:
+            raise SceneError(f"{xml}: no body named '{obj.name}', which scene.json lists; convert the scene again")
+        if model.body_jntnum[body] != 1:
+            raise SceneError(f"{xml}: body '{obj.name}' has {model.body_jntnum[body]} joints, expected 1")
+        joint = model.body_jntadr[body]
+        box = [g for g in geoms_of[body] if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
+        hull = [
+            g
+            for g in geoms_of[body]
+            if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH and (model.geom_contype[g] or model.geom_conaffinity[g])
+        ]
+        if not box:
+            raise SceneError(f"{xml}: body '{obj.name}' has no box geom to collide with; convert the scene again")
+        hinge = None
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+            dof = model.jnt_dofadr[joint]
+            limits = tuple(float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else None
+            hinge = Hinge(
+                axis=model.jnt_axis[joint].copy(),
+                anchor_m=model.jnt_pos[joint].copy(),
+                range_rad=limits,  # type: ignore[arg-type]
+                damping=float(np.ravel(model.dof_damping[dof])[0]),
+                frictionloss=float(model.dof_frictionloss[dof]),
+            )
+        elif model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+            raise SceneError(f"{xml}: joint of '{obj.name}' is neither free nor a hinge")
+        movables.append(
+            Movable(
+                name=obj.name,
+                category=obj.category,
+                mass_kg=float(model.body_mass[body]),
+                inertia=model.body_inertia[body].copy(),
+                com_m=model.body_ipos[body].copy(),
+                inertia_quat=model.body_iquat[body].copy(),
+                pos_w=model.body_pos[body].copy(),
+                quat_w=model.body_quat[body].copy(),
+                friction=obj.friction,
+                boxes=_boxes(model, box),
+                hulls=tuple(_hull(model, g) for g in hull),
+                hinge=hinge,
+            )
+        )
+    walls = _boxes(model, solid)
+    for row in walls:
+        row[:3] = model.body_pos[structure] + _quat_rotate(model.body_quat[structure], row[:3])
+    if not np.allclose(model.body_quat[structure], [1, 0, 0, 0]):
+        raise SceneError(f"{xml}: body 'structure' is rotated, expected the identity")
+    return Scene(folder, manifest.name, manifest.split, digest, manifest, maps, walls, tuple(movables))

@@ -1,0 +1,176 @@
+"""A `World` and its settings in, `SceneTables` on the device out: all that `reset` and `step` look up."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+
+from interactive_nav.config import NavConfig
+from interactive_nav.geodesic import DistanceTable, clearance, distance_table, navigation_grid
+from interactive_nav.placement import CLEARANCE_M
+from interactive_nav.scene import Scene
+from interactive_nav.types import SceneTables
+from interactive_nav.world import World
+from scenes_mjcf.schema import SceneError
+
+
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    """[3, 3] from w x y z."""
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
+    """Cells of the scene's map over which furniture stands below a height.
+
+    Args:
+        scene: with its map.
+        poses: body name -> (position, quaternion w x y z), world.
+        height_m: of the robot; what hangs higher does not count.
+
+    Returns:
+        [rows, columns] bool.
+    """
+    maps = scene.maps
+    rows, columns = maps.traversable.shape
+    x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
+    y = maps.origin_w[1] + (np.arange(rows) + 0.5) * maps.resolution_m
+    z = np.arange(0.02, height_m, 0.03)
+    covered = np.zeros((rows, columns), bool)
+    for movable in scene.movables:
+        pos, quat = poses[movable.name]
+        body = _rotation(quat)
+        for row in movable.boxes:
+            centre, axes, half = pos + body @ row[:3], body @ _rotation(row[3:7]), row[7:10]
+            reach = np.abs(axes) @ half
+            cs = np.flatnonzero(np.abs(x - centre[0]) <= reach[0] + maps.resolution_m)
+            rs = np.flatnonzero(np.abs(y - centre[1]) <= reach[1] + maps.resolution_m)
+            if not len(cs) or not len(rs):
+                continue
+            grid = np.stack(np.meshgrid(x[cs], y[rs], z, indexing="xy"), -1)
+            inside = (np.abs((grid - centre) @ axes) <= half + maps.resolution_m / 2).all(-1).any(-1)
+            covered[np.ix_(rs, cs)] |= inside
+    return covered
+
+
+def _sample(values: np.ndarray, resolution_m: float, shape: tuple[int, int], cell_m: float) -> np.ndarray:
+    """Bilinear sample of a map's cell values at the navigation cells' centres."""
+    r = (np.arange(shape[0]) + 0.5) * cell_m / resolution_m - 0.5
+    c = (np.arange(shape[1]) + 0.5) * cell_m / resolution_m - 0.5
+    return scipy.ndimage.map_coordinates(values, np.meshgrid(r, c, indexing="ij"), order=1, cval=0.0)
+
+
+def _poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    qpos, layout = world.rest_qpos[index], world.layout
+    rest = {m.name: (m.pos_w, m.quat_w) for m in world.scenes[index].movables}
+    for name, kind, at in zip(world.names[index], layout.slot_kind, layout.slot_qpos, strict=True):
+        if kind == "free" and name:
+            rest[name] = (qpos[at : at + 3], qpos[at + 3 : at + 7])
+    return rest
+
+
+def _scene_places(world: World, index: int, config: NavConfig) -> tuple[DistanceTable, np.ndarray, np.ndarray]:
+    """Distance table, start places [p, 2] and clutter places [q, 2] of one scene."""
+    scene, robot = world.scenes[index], world.robot
+    maps, cell = scene.maps, config.nav_cell_m
+    free = navigation_grid(maps.traversable, maps.resolution_m, maps.origin_w, robot.footprint_radius_m, cell)
+    if not free.any():
+        raise SceneError(
+            f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "
+            "map; use a smaller robot or check the scan's floor"
+        )
+    table = distance_table(free, cell, maps.origin_w, config.max_goals, seed=int(scene.digest[:8], 16))
+    open_m = clearance(
+        maps.traversable & ~furniture_map(scene, _poses(world, index), robot.height_m), maps.resolution_m
+    )
+    margin = _sample(open_m, maps.resolution_m, free.shape, cell)
+    largest = max((o.radius_m for o in world.small_objects), default=0.0)
+
+    def centres(mask: np.ndarray) -> np.ndarray:
+        r, c = np.nonzero(mask)
+        return np.stack([maps.origin_w[0] + (c + 0.5) * cell, maps.origin_w[1] + (r + 0.5) * cell], -1)
+
+    starts = centres(free & (margin >= robot.footprint_radius_m + 0.75 * cell + CLEARANCE_M))
+    clutter = centres(margin >= largest + CLEARANCE_M)
+    goals = table.node_xy_w[table.goal_node]
+    far = len(starts) and np.linalg.norm(starts[:, None] - goals[None], axis=-1).max() >= config.min_goal_distance_m
+    if not far:
+        raise SceneError(
+            f"{scene.path}: no room for a start and a goal {config.min_goal_distance_m} m apart for robot "
+            f"'{robot.name}'; lower min_goal_distance_m or use a larger scene"
+        )
+    return table, starts, clutter
+
+
+def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
+    """Stacks arrays padded at the end of their first `axes` axes to common sizes."""
+    sizes = [max(a.shape[i] for a in arrays) for i in range(axes)]
+    padded = [
+        np.pad(a, [(0, s - n) for s, n in zip(sizes, a.shape, strict=False)] + [(0, 0)] * (a.ndim - axes),
+               constant_values=fill)
+        for a in arrays
+    ]  # fmt: skip
+    return np.stack(padded)
+
+
+def _index_dtype(navs: list[DistanceTable]):
+    """The smallest unsigned type that numbers every free cell: the table is large."""
+    return jnp.uint16 if max(len(n.node_xy_w) for n in navs) < 2**16 else jnp.uint32
+
+
+def build_tables(world: World, config: NavConfig) -> SceneTables:
+    """Solves navigation for every scene and stacks all constants on the device.
+
+    Raises:
+        SceneError: a scene with no room for the robot, or for a start and a goal.
+    """
+    places = [_scene_places(world, i, config) for i in range(len(world.scenes))]
+    navs = [p[0] for p in places]
+    layout, slots = world.layout, world.layout.num_slots
+    com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
+    hinge = {k: np.zeros((len(world.scenes), slots, n)) for k, n in (("pos", 3), ("quat", 4), ("axis", 3), ("anchor", 3))}
+    hinge["quat"][..., 0] = 1.0
+    for s, model in enumerate(world.models):
+        for k in range(slots):
+            if layout.slot_kind[k] == "hinge":
+                body = layout.slot_body[k]
+                joint = model.body_jntadr[body]
+                hinge["pos"][s, k], hinge["quat"][s, k] = model.body_pos[body], model.body_quat[body]
+                hinge["axis"][s, k], hinge["anchor"][s, k] = model.jnt_axis[joint], model.jnt_pos[joint]
+    mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.mass_kg], 1)
+
+    def f32(value) -> jnp.ndarray:
+        return jnp.asarray(value, jnp.float32)
+
+    def i32(value) -> jnp.ndarray:
+        return jnp.asarray(value, jnp.int32)
+
+    return SceneTables(
+        rest_qpos=f32(world.rest_qpos),
+        mass_kg=f32(mass),
+        com_m=f32(com),
+        hinge_pos_w=f32(hinge["pos"]),
+        hinge_quat_w=f32(hinge["quat"]),
+        hinge_axis=f32(hinge["axis"]),
+        hinge_anchor_m=f32(hinge["anchor"]),
+        node_of_cell=i32(_pad([n.node_of_cell for n in navs], 2)),
+        offset_of_cell_m=f32(_pad([n.offset_of_cell_m for n in navs], 2, fill=1.0)),
+        grid_origin_w=f32([n.origin_w for n in navs]),
+        node_xy_w=f32(_pad([n.node_xy_w for n in navs], 1)),
+        goal_node=i32(_pad([n.goal_node for n in navs], 1)),
+        num_goals=i32([len(n.goal_node) for n in navs]),
+        distance_m=f32(_pad([n.distance_m for n in navs], 2)),
+        next_node=jnp.asarray(_pad([n.next_node for n in navs], 2), _index_dtype(navs)),
+        start_xy_w=f32(_pad([p[1] for p in places], 1)),
+        num_starts=i32([len(p[1]) for p in places]),
+        clutter_xy_w=f32(_pad([p[2].reshape(-1, 2) if len(p[2]) else np.zeros((1, 2)) for p in places], 1)),
+        num_clutter=i32([len(p[2]) for p in places]),
+        cell_m=config.nav_cell_m,
+    )

@@ -1,0 +1,111 @@
+"""Records that travel through `reset` and `step`: frozen structs of arrays; shapes are those of one environment."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+
+
+@flax.struct.dataclass
+class SceneTables:
+    """Constants of all scenes on the device; S scenes, M movable slots, G goals, n free cells, padded alike."""
+
+    rest_qpos: jax.Array
+    """[S, nq] f32 furniture at rest, robot and small objects parked."""
+    mass_kg: jax.Array
+    """[S, M + 1] f32, index 0 the robot; 0 for an empty slot."""
+    com_m: jax.Array
+    """[S, M, 3] f32 centre of mass in the body's frame."""
+    hinge_pos_w: jax.Array
+    """[S, M, 3] f32 rest position of a hinged body's frame, m, world."""
+    hinge_quat_w: jax.Array
+    """[S, M, 4] f32 rest orientation of it."""
+    hinge_axis: jax.Array
+    """[S, M, 3] f32 in the body's frame."""
+    hinge_anchor_m: jax.Array
+    """[S, M, 3] f32 in the body's frame."""
+    node_of_cell: jax.Array
+    """[S, rows, columns] i32 nearest free cell."""
+    offset_of_cell_m: jax.Array
+    """[S, rows, columns] f32 distance to it."""
+    grid_origin_w: jax.Array
+    """[S, 2] f32 outer corner of cell [0, 0]."""
+    node_xy_w: jax.Array
+    """[S, n, 2] f32 centres of the free cells."""
+    goal_node: jax.Array
+    """[S, G] i32."""
+    num_goals: jax.Array
+    """[S] i32."""
+    distance_m: jax.Array
+    """[S, G, n] f32."""
+    next_node: jax.Array
+    """[S, G, n] u16 or u32: the next free cell on the shortest path; a goal's is itself."""
+    start_xy_w: jax.Array
+    """[S, p, 2] f32 places where the robot stands clear of structure and furniture."""
+    num_starts: jax.Array
+    """[S] i32."""
+    clutter_xy_w: jax.Array
+    """[S, q, 2] f32 places where the largest small object lies clear of structure and furniture."""
+    num_clutter: jax.Array
+    """[S] i32."""
+    cell_m: float = flax.struct.field(pytree_node=False, default=0.1)
+    """Side of a navigation cell."""
+
+
+@flax.struct.dataclass
+class NavInfo:
+    """The task's memory of one episode."""
+
+    scene_index: jax.Array
+    """[] i32."""
+    goal_index: jax.Array
+    """[] i32 row of the goal in the scene's tables."""
+    goal_xy_w: jax.Array
+    """(2,) f32, m."""
+    start_xy_w: jax.Array
+    """(2,) f32, m."""
+    robot_pos_w: jax.Array
+    """(3,) f32, m: base frame."""
+    yaw_rad: jax.Array
+    """[] f32."""
+    waypoints_b: jax.Array
+    """(W, 2) f32, m, robot frame."""
+    object_pos_w: jax.Array
+    """(M, 3) f32, m: centres of mass."""
+    geodesic_m: jax.Array
+    """[] f32 distance to the goal for the body among static structure."""
+    shortest_path_m: jax.Array
+    """[] f32 L*: `geodesic_m` at the start."""
+    robot_path_m: jax.Array
+    """[] f32 l_0."""
+    object_path_m: jax.Array
+    """(M,) f32 l_i."""
+    force_sum_n: jax.Array
+    """[] f32 sum of F_t."""
+    interaction_steps: jax.Array
+    """[] i32 control steps with a touched movable."""
+    structure_steps: jax.Array
+    """[] i32 control steps with a touched wall."""
+    overflow_steps: jax.Array
+    """[] i32 control steps in which a contact or constraint buffer overflowed."""
+    objects_dropped: jax.Array
+    """[] i32 small objects for which no free place was found: parked outside."""
+    step_count: jax.Array
+    """[] i32 control steps done."""
+
+
+@flax.struct.dataclass
+class EpisodeStart:
+    """What one draw of an episode decides."""
+
+    scene_index: jax.Array
+    goal_index: jax.Array
+    start_xy_w: jax.Array
+    start_yaw_rad: jax.Array
+    goal_xy_w: jax.Array
+    small_xy_w: jax.Array
+    """(num_objects, 2) f32."""
+    small_yaw_rad: jax.Array
+    """(num_objects,) f32."""
+    small_placed: jax.Array
+    """(num_objects,) bool; False: parked."""

@@ -1,0 +1,347 @@
+"""Robot, small objects and scenes in, one `World` out: MuJoCo models of equal layout, one per scene.
+
+All scenes are padded to common slots (movable bodies, boxes per body, walls), so that one compiled
+program steps any mix of them: what differs between the models is numbers, never structure. An empty
+slot is a body without a place: it waits at its parking spot and never counts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+
+from interactive_nav.config import NavConfig
+from interactive_nav.objects import SmallObject, pick
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scene import Movable, Scene
+from scenes_mjcf.schema import SceneError
+
+PARKING_W = (200.0, 200.0)
+"""World x, y of the first parking spot; far outside any building."""
+_PARKING_STEP_M = 3.0
+_EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
+_SETTLE_TIME_S = 3.0
+FLOOR_FRICTION = 0.05
+"""Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where things are in the models' state vectors; the same for every scene of a world."""
+
+    robot_qpos: int
+    """Address of the robot's free joint in qpos (7 numbers)."""
+    robot_qvel: int
+    slot_kind: tuple[str, ...]
+    """Per movable slot: 'small', 'free' or 'hinge'."""
+    slot_qpos: np.ndarray
+    """[M] address in qpos: 7 numbers, or 1 for a hinge."""
+    slot_qvel: np.ndarray
+    """[M] address in qvel: 6 numbers, or 1."""
+    slot_body: np.ndarray
+    """[M] body ids."""
+    robot_bodies: np.ndarray
+    """Body ids of the robot's subtree."""
+    structure_body: int
+    force_sensors: np.ndarray
+    """[M + 1] addresses in sensordata of the net force (3) on each slot's body, then on the structure."""
+
+    @property
+    def num_slots(self) -> int:
+        """M."""
+        return len(self.slot_kind)
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """Everything that is constant about a batch of environments, on the host."""
+
+    robot: RobotSpec
+    scenes: tuple[Scene, ...]
+    small_objects: tuple[SmallObject, ...]
+    specs: tuple[mujoco.MjSpec, ...]
+    models: tuple[mujoco.MjModel, ...]
+    """Compiled specs, one per scene, equal in structure."""
+    layout: Layout
+    rest_qpos: np.ndarray
+    """[S, nq]: furniture settled, robot and small objects parked."""
+    robot_mass_kg: float
+    mass_kg: np.ndarray
+    """[S, M], 0 for an empty slot."""
+    occupied: np.ndarray
+    """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
+    names: tuple[tuple[str, ...], ...]
+    """[S][M] body names, '' for an empty slot."""
+    settle_m: np.ndarray
+    """[S, M] how far each piece of furniture moved while settling."""
+
+
+def parking_spot(index: int) -> tuple[float, float]:
+    """World x, y of a parking spot."""
+    return PARKING_W[0] + _PARKING_STEP_M * (index % 16), PARKING_W[1] + _PARKING_STEP_M * (index // 16)
+
+
+def _sorted_movables(scene: Scene) -> tuple[list[Movable], list[Movable]]:
+    free = sorted((m for m in scene.movables if m.hinge is None), key=lambda m: -len(m.boxes))
+    hinged = sorted((m for m in scene.movables if m.hinge is not None), key=lambda m: -len(m.boxes))
+    return free, hinged
+
+
+def _slot(lists: list[list[Movable]], index: int) -> list[Movable | None]:
+    return [movables[index] if index < len(movables) else None for movables in lists]
+
+
+def _add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float) -> None:
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=row[:3],
+        quat=row[3:7],
+        size=row[7:10],
+        mass=0.0,
+        friction=[friction, 0.005, 0.0001],
+        group=3,
+    )
+
+
+def _add_movable(
+    spec: mujoco.MjSpec,
+    name: str,
+    movable: Movable | None,
+    n_boxes: int,
+    kind: str,
+    park: int,
+    collision: str,
+    padded: bool,
+) -> None:
+    x, y = parking_spot(park)
+    if movable is None:
+        body = spec.worldbody.add_body(name=name, pos=[x, y, 2.0])
+        mass, inertia, com, iquat = 1.0, np.full(3, 0.01), np.zeros(3), np.array([1.0, 0, 0, 0])
+        boxes, friction = np.zeros((0, 10)), 0.5
+    else:
+        body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w)
+        mass, inertia, com, iquat = movable.mass_kg, movable.inertia, movable.com_m, movable.inertia_quat
+        boxes, friction = movable.boxes, movable.friction
+    if padded:
+        # An empty slot floats in place. The tiny value keeps the models' structure equal.
+        body.gravcomp = 1.0 if movable is None else 1e-9
+    body.explicitinertial = True
+    body.mass, body.inertia, body.ipos, body.iquat = mass, inertia, com, iquat
+    if kind == "hinge":
+        hinge = movable.hinge if movable else None
+        joint = body.add_joint(name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
+        joint.axis = hinge.axis if hinge else [0, 0, 1]
+        joint.pos = hinge.anchor_m if hinge else [0, 0, 0]
+        joint.limited = True
+        joint.range = hinge.range_rad if hinge and hinge.range_rad else (-math.pi, math.pi)
+        joint.damping = [hinge.damping if hinge else 0.1, 0, 0]
+        joint.frictionloss = hinge.frictionloss if hinge else 0.0
+    else:
+        body.add_freejoint(name=f"{name}_joint")
+    if collision == "hulls" and movable is not None and movable.hulls:
+        for i, vertices in enumerate(movable.hulls):
+            spec.add_mesh(name=f"{name}_mesh_{i}", uservert=np.asarray(vertices, float).ravel())
+            body.add_geom(
+                name=f"{name}_hull_{i}",
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=f"{name}_mesh_{i}",
+                mass=0.0,
+                friction=[friction, 0.005, 0.0001],
+                group=3,
+            )
+        return
+    # A padding box hides at the centre of mass, inside the body, and is too small to be met first.
+    hidden = _EMPTY_BOX.copy()
+    hidden[:3] = com
+    for i in range(n_boxes):
+        _add_box(body, boxes[i] if i < len(boxes) else hidden, f"{name}_box_{i}", friction)
+
+
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> None:
+    x, y = parking_spot(park)
+    body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
+    body.add_freejoint(name=f"{name}_joint")
+    volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
+    for i, box in enumerate(obj.boxes):
+        body.add_geom(
+            name=f"{name}_box_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.centre_m,
+            size=box.half_m,
+            density=obj.mass_kg / volume,
+            friction=[obj.friction, 0.005, 0.0001],
+            group=3,
+        )
+
+
+def _build_spec(
+    robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], small: tuple[SmallObject, ...], config: NavConfig
+) -> tuple[mujoco.MjSpec, list[tuple[str, str]]]:
+    """The padded spec of one scene, and the movable slots as (body name, kind)."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "interactive_nav"
+    option = spec.option
+    option.timestep = config.sim_dt_s
+    option.gravity = [0, 0, -9.81]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = config.solver_iterations
+    option.ls_iterations = 20
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.1],
+        friction=[FLOOR_FRICTION, 0.005, 0.0001],
+    )
+    robot.add_to(spec)
+    slots: list[tuple[str, str]] = []
+    for i, obj in enumerate(small):
+        name = f"{obj.category}_small_{i}"
+        _add_small(spec, name, obj, len(slots))
+        slots.append((name, "small"))
+    lists = [_sorted_movables(s) for s in scenes]
+    for kind, per_scene in (("free", [a for a, _ in lists]), ("hinge", [b for _, b in lists])):
+        for i in range(max(len(x) for x in per_scene)):
+            column = _slot(per_scene, i)
+            n_boxes = max(len(m.boxes) for m in column if m is not None)
+            name = f"{kind}_{i}"
+            _add_movable(spec, name, column[scene_index], n_boxes, kind, len(slots), config.collision, None in column)
+            slots.append((name, kind))
+    structure = spec.worldbody.add_body(name="structure")
+    walls = scenes[scene_index].walls
+    for i in range(max(len(s.walls) for s in scenes)):
+        row = walls[i] if i < len(walls) else _EMPTY_BOX + np.array([0, 0, -5.0 - 0.01 * i, 0, 0, 0, 0, 0, 0, 0])
+        _add_box(structure, row, f"wall_{i}", 0.5)
+    for i, (name, kind) in enumerate(slots):
+        _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
+        if kind == "hinge":
+            # A door leaf hangs in its frame: they touch by design.
+            spec.add_exclude(bodyname1=name, bodyname2="structure")
+    _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
+    return spec, slots
+
+
+def _add_force_sensor(spec: mujoco.MjSpec, robot_body: str, other: str, name: str) -> None:
+    """Net force of the robot's subtree on a body: 3 numbers, world frame."""
+    spec.add_sensor(
+        name=name,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname=robot_body,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname=other,
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],
+    )
+
+
+def _layout(model: mujoco.MjModel, robot: RobotSpec, slots: list[tuple[str, str]]) -> Layout:
+    def body(name: str) -> int:
+        return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+
+    joints = [model.body_jntadr[body(name)] for name, _ in slots]
+    base = body(robot.base_body)
+    joint = model.body_jntadr[base]
+    subtree = [b for b in range(model.nbody) if b == base or model.body_rootid[b] == base]
+    sensors = [model.sensor(f"force_{i}").adr[0] for i in range(len(slots))]
+    return Layout(
+        robot_qpos=int(model.jnt_qposadr[joint]),
+        robot_qvel=int(model.jnt_dofadr[joint]),
+        slot_kind=tuple(kind for _, kind in slots),
+        slot_qpos=np.asarray([model.jnt_qposadr[j] for j in joints], np.int32),
+        slot_qvel=np.asarray([model.jnt_dofadr[j] for j in joints], np.int32),
+        slot_body=np.asarray([body(name) for name, _ in slots], np.int32),
+        robot_bodies=np.asarray(subtree, np.int32),
+        structure_body=body("structure"),
+        force_sensors=np.asarray([*sensors, model.sensor("force_structure").adr[0]], np.int32),
+    )
+
+
+def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
+    """Rest configuration [nq]: furniture falls and slides to rest, with the robot parked."""
+    data = mujoco.MjData(model)
+    x, y = parking_spot(layout.num_slots)
+    adr = layout.robot_qpos
+    data.qpos[adr : adr + 7] = [x, y, robot.spawn_height_m, 1, 0, 0, 0]
+    start = data.qpos.copy()
+    steps = math.ceil(_SETTLE_TIME_S / model.opt.timestep)
+    iterations = model.opt.iterations
+    model.opt.iterations = max(100, iterations)
+    for step in range(steps):
+        mujoco.mj_step(model, data)
+        # Overlaps of the boxes are pushed apart slowly, not flung.
+        if step < steps // 2:
+            data.qvel *= 0.8
+    model.opt.iterations = iterations
+    qpos = data.qpos.copy()
+    qpos[adr : adr + 7] = start[adr : adr + 7]
+    return qpos
+
+
+def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) -> World:
+    """Compiles one padded model per scene and settles its furniture under the environment's own physics.
+
+    Args:
+        robot: the robot's spec.
+        scenes: at least one; hull collision takes exactly one.
+        config: the environment's settings.
+
+    Raises:
+        ValueError: no scene, or hulls with several scenes.
+        SceneError: a scene whose furniture does not come to rest at finite coordinates.
+    """
+    if not scenes:
+        raise ValueError("scenes is empty, expected at least one scene folder")
+    if config.collision == "hulls" and len(scenes) > 1:
+        raise ValueError(
+            f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
+            "use collision='boxes'"
+        )
+    small = pick(config.num_objects)
+    specs, models, slots = [], [], []
+    for i in range(len(scenes)):
+        spec, slots = _build_spec(robot, i, scenes, small, config)
+        specs.append(spec)
+        models.append(spec.compile())
+    layout = _layout(models[0], robot, slots)
+    occupied, mass, names, rest, moved = [], [], [], [], []
+    for scene, model in zip(scenes, models, strict=True):
+        free, hinged = _sorted_movables(scene)
+        count = {"free": len(free), "hinge": len(hinged)}
+        own, label = [], []
+        for name, kind in slots:
+            index = int(name.rsplit("_", 1)[1])
+            own.append(kind == "small" or index < count[kind])
+            source = {"free": free, "hinge": hinged}.get(kind)
+            label.append(name if source is None else source[index].name if index < len(source) else "")
+        own = np.asarray(own, bool)
+        qpos = _settle(model, layout, robot)
+        if not np.isfinite(qpos).all():
+            raise SceneError(f"{scene.path}: its furniture does not settle (non-finite); convert the scene again")
+        shift = [
+            np.linalg.norm(qpos[q : q + 3] - model.qpos0[q : q + 3]) if kind == "free" else 0.0
+            for q, kind in zip(layout.slot_qpos, layout.slot_kind, strict=True)
+        ]
+        occupied.append(own)
+        names.append(tuple(label))
+        mass.append(np.where(own, model.body_mass[layout.slot_body], 0.0))
+        rest.append(qpos)
+        moved.append(np.where(own, shift, 0.0))
+    return World(
+        robot=robot,
+        scenes=scenes,
+        small_objects=small,
+        specs=tuple(specs),
+        models=tuple(models),
+        layout=layout,
+        rest_qpos=np.asarray(rest),
+        robot_mass_kg=float(models[0].body_mass[layout.robot_bodies].sum()),
+        mass_kg=np.asarray(mass),
+        occupied=np.asarray(occupied),
+        names=tuple(names),
+        settle_m=np.asarray(moved),
+    )

@@ -1,0 +1,96 @@
+"""The seam to learners: a batched environment whose finished episodes are followed by newly drawn ones.
+
+Brax's own auto-reset returns each environment's first state again, so an environment would repeat one
+episode for ever, and what the task keeps in `info` would leak into it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from interactive_nav.env import EPISODE_METRICS, InteractiveNav
+
+
+class AutoResetEnv(Env):
+    """N environments as one natively batched Brax environment (`wrap_env=False` for Brax's learners).
+
+    `reward`, `done`, `info["truncation"]`, `info["time_out"]` and `metrics` belong to the step just made;
+    where an episode ended, `obs`, `pipeline_state` and `info["nav"]` are those of a new one. `info` also has
+    `steps` [N] (of the episode that the step belongs to), `episode_done` [N] and `episode_metrics`: name ->
+    [N], the scores of the last finished episode, with `length` and `sum_reward`.
+    """
+
+    def __init__(self, env: InteractiveNav):
+        self.env = env
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation."""
+        return self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions."""
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """Physics backend in use."""
+        return self.env.backend
+
+    @property
+    def unwrapped(self) -> InteractiveNav:  # type: ignore[override]
+        """The single environment."""
+        return self.env
+
+    def reset(self, rng: jax.Array) -> State:
+        """[N, 2] keys to N states."""
+        state = jax.vmap(self.env.reset)(rng)
+        zero = jnp.zeros(rng.shape[0])
+        info = {
+            **state.info,
+            "steps": zero,
+            "episode_done": zero,
+            "running_reward": zero,
+            "episode_metrics": {name: zero for name in (*EPISODE_METRICS, "length", "sum_reward")},
+        }
+        return state.replace(info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """N states and [N, A] actions to N states."""
+        stepped = jax.vmap(self.env.step)(state, action)
+        done = stepped.done > 0
+        steps = stepped.info["nav"].step_count.astype(jnp.float32)
+        total = state.info["running_reward"] + stepped.reward
+        finished = {name: stepped.metrics[name] for name in EPISODE_METRICS}
+        finished |= {"length": steps, "sum_reward": total}
+        last = state.info["episode_metrics"]
+        episode_metrics = {name: jnp.where(done, finished[name], last[name]) for name in last}
+
+        def draw(current):
+            return self._with_new_episodes(current, done)
+
+        moving = (stepped.pipeline_state, stepped.obs, stepped.info["nav"], stepped.info["rng"])
+        physics, obs, nav, rng = jax.lax.cond(done.any(), draw, lambda x: x, moving)
+        info = {
+            **stepped.info,
+            "nav": nav,
+            "rng": rng,
+            "steps": steps,
+            "episode_done": stepped.done,
+            "running_reward": jnp.where(done, 0.0, total),
+            "episode_metrics": episode_metrics,
+        }
+        return stepped.replace(pipeline_state=physics, obs=obs, info=info)
+
+    def _with_new_episodes(self, current, done: jax.Array):
+        rng = current[3]
+        fresh = jax.vmap(self.env.reset)(rng)
+        new = (fresh.pipeline_state, fresh.obs, fresh.info["nav"], fresh.info["rng"])
+
+        def choose(a, b):
+            return jnp.where(done.reshape(done.shape + (1,) * (a.ndim - 1)), a, b)
+
+        return jax.tree.map(choose, new, current)

@@ -1,0 +1,198 @@
+"""The scene folder's contract: `scene.json` and `maps.npz` in, typed and checked records out, and back.
+
+A scene folder holds `scene.xml` (MJCF), `scene.json` (this module's `SceneManifest`), `maps.npz`
+(`SceneMaps`) and `assets/`. World frame: z up, metres, floor at z = 0. See `scenes_mjcf/README.md`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SCHEMA_VERSION = 1
+CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy")
+SPLITS = ("train", "test")
+
+
+class SceneError(ValueError):
+    """A scene folder that cannot be used; the message says what, where, what was expected and what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneObject:
+    """One movable object of a scene."""
+
+    name: str
+    """Body name in scene.xml, `<category>_<k>`."""
+    category: str
+    """One of `CATEGORIES`."""
+    mass_kg: float
+    """Density times decomposed volume, or the source's own mass."""
+    friction: float
+    """Sliding friction coefficient of its geoms."""
+    n_hulls: int
+    """Convex hulls (and as many boxes) it collides with."""
+    cad_id: str
+    """Identifier of the CAD model in its library."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneManifest:
+    """Content of `scene.json`: what a scene is, where it came from, and which gates it passed."""
+
+    name: str
+    split: str
+    source: dict[str, Any]
+    """`format`, path names relative to the source folder, and their `sha256`."""
+    licence: str
+    floor_area_m2: float
+    objects: tuple[SceneObject, ...]
+    collision: dict[str, Any]
+    """Decomposition parameters."""
+    gates: dict[str, Any]
+    """Gate name -> {passed, value, limit, unit}."""
+    versions: dict[str, str]
+    """Package versions that wrote the folder."""
+    alignment: tuple[dict[str, Any], ...] = ()
+    """Per object: residual of the keypoint fit and difference to the annotated pose."""
+    schema_version: int = SCHEMA_VERSION
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneMaps:
+    """Content of `maps.npz`."""
+
+    traversable: np.ndarray
+    """[rows along y, columns along x] bool; static structure only, not eroded."""
+    resolution_m: float
+    """Cell side."""
+    origin_w: tuple[float, float]
+    """World x, y of the outer corner of cell [0, 0]."""
+    floor_height_m: float
+    """Height of the floor in the scan's own frame (0 in the scene's)."""
+
+
+def _known_keys(data: dict[str, Any], cls: type, where: str) -> dict[str, Any]:
+    names = {f.name for f in dataclasses.fields(cls)}
+    required = {
+        f.name
+        for f in dataclasses.fields(cls)
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    }
+    for key in data:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(sorted(names))}"
+            raise SceneError(f"{where}: unknown key '{key}'{hint}")
+    missing = sorted(required - data.keys())
+    if missing:
+        raise SceneError(f"{where}: missing key '{missing[0]}'; convert the scene again to rewrite the file")
+    return data
+
+
+def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
+    """Builds a manifest from decoded JSON.
+
+    Args:
+        data: the decoded object.
+        where: file named in errors.
+
+    Raises:
+        SceneError: unknown or missing key, unknown category or split, non-positive mass or friction.
+    """
+    if not isinstance(data, dict):
+        raise SceneError(f"{where}: got {type(data).__name__}, expected a JSON object")
+    data = dict(_known_keys(data, SceneManifest, where))
+    if data.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        raise SceneError(
+            f"{where}: schema_version is {data['schema_version']}, expected {SCHEMA_VERSION}; convert the scene again"
+        )
+    objects = []
+    for i, raw in enumerate(data["objects"]):
+        here = f"{where}: objects[{i}]"
+        obj = SceneObject(**_known_keys(raw, SceneObject, here))
+        if obj.category not in CATEGORIES:
+            raise SceneError(f"{here}: category is '{obj.category}', expected one of {', '.join(CATEGORIES)}")
+        for field in ("mass_kg", "friction"):
+            value = getattr(obj, field)
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
+                raise SceneError(f"{here}: {field} is {value!r}, expected a positive number")
+        objects.append(obj)
+    names = [o.name for o in objects]
+    if len(set(names)) != len(names):
+        raise SceneError(f"{where}: two objects share a name; names must be unique")
+    if data["split"] not in SPLITS:
+        raise SceneError(f"{where}: split is {data['split']!r}, expected one of {', '.join(SPLITS)}")
+    data["objects"] = tuple(objects)
+    data["alignment"] = tuple(data.get("alignment", ()))
+    return SceneManifest(**data)
+
+
+def load_manifest(folder: str | Path) -> SceneManifest:
+    """Reads and checks `folder/scene.json`.
+
+    Raises:
+        SceneError: the folder or file is missing, is not JSON, or breaks the schema.
+    """
+    path = Path(folder) / "scene.json"
+    if not path.is_file():
+        raise SceneError(
+            f"{path}: no such file; expected a scene folder (scene.xml, scene.json, maps.npz, assets/), "
+            "make one with 'python -m converters convert SRC OUT'"
+        )
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: not readable as JSON ({error}); convert the scene again") from error
+    return manifest_from_dict(data, str(path))
+
+
+def save_manifest(manifest: SceneManifest, folder: str | Path) -> None:
+    """Writes `folder/scene.json` with sorted keys, so that equal manifests give equal bytes."""
+    text = json.dumps(dataclasses.asdict(manifest), indent=1, sort_keys=True, allow_nan=False)
+    (Path(folder) / "scene.json").write_text(text + "\n", encoding="utf-8")
+
+
+def load_maps(folder: str | Path) -> SceneMaps:
+    """Reads and checks `folder/maps.npz`.
+
+    Raises:
+        SceneError: missing or unreadable file, wrong shapes, resolution coarser than 0.05 m, or no traversable cell.
+    """
+    path = Path(folder) / "maps.npz"
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file; convert the scene again")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            traversable = arrays["traversable"]
+            resolution = float(arrays["resolution"])
+            origin = np.asarray(arrays["origin"], float).reshape(-1)
+            floor_height = float(arrays["floor_height"])
+    except (OSError, KeyError, ValueError, EOFError) as error:
+        raise SceneError(f"{path}: not readable ({error}); convert the scene again") from error
+    if traversable.ndim != 2 or traversable.dtype != np.bool_:
+        raise SceneError(f"{path}: traversable is {traversable.dtype}{traversable.shape}, expected a 2-D bool array")
+    if not 0 < resolution <= 0.05 + 1e-9:
+        raise SceneError(f"{path}: resolution is {resolution} m, expected at most 0.05 m")
+    if origin.shape != (2,):
+        raise SceneError(f"{path}: origin has shape {origin.shape}, expected (2,)")
+    if not traversable.any():
+        raise SceneError(f"{path}: the traversable map is empty; the scan needs visible floor")
+    return SceneMaps(traversable, resolution, (float(origin[0]), float(origin[1])), floor_height)
+
+
+def save_maps(maps: SceneMaps, folder: str | Path) -> None:
+    """Writes `folder/maps.npz`."""
+    np.savez_compressed(
+        Path(folder) / "maps.npz",
+        traversable=np.asarray(maps.traversable, bool),
+        resolution=np.float64(maps.resolution_m),
+        origin=np.asarray(maps.origin_w, np.float64),
+        floor_height=np.float64(maps.floor_height_m),
+    )
