@@ -80,7 +80,9 @@ def draw_episode(
         return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None
 
     nothing = (jnp.zeros((count, 2)), jnp.zeros((count,), bool))
-    (small_xy, small_placed), _ = jax.lax.scan(place, nothing, jnp.arange(count))
+    small_xy, small_placed = nothing
+    if count:
+        (small_xy, small_placed), _ = jax.lax.scan(place, nothing, jnp.arange(count))
     return EpisodeStart(
         scene_index=scene,
         goal_index=goals[chosen],

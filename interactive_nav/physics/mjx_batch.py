@@ -25,6 +25,9 @@ _UNUSED_BY_MJX = {
     "geom_sameframe",
     "body_simple",
     "dof_simplenum",
+    "bvh_nodeid",
+    "bvh_child",
+    "bvh_depth",
 }
 BATCHABLE = frozenset(
     "geom_size geom_pos geom_quat geom_rbound geom_aabb geom_friction body_mass body_inertia body_ipos body_iquat "
@@ -98,15 +101,24 @@ class MjxPhysics(Physics):
             data = template.replace(
                 qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
             )
-            forces, overflow = [], jnp.asarray(0, jnp.int32)
-            for _ in range(self._substeps):
-                data = mjx.step(model, data)
-                if self.name == "warp":
-                    forces.append(data.sensordata[self._sensors])
+            if self.name == "jax":
+
+                def substep(data, _):
+                    data = mjx.step(model, data)
+                    return data, self._forces_from_contacts(data)
+
+                data, forces = jax.lax.scan(substep, data, None, length=self._substeps)
+                overflow = jnp.asarray(0, jnp.int32)
+            else:
+                # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's
+                # carry cannot.
+                collected, overflow = [], jnp.asarray(0, jnp.int32)
+                for _ in range(self._substeps):
+                    data = mjx.step(model, data)
+                    collected.append(data.sensordata[self._sensors])
                     overflow |= self._overflowed(data)
-                else:
-                    forces.append(self._forces_from_contacts(model, data))
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), jnp.stack(forces), overflow
+                forces = jnp.stack(collected)
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), forces, overflow
 
         new, forces, overflow = jax.vmap(one)(scene, state, ctrl)
         force_n, slot_n, structure_n = summarise_forces(forces)
@@ -132,25 +144,28 @@ class MjxPhysics(Physics):
         )
         return ((data._impl.overflow & dropped) != 0).astype(jnp.int32)
 
-    def _forces_from_contacts(self, model, data) -> jax.Array:
+    def _forces_from_contacts(self, data) -> jax.Array:
         """[M + 1, 3] net force of the robot on each slot and the structure, world frame, from MJX-JAX's contacts."""
-        contact = data._impl.contact
-        geom = contact.geom
-        robot = jnp.asarray(self._slot_of_geom == _ROBOT)
-        slot = jnp.asarray(self._slot_of_geom)
-        first, second = geom[:, 0], geom[:, 1]
-        target = jnp.where(robot[first], slot[second], jnp.where(robot[second], slot[first], -1))
-        target = jnp.where(robot[first] & robot[second], -1, target)
-        forces = []
-        for i in range(geom.shape[0]):
-            forces.append(mjx._src.support.contact_force(model, data, i, True)[:3])
-        if not forces:
-            return jnp.zeros((len(self._sensors), 3))
-        # A contact's frame points from its first geom to its second, and its force acts on the second.
-        sign = jnp.where(robot[first], 1.0, -1.0)[:, None]
-        rows = jnp.where(target[:, None] >= 0, jnp.stack(forces) * sign, 0.0)
+        contact, efc = data._impl.contact, data._impl.efc_force
         out = jnp.zeros((len(self._sensors), 3))
-        return out.at[jnp.maximum(target, 0)].add(rows)
+        dims, address = np.asarray(contact.dim), np.asarray(contact.efc_address)
+        slot = jnp.asarray(self._slot_of_geom)
+        for dim in np.unique(dims):
+            at = np.flatnonzero((dims == dim) & (address >= 0))
+            rows = efc[address[at][:, None] + np.arange(1 if dim == 1 else 2 * (dim - 1))]
+            # Pyramidal cone: the normal force is the sum over the pyramid's edges, a tangential one the
+            # difference of its pair of edges times the friction coefficient.
+            local = rows.sum(-1)[:, None]
+            if dim >= 3:
+                pairs = rows.reshape(len(at), dim - 1, 2)[:, :2]
+                local = jnp.concatenate([local, (pairs[..., 0] - pairs[..., 1]) * contact.friction[at, :2]], -1)
+            force = jnp.einsum("nk,nkj->nj", local, contact.frame[at][:, : local.shape[1]])
+            first, second = slot[contact.geom[at, 0]], slot[contact.geom[at, 1]]
+            # A contact's frame points from its first geom to its second, and its force acts on the second.
+            given = jnp.where((first == _ROBOT)[:, None], force, -force)
+            target = jnp.where(first == _ROBOT, second, jnp.where(second == _ROBOT, first, -1))
+            out = out.at[jnp.maximum(target, 0)].add(jnp.where(target[:, None] >= 0, given, 0.0))
+        return out
 
 
 _ROBOT = -2

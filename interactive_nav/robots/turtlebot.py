@@ -69,11 +69,19 @@ def _add_to(spec: mujoco.MjSpec) -> None:
         )
     for side, sign in (("left", 1.0), ("right", -1.0)):
         wheel = base.add_body(name=f"turtlebot_wheel_{side}", pos=[0.0, sign * HALF_TRACK_M, WHEEL_RADIUS_M])
+        # The torque limit sits on the joint: with an actuator's own limit, C MuJoCo drops the implicit
+        # damping of a saturated motor and MJX-JAX keeps it, so that their robots accelerate differently.
         wheel.add_joint(
-            name=f"turtlebot_wheel_{side}_joint", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, 1.0, 0.0], armature=1e-3
+            name=f"turtlebot_wheel_{side}_joint",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=[0.0, 1.0, 0.0],
+            armature=1e-3,
+            actfrclimited=True,
+            actfrcrange=[-WHEEL_TORQUE_NM, WHEEL_TORQUE_NM],
         )
         wheel.explicitinertial = True
         wheel.mass = 0.1
+        wheel.ipos = [0.0, 0.0, 0.0]
         wheel.inertia = [4e-5, 6.2e-5, 4e-5]
         wheel.add_geom(
             name=f"turtlebot_wheel_{side}",
@@ -94,8 +102,6 @@ def _add_to(spec: mujoco.MjSpec) -> None:
             biasprm=[0.0, 0.0, -_VELOCITY_GAIN] + [0.0] * 7,
             ctrllimited=True,
             ctrlrange=list(WHEEL_SPEED_RAD_S),
-            forcelimited=True,
-            forcerange=[-WHEEL_TORQUE_NM, WHEEL_TORQUE_NM],
         )
 
 

@@ -1,0 +1,244 @@
+"""`python -m converters convert|check|generate|preview`: parses, prints, sets exit codes.
+
+Exit codes: 0 done, 1 a gate failed, 2 unusable input (one line on stderr), 130 or 143 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from converters.gates import Gate
+
+
+class Interrupted(BaseException):
+    """SIGTERM arrived; unwinds like Ctrl-C so that every `finally` runs."""
+
+
+def _on_sigterm(signum: int, frame: FrameType | None) -> None:
+    raise Interrupted
+
+
+@contextlib.contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
+    """One bar over the whole work, with the stage's name and the time left."""
+    with Progress(
+        TextColumn("{task.description:<16}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=False,
+    ) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda stage, share: bar.update(task, description=stage, completed=share)
+
+
+def _bounds(gate: Gate) -> str:
+    pairs = ((">=", gate.limit.least), ("<=", gate.limit.most))
+    return " ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
+
+
+def _gate_table(gates: tuple[Gate, ...]) -> Table:
+    table = Table("gate", "value", "limit", "", title="Gates")
+    for gate in gates:
+        verdict = "[green]PASS[/green]" if gate.passed else "[red]FAIL[/red]"
+        table.add_row(gate.name, f"{gate.value:.5g} {gate.limit.unit}", _bounds(gate), verdict)
+    return table
+
+
+def _alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
+    """Units in the head; `settled` is how far the short simulation moved the object from its annotation."""
+    table = Table(
+        "object",
+        "pairs",
+        "rms cm",
+        "shift cm",
+        "yaw °",
+        "scale x y z",
+        "tilt °",
+        "settled cm",
+        title="Pose re-solved from keypoints, against the annotated pose",
+    )
+    for row in rows:
+        if row["solved"]:
+            solved = (
+                f"{100 * row['rms_m']:.1f}",
+                f"{100 * row['translation_difference_m']:.1f}",
+                f"{row['yaw_difference_deg']:.1f}",
+                " ".join(f"{v:.2f}" for v in row["scale_ratio"]),
+            )
+        else:
+            solved = ("-", "-", "-", row["reason"])
+        table.add_row(
+            row["name"],
+            str(row["n_keypoints"]),
+            *solved,
+            f"{row['tilt_removed_deg']:.1f}",
+            f"{100 * row['settle_shift_m']:.1f}",
+        )
+    return table
+
+
+def _convert(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.pipeline import ConvertConfig, convert
+
+    config = ConvertConfig(
+        format=arguments.format,
+        split=arguments.split,
+        jobs=arguments.jobs,
+        seed=arguments.seed,
+        overwrite=arguments.overwrite,
+    )
+    with _progress(console) as report:
+        result = convert(arguments.source, arguments.out, config, report)
+    console.print(_alignment_table(result.manifest.alignment))
+    console.print(_gate_table(result.gates))
+    times = ", ".join(f"{k} {v:.1f}" for k, v in result.stage_s.items())
+    failed = [g.name for g in result.gates if not g.passed]
+    console.print(f"Seconds: {times}", soft_wrap=True)
+    console.print(
+        f"{arguments.out}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
+        f"{result.manifest.floor_area_m2:.1f} m² traversable; "
+        + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
+        soft_wrap=True,
+    )
+    return 0
+
+
+def _check(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.gates import check_folder
+
+    manifest, gates = check_folder(arguments.scene)
+    for gate in gates:
+        verdict = "PASS" if gate.passed else "FAIL"
+        print(
+            f"{verdict}  {gate.name:<18} {gate.value:>10.5g} {gate.limit.unit:<6} limit {_bounds(gate):<8} "
+            f"({gate.limit.meaning})"
+        )
+    failed = sum(not g.passed for g in gates)
+    print(f"{manifest.name}: {len(gates) - failed} of {len(gates)} gates pass")
+    return 1 if failed else 0
+
+
+def _generate(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.generate import generate_building
+
+    with _progress(console) as report:
+        generate_building(arguments.out, arguments.seed, report)
+    console.print(
+        f"{arguments.out}: building of seed {arguments.seed}; convert it with "
+        f"'python -m converters convert {arguments.out} SCENE_DIR'",
+        soft_wrap=True,
+    )
+    return 0
+
+
+def _preview(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.preview import preview
+
+    preview(arguments.scene, arguments.output)
+    console.print(f"{arguments.output}: picture of {arguments.scene}", soft_wrap=True)
+    return 0
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not a positive number")
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m converters", description="Raw scans to MuJoCo scene folders."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    convert = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
+    convert.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
+    convert.add_argument(
+        "out", type=Path, metavar="OUT", help="scene folder to make; its name becomes the scene's"
+    )
+    convert.add_argument(
+        "--format",
+        choices=("auto", "gibson", "scan2cad"),
+        default="auto",
+        help="layout of SRC (default: told from its files)",
+    )
+    convert.add_argument("--split", choices=("train", "test"), default="train", help="recorded in scene.json")
+    convert.add_argument(
+        "--jobs",
+        type=_positive,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="decompositions side by side (default: one a processor)",
+    )
+    convert.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
+    convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
+    convert.set_defaults(run=_convert)
+    check = commands.add_parser(
+        "check", help="run the acceptance gates on a scene folder; exit 1 if one fails"
+    )
+    check.add_argument("scene", type=Path, metavar="SCENE_DIR")
+    check.set_defaults(run=_check)
+    generate = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
+    generate.add_argument("out", type=Path, metavar="OUT", help="folder to make")
+    generate.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
+    generate.set_defaults(run=_generate)
+    preview = commands.add_parser("preview", help="draw a scene folder from above")
+    preview.add_argument("scene", type=Path, metavar="SCENE_DIR")
+    preview.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
+    preview.set_defaults(run=_preview)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command and returns its exit code."""
+    arguments = _parser().parse_args(argv)
+    signal.signal(signal.SIGTERM, _on_sigterm)
+    console = Console()
+    try:
+        return arguments.run(arguments, console)
+    except KeyboardInterrupt:
+        print("interrupted; nothing was written", file=sys.stderr)
+        return 130
+    except Interrupted:
+        print("terminated; nothing was written", file=sys.stderr)
+        return 143
+    except OSError as error:
+        print(f"error: {error.filename or 'file system'}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except (ValueError, RuntimeError) as error:
+        from converters.errors import SceneRejected, StageFailed
+        from scenes_mjcf.schema import SceneError
+
+        known = isinstance(error, (SceneRejected, StageFailed, SceneError))
+        if not known and type(error).__name__ != "GenerationError":
+            raise
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

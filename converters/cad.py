@@ -1,0 +1,100 @@
+"""A ShapeNet-like OBJ with its materials in, one `CadModel` (z up, a colour per face) out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from converters.errors import SceneRejected
+from converters.files import SourceFolder, check_mesh
+from converters.raw import SYNSETS, CadModel
+
+Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns a y-up vector into a z-up one: x stays, y becomes z, z becomes -y."""
+
+
+def _face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(m, 3) uint8 colour of every face: its texture at the face's middle, else the material's."""
+    count = len(mesh.faces)
+    material = getattr(mesh.visual, "material", None)
+    uv = getattr(mesh.visual, "uv", None)
+    image = getattr(material, "image", None)
+    if image is not None and uv is not None and len(uv) == len(mesh.vertices):
+        pixels = np.asarray(image.convert("RGB"))
+        middle = np.asarray(uv)[mesh.faces].mean(axis=1)
+        middle = np.where(np.isfinite(middle), middle, 0.0) % 1.0
+        column = np.minimum((middle[:, 0] * pixels.shape[1]).astype(int), pixels.shape[1] - 1)
+        row = np.minimum(((1.0 - middle[:, 1]) * pixels.shape[0]).astype(int), pixels.shape[0] - 1)
+        return pixels[row, column]
+    diffuse = getattr(material, "diffuse", None)
+    if diffuse is not None:
+        return np.tile(np.asarray(diffuse, np.uint8)[:3], (count, 1))
+    return np.full((count, 3), 160, np.uint8)
+
+
+def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
+    """Reads `cad/<synset>/<id>/models/model_normalized.obj` and turns it to z up.
+
+    Raises:
+        SceneRejected: unknown synset, absent model, or unreadable file.
+    """
+    if synset not in SYNSETS:
+        known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
+        raise SceneRejected(
+            f"{source.root}: CAD model {cad_id} has category id {synset}, expected one of {known}"
+        )
+    relative = f"cad/{synset}/{cad_id}/models/model_normalized.obj"
+    path = source.use(
+        relative,
+        f"an annotation names CAD model {cad_id} of category {synset} ({SYNSETS[synset]}); "
+        "put the model there or remove the annotation",
+    )
+    _use_material_files(source, path)
+    try:
+        loaded = trimesh.load(path, process=False, force="scene")
+        assert isinstance(loaded, trimesh.Scene)
+        parts = [m for m in loaded.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
+    except Exception as error:  # trimesh's loaders raise anything on a broken file
+        raise SceneRejected(
+            f"{path}: not readable as a mesh ({type(error).__name__}: {error}); fetch the model again"
+        ) from error
+    if not parts:
+        raise SceneRejected(f"{path}: no faces, expected a triangle mesh; fetch the model again")
+    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
+    vertices = np.vstack([np.asarray(m.vertices, float) for m in parts])
+    faces = np.vstack([np.asarray(m.faces, np.int64) + o for m, o in zip(parts, offsets, strict=True)])
+    colours = np.vstack([_face_colours(m) for m in parts])
+    check_mesh(path, vertices, faces)
+    vertices, faces, keep = merge_vertices(vertices, faces)
+    return CadModel(SYNSETS[synset], cad_id, vertices @ Y_UP_TO_Z_UP.T, faces, colours[keep].astype(np.uint8))
+
+
+def _use_material_files(source: SourceFolder, obj: Path) -> None:
+    """Records the hashes of the MTL and its images; a missing one only costs colour, so it is no error."""
+    for mtl in sorted(obj.parent.glob("*.mtl")):
+        source.use(str(mtl.relative_to(source.root)), "")
+        for line in mtl.read_text(encoding="utf-8", errors="replace").splitlines():
+            words = line.split()
+            if len(words) >= 2 and words[0].lower() == "map_kd":
+                image = (mtl.parent / words[-1]).resolve()
+                if image.is_file() and image.is_relative_to(source.root.resolve()):
+                    source.use(str(image.relative_to(source.root.resolve())), "")
+
+
+def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joins vertices at equal positions (to 1e-6 of the extent) and drops faces that collapse.
+
+    Returns:
+        vertices (n', 3), faces (m', 3), keep (m',) indices of the faces that stayed.
+    """
+    step = max(float(np.ptp(vertices, axis=0).max()), 1e-9) * 1e-6
+    _, first, inverse = np.unique(
+        np.round(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    faces = inverse.reshape(-1)[faces]
+    keep = np.flatnonzero(
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    return vertices[first], faces[keep], keep

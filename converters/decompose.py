@@ -1,0 +1,186 @@
+"""CAD meshes in, convex hulls out: coacd in one process a model, results cached by content.
+
+coacd runs outside this process because it prints its log to the terminal, may crash on bad meshes, and
+cannot be interrupted from Python. A model is decomposed once, unscaled: scaling keeps a hull convex.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from converters.errors import StageFailed
+from converters.objects import Hull
+
+
+@dataclasses.dataclass(frozen=True)
+class DecomposeConfig:
+    """coacd's parameters; the values were chosen by measurement (quick settings, hull mode)."""
+
+    threshold: float = 0.1
+    max_convex_hull: int = 12
+    preprocess_resolution: int = 30
+    resolution: int = 800
+    mcts_nodes: int = 10
+    mcts_iterations: int = 40
+    mcts_max_depth: int = 2
+    max_ch_vertex: int = 32
+    """Vertices of a hull: keeps collision cheap and the assets small."""
+    seed: int = 0
+    timeout_s: float = 240.0
+
+
+def cache_folder() -> Path:
+    """`$INTERACTIVE_NAV_CACHE/hulls`, else `$XDG_CACHE_HOME/interactive_nav/hulls`, else `~/.cache/...`."""
+    own = os.environ.get("INTERACTIVE_NAV_CACHE")
+    if own:
+        return Path(own) / "hulls"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav" / "hulls"
+
+
+def content_key(vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig) -> str:
+    """sha256 over the mesh, the parameters and coacd's version."""
+    from importlib.metadata import version
+
+    digest = hashlib.sha256()
+    digest.update(np.ascontiguousarray(vertices, np.float64).tobytes())
+    digest.update(np.ascontiguousarray(faces, np.int64).tobytes())
+    parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
+    digest.update(repr((sorted(parameters.items()), version("coacd"))).encode())
+    return digest.hexdigest()
+
+
+def _load(path: Path) -> tuple[Hull, ...] | None:
+    """Hulls from a cache file; None where it is missing or damaged (then it is made again)."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            count = int(arrays["count"])
+            return tuple(Hull(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(count)) or None
+    except (OSError, KeyError, ValueError, EOFError):
+        return None
+
+
+def _store(path: Path, hulls: tuple[Hull, ...]) -> None:
+    """Writes beside and renames, so that two writers of one key leave one whole file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {f"v{i}": h.vertices for i, h in enumerate(hulls)} | {
+        f"f{i}": h.faces for i, h in enumerate(hulls)
+    }
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
+    os.close(handle)
+    try:
+        np.savez_compressed(temporary, count=len(hulls), **arrays)  # pyright: ignore[reportArgumentType]
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+@dataclasses.dataclass
+class _Job:
+    key: str
+    name: str
+    process: subprocess.Popen
+    started: float
+    output: Path
+
+
+def decompose_all(
+    meshes: dict[str, tuple[np.ndarray, np.ndarray]],
+    config: DecomposeConfig,
+    jobs: int,
+    cache: Path,
+    progress: Callable[[float], None] | None = None,
+) -> dict[str, tuple[Hull, ...]]:
+    """Decomposes every mesh, `jobs` processes at a time.
+
+    Args:
+        meshes: name -> (vertices (n, 3), faces (m, 3)).
+        config: coacd's parameters.
+        jobs: processes side by side.
+        cache: folder of hulls by content.
+        progress: called with the share that is done, 0 to 1.
+
+    Returns:
+        name -> hulls, in the meshes' own frame.
+
+    Raises:
+        StageFailed: coacd failed or ran past the time limit; the message names the model.
+    """
+    keys = {name: content_key(v, f, config) for name, (v, f) in meshes.items()}
+    done: dict[str, tuple[Hull, ...]] = {}
+    waiting: list[tuple[str, str]] = []
+    for name, key in keys.items():
+        found = _load(cache / f"{key}.npz")
+        if found is not None:
+            done[key] = found
+        elif key not in {k for k, _ in waiting}:
+            waiting.append((key, name))
+    # The largest first: the tail of the stage is then short.
+    waiting.sort(key=lambda item: -len(meshes[item[1]][1]))
+    total = len(set(keys.values()))
+    running: list[_Job] = []
+    with tempfile.TemporaryDirectory(prefix="hulls-") as scratch:
+        try:
+            while waiting or running:
+                while waiting and len(running) < max(jobs, 1):
+                    key, name = waiting.pop(0)
+                    running.append(_start(key, name, *meshes[name], config, Path(scratch)))
+                for job in list(running):
+                    if job.process.poll() is None:
+                        if time.monotonic() - job.started > config.timeout_s:
+                            raise StageFailed(
+                                f"decompose: coacd ran past {config.timeout_s:.0f} s on {job.name}"
+                            )
+                        continue
+                    running.remove(job)
+                    hulls = _load(job.output) if job.process.returncode == 0 else None
+                    if hulls is None:
+                        log = job.output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
+                        last = log[-1] if log else "no message"
+                        raise StageFailed(
+                            f"decompose: coacd failed on {job.name} (exit code {job.process.returncode}: "
+                            f"{last})"
+                        )
+                    _store(cache / f"{job.key}.npz", hulls)
+                    done[job.key] = hulls
+                if progress is not None:
+                    progress(len(done) / max(total, 1))
+                if running:
+                    time.sleep(0.05)
+        finally:
+            for job in running:
+                job.process.kill()
+                job.process.wait()
+    return {name: done[key] for name, key in keys.items()}
+
+
+def _start(
+    key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path
+) -> _Job:
+    mesh_path, output = scratch / f"{key}.in.npz", scratch / f"{key}.npz"
+    parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
+    np.savez(mesh_path, vertices=vertices, faces=faces, **parameters)  # pyright: ignore[reportArgumentType]
+    # One thread each: results then do not depend on the machine's load, and `jobs` is what it says.
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    with output.with_suffix(".log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "converters.coacd_worker", str(mesh_path), str(output)],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            cwd=Path(__file__).resolve().parent.parent,
+        )
+    return _Job(key, name, process, time.monotonic(), output)

@@ -1,0 +1,11 @@
+"""Errors that a user of the converter can act on: one line with what, where, expected, remedy."""
+
+from __future__ import annotations
+
+
+class SceneRejected(ValueError):
+    """The input cannot become a scene (missing or broken file, no floor, unknown category, ...)."""
+
+
+class StageFailed(RuntimeError):
+    """A stage broke on input that had passed the readers; the message names stage and object."""

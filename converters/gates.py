@@ -1,0 +1,222 @@
+"""A scene's model, manifest and maps in; acceptance values against one table of limits out."""
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist
+
+from converters.maps import label_pieces
+from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+
+ROBOT_RADIUS_M = 0.18
+"""Free space is judged for a TurtleBot-sized disc."""
+START_GOAL_M = 1.0
+DRIFT_S = 2.0
+BOX_TIMESTEP_S = 0.01
+"""Timestep of the batched environments, which collide with boxes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """What a gate demands."""
+
+    unit: str
+    least: float | None = None
+    most: float | None = None
+    meaning: str = ""
+
+
+LIMITS: dict[str, Limit] = {
+    "compiles": Limit("bool", least=1, meaning="scene.xml compiles in MuJoCo"),
+    "objects": Limit("count", least=1, meaning="movable bodies, each named in scene.json and in scene.xml"),
+    "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml"),
+    "finite": Limit("bool", least=1, meaning="no non-finite number after 2 s"),
+    "drift_hulls": Limit(
+        "m", most=0.01, meaning="largest move in 2 s untouched, hulls at the scene's timestep"
+    ),
+    "drift_boxes": Limit("m", most=0.01, meaning="the same with boxes at 0.01 s"),
+    "turn_hulls": Limit("deg", most=2.0, meaning="largest turn in 2 s untouched, hulls"),
+    "turn_boxes": Limit("deg", most=2.0, meaning="the same with boxes at 0.01 s"),
+    "penetration_hulls": Limit("m", most=0.01, meaning="deepest contact at rest, hulls"),
+    "penetration_boxes": Limit("m", most=0.02, meaning="deepest contact at rest, boxes"),
+    "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),
+    "connected_share": Limit(
+        "share", least=0.8, meaning="largest piece of the free space for a disc of 0.18 m"
+    ),
+    "start_goal": Limit("m", least=START_GOAL_M, meaning="farthest two cells in that piece, straight line"),
+    "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
+    "hulls": Limit("count", most=400, meaning="hulls in all"),
+    "walls": Limit("count", most=200, meaning="wall boxes"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Gate:
+    """One gate's outcome."""
+
+    name: str
+    value: float
+    passed: bool
+    limit: Limit
+
+    def as_dict(self) -> dict[str, Any]:
+        """For scene.json."""
+        bound = {k: v for k, v in (("least", self.limit.least), ("most", self.limit.most)) if v is not None}
+        return {"passed": self.passed, "value": round(self.value, 6), "limit": bound, "unit": self.limit.unit}
+
+
+def judge(name: str, value: float) -> Gate:
+    """Holds a value against the table; a non-finite value fails."""
+    limit = LIMITS[name]
+    passed = math.isfinite(value)
+    passed = (
+        passed
+        and (limit.least is None or value >= limit.least)
+        and (limit.most is None or value <= limit.most)
+    )
+    return Gate(name, float(value) if math.isfinite(value) else -1.0, passed, limit)
+
+
+def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
+    """Compiles a scene with the movables colliding by their hulls or by their boxes.
+
+    The switch is thrown in the spec: a compiled model's bounding-volume trees hold colliding geoms only, so
+    that setting `geom_contype` afterwards leaves contacts out.
+
+    Args:
+        spec: of a scene folder; changed in place.
+        shape: 'hull', 'box' or 'both'.
+    """
+    for geom in spec.geoms:
+        for kind in ("hull", "box"):
+            if f"_{kind}_" in geom.name:
+                geom.contype = geom.conaffinity = int(shape in (kind, "both"))
+    return spec.compile()
+
+
+def run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
+    """Steps for so long at the model's own timestep."""
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+
+
+def movable_bodies(model: mujoco.MjModel) -> list[int]:
+    """Ids of the bodies that have a joint of their own."""
+    return [b for b in range(1, model.nbody) if model.body_jntnum[b] > 0]
+
+
+def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Largest penetration among the present contacts, m; 0 without any."""
+    return max([-float(c.dist) for c in data.contact[: data.ncon]], default=0.0) if data.ncon else 0.0
+
+
+def physical_values(model: mujoco.MjModel) -> dict[str, float]:
+    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    bodies = movable_bodies(model)
+    start_com, start_quat = data.xipos[bodies].copy(), data.xquat[bodies].copy()
+    start_pos, depth = data.xpos[bodies].copy(), deepest_contact(model, data)
+    run(model, data, DRIFT_S)
+    mujoco.mj_forward(model, data)
+    moved = np.maximum(
+        np.linalg.norm(data.xipos[bodies] - start_com, axis=1),
+        np.linalg.norm(data.xpos[bodies] - start_pos, axis=1),
+    )
+    cosine = np.abs((data.xquat[bodies] * start_quat).sum(axis=1))
+    return {
+        "drift": float(moved.max(initial=0.0)),
+        "turn": float(np.degrees(2 * np.arccos(np.clip(cosine, 0, 1))).max(initial=0.0)),
+        "penetration": max(depth, deepest_contact(model, data)),
+        "finite": float(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()),
+    }
+
+
+def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
+    """Cells whose middle is at least the radius from all that is not traversable, map edge included."""
+    padded = np.pad(traversable, 1)
+    distance = ndimage.distance_transform_edt(padded)
+    assert isinstance(distance, np.ndarray)
+    # The transform measures to the middle of the nearest blocked cell; its edge is half a cell nearer.
+    return ((distance - 0.5) * resolution_m >= radius_m)[1:-1, 1:-1]
+
+
+def free_space_values(maps: SceneMaps) -> dict[str, float]:
+    """Traversable area (m2), share of the largest piece for the disc, and its farthest pair of cells (m)."""
+    free = eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M)
+    pieces, count = label_pieces(free, np.ones((3, 3)))
+    size = np.bincount(pieces.ravel(), minlength=2)[1:]
+    cells = np.argwhere(pieces == int(np.argmax(size)) + 1).astype(float) if count else np.zeros((0, 2))
+    farthest = 0.0
+    if len(cells) > 1:
+        try:
+            cells = cells[ConvexHull(cells).vertices]
+        except QhullError:
+            cells = cells[[0, -1]]  # one straight line of cells, sorted along it
+        farthest = float(pdist(cells).max()) * maps.resolution_m
+    return {
+        "traversable_area": float(maps.traversable.sum()) * maps.resolution_m**2,
+        "connected_share": float(size.max() / size.sum()) if count else 0.0,
+        "start_goal": farthest,
+    }
+
+
+def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]) -> tuple[Gate, ...]:
+    """Every gate in the table's order.
+
+    Args:
+        spec: of the scene; changed in place.
+        maps: of the scene.
+        object_names: from its manifest.
+    """
+    try:
+        model = collide_with(spec, "hull")
+        boxes = collide_with(spec, "box")
+    except ValueError:
+        return (judge("compiles", 0.0),)
+    boxes.opt.timestep = BOX_TIMESTEP_S
+    bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in movable_bodies(model)}
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or "" for g in range(model.ngeom)]
+    hulls = [sum(n.startswith(f"{o}_hull_") for n in names) for o in object_names]
+    by_hull, by_box = physical_values(model), physical_values(boxes)
+    values = {
+        "compiles": 1.0,
+        "objects": float(len(bodies & set(object_names))),
+        "unmatched_objects": float(len(bodies ^ set(object_names))),
+        "finite": min(by_hull["finite"], by_box["finite"]),
+        "hulls_per_object": float(max(hulls, default=0)),
+        "hulls": float(sum(hulls)),
+        "walls": float(sum(n.startswith("wall_") for n in names)),
+    }
+    for quantity in ("drift", "turn", "penetration"):
+        values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
+    values |= free_space_values(maps)
+    return tuple(judge(name, values[name]) for name in LIMITS)
+
+
+def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
+    """Runs the gates on a written scene folder.
+
+    Raises:
+        SceneError: the folder's files are missing or break the schema.
+    """
+    manifest, maps = load_manifest(folder), load_maps(folder)
+    path = folder / "scene.xml"
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file; convert the scene again")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError:
+        return manifest, (judge("compiles", 0.0),)
+    return manifest, evaluate(spec, maps, tuple(o.name for o in manifest.objects))

@@ -1,0 +1,152 @@
+"""A seed in, a raw building folder out: a synthetic apartment in the raw Gibson layout."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from converters.generate.annotate import annotate_items
+from converters.generate.config import BuildingConfig, GenerationError
+from converters.generate.furnish import furnish_plan, no_place
+from converters.generate.instance import Instance
+from converters.generate.maps import floor_maps
+from converters.generate.plan import Plan, make_plan
+from converters.generate.scan import Scan, scan_building
+from converters.generate.texture import Atlas, make_atlas
+from converters.generate.write import LICENCE, write_cad, write_json, write_png, write_scan
+
+__all__ = ["Building", "BuildingConfig", "GenerationError", "design_building", "generate_building"]
+
+GENERATOR_VERSION = 1
+"""Raised whenever the same seed would give other bytes."""
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share (0..1) that is done."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Building:
+    """The truth behind a generated scan."""
+
+    plan: Plan
+    items: tuple[Instance, ...]
+    floor_height_m: float
+    """The floor in the scan's own frame."""
+
+
+def _streams(seed: int) -> list[np.random.Generator]:
+    """One random stream per stage, so that a change in one stage leaves the others alone."""
+    return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
+
+
+def design_building(seed: int, config: BuildingConfig | None = None, max_plans: int = 40) -> Building:
+    """Draws plan and furniture.
+
+    Args:
+        seed: 0 or more; the same seed gives the same building.
+        config: what to build; default: a small apartment.
+        max_plans: plans tried before giving up.
+
+    Returns:
+        The building.
+
+    Raises:
+        GenerationError: the configuration is wrong, or its rooms or furniture do not fit.
+    """
+    if seed < 0:
+        raise GenerationError(f"seed is {seed}: expected a whole number of 0 or more")
+    cfg = (config or BuildingConfig()).validate()
+    rng = _streams(seed)[0]
+    floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
+    for _ in range(max_plans):
+        plan = make_plan(cfg, rng)
+        items = furnish_plan(plan, cfg, rng)
+        if items is not None:
+            return Building(plan, tuple(items), floor_height_m)
+    raise no_place(cfg, seed)
+
+
+def render_building(
+    building: Building, seed: int, config: BuildingConfig, progress: Progress
+) -> tuple[Scan, Atlas]:
+    """Scans and paints a building."""
+    streams = _streams(seed)
+    progress("scanning", 0.1)
+    scan = scan_building(building.plan, list(building.items), config, streams[1])
+    progress("painting", 0.6)
+    rooms = [(r.x0, r.y0, r.x1, r.y1) for r in building.plan.rooms]
+    return scan, make_atlas(scan, rooms, config.texels_per_m, streams[2])
+
+
+def generate_building(
+    out_dir: Path, seed: int, progress: Progress | None = None, config: BuildingConfig | None = None
+) -> None:
+    """Writes a raw building folder.
+
+    Everything is written into a folder beside `out_dir` and renamed at the end, so nothing half-written is
+    left.
+
+    Args:
+        out_dir: must not exist, or be an empty folder.
+        seed: 0 or more; the same seed and configuration give the same bytes.
+        progress: called with a stage's name and the share done, 0..1.
+        config: what to build; default: a small apartment.
+
+    Raises:
+        GenerationError: `out_dir` is taken, or the building cannot be generated.
+    """
+    out_dir = Path(out_dir)
+    if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
+        raise GenerationError(f"{out_dir} exists and is not an empty folder: name a new folder or remove it")
+    existing = next(p for p in out_dir.absolute().parents if p.exists())
+    if not existing.is_dir():
+        raise GenerationError(
+            f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder"
+        )
+    tell = progress or (lambda stage, share: None)
+    cfg = (config or BuildingConfig()).validate()
+    tell("drawing the plan", 0.0)
+    building = design_building(seed, cfg)
+    scan, atlas = render_building(building, seed, cfg, tell)
+    tell("writing", 0.85)
+    out_dir.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{out_dir.name}-", dir=out_dir.parent))
+    try:
+        _write(work, building, scan, atlas, seed, cfg)
+        work.chmod(0o755)
+        os.replace(work, out_dir)
+    except BaseException:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
+    tell("done", 1.0)
+
+
+def _write(
+    folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: BuildingConfig
+) -> None:
+    write_scan(folder, scan, atlas, building.floor_height_m)
+    (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
+    obstacles, traversable = floor_maps(building.plan)
+    write_png(folder / "floor_0.png", obstacles)
+    write_png(folder / "floor_trav_0.png", traversable)
+    items = list(building.items)
+    rng = _streams(seed)[3]
+    write_json(
+        folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, cfg, seed, rng)
+    )
+    for model in {item.model.name: item.model for item in items}.values():
+        write_cad(folder / "cad", model)
+    about = {
+        "generator": "converters.generate",
+        "version": GENERATOR_VERSION,
+        "seed": seed,
+        "config": dataclasses.asdict(cfg),
+    }
+    write_json(folder / "generator.json", about)
+    (folder / "LICENCE").write_text(LICENCE, encoding="ascii")

@@ -1,0 +1,61 @@
+"""Results of the stages in, `SceneManifest` (scene.json) out."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.metadata import version
+from typing import Any
+
+from converters.decompose import DecomposeConfig
+from converters.emit import SceneParts
+from converters.gates import Gate
+from converters.raw import RawScene
+from scenes_mjcf.schema import SceneManifest, SceneObject
+
+PACKAGES = (
+    "mujoco",
+    "coacd",
+    "trimesh",
+    "fast-simplification",
+    "xatlas",
+    "numpy",
+    "scipy",
+    "pillow",
+    "shapely",
+)
+
+
+def make_manifest(
+    raw: RawScene,
+    split: str,
+    parts: SceneParts,
+    floor_area_m2: float,
+    alignment: list[dict[str, Any]],
+    gates: tuple[Gate, ...],
+    decompose: DecomposeConfig,
+) -> SceneManifest:
+    """Collects what a scene is, where it came from and which gates it passed; all paths are relative."""
+    objects = tuple(
+        SceneObject(
+            name=placed.name,
+            category=placed.category,
+            mass_kg=round(physical.mass_kg, 4),
+            friction=physical.friction,
+            n_hulls=len(placed.hulls_b),
+            cad_id=placed.cad_id,
+        )
+        for placed, physical in zip(parts.objects, parts.physical, strict=True)
+    )
+    parameters = {k: v for k, v in dataclasses.asdict(decompose).items() if k != "timeout_s"}
+    return SceneManifest(
+        name=parts.name,
+        split=split,
+        source={"format": raw.source_format, "sha256": raw.sources},
+        licence=raw.licence,
+        floor_area_m2=round(floor_area_m2, 3),
+        objects=objects,
+        collision={"method": "coacd", "boxes": "oriented box of each hull", **parameters},
+        gates={g.name: g.as_dict() for g in gates},
+        versions={name: version(name) for name in PACKAGES},
+        alignment=tuple(alignment),
+    )

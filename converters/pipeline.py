@@ -1,0 +1,293 @@
+"""A raw folder in, a scene folder out: read, stages that are functions of arrays, write, rename."""
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from converters import gibson, scan2cad
+from converters.alignment import Alignment, compare, upright
+from converters.cut import cut_furniture
+from converters.decompose import DecomposeConfig, cache_folder, decompose_all
+from converters.emit import SceneParts, write_scene
+from converters.errors import SceneRejected
+from converters.floor import floor_patch, level_floor
+from converters.gates import Gate, evaluate
+from converters.manifest import make_manifest
+from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
+from converters.objects import PlacedObject, name_objects, place_object, rotation_of, to_world
+from converters.physical import physical_properties
+from converters.raw import RawScene
+from converters.settle import Settled, settle
+from converters.texture import ColourCloud, VisualMesh, bake_object, bake_structure, colour_cloud
+from converters.walls import wall_boxes
+from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
+
+READERS = {
+    "gibson": (gibson.looks_like, gibson.read_gibson),
+    "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
+}
+STAGES = {
+    "read": 1.0,
+    "align": 0.5,
+    "decompose": 25.0,
+    "cut": 3.0,
+    "map": 1.0,
+    "settle": 4.0,
+    "texture": 10.0,
+    "write": 1.0,
+    "gates": 3.0,
+}
+"""Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
+
+Report = Callable[[str, float], None]
+"""Called with the stage's name and the share of the whole work that is done, 0 to 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ConvertConfig:
+    """Choices of one conversion."""
+
+    format: str = "auto"
+    split: str = "train"
+    jobs: int = 2
+    seed: int = 0
+    """Seed of coacd's search."""
+    overwrite: bool = False
+    structure_faces: int = 16000
+    object_faces: int = 1500
+    structure_texture: int = 1024
+    object_texture: int = 256
+
+
+@dataclasses.dataclass(frozen=True)
+class Converted:
+    """What `convert` made."""
+
+    manifest: SceneManifest
+    gates: tuple[Gate, ...]
+    settled: Settled
+    n_walls: int
+    stage_s: dict[str, float]
+    """Stage -> seconds."""
+
+
+class _Clock:
+    """Times the stages and turns their shares into one progress number."""
+
+    def __init__(self, report: Report) -> None:
+        self.report = report
+        self.seconds: dict[str, float] = {}
+        self._before = 0.0
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[Callable[[float], None]]:
+        total = sum(STAGES.values())
+        start = time.monotonic()
+
+        def inner(share: float) -> None:
+            self.report(name, (self._before + STAGES[name] * min(share, 1.0)) / total)
+
+        inner(0.0)
+        yield inner
+        inner(1.0)
+        self._before += STAGES[name]
+        self.seconds[name] = time.monotonic() - start
+
+
+def detect_format(source: Path) -> str:
+    """Name of the layout that the folder has.
+
+    Raises:
+        SceneRejected: no known layout.
+    """
+    for name, (looks_like, _) in READERS.items():
+        if looks_like(source):
+            return name
+    if not source.exists():
+        raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
+    raise SceneRejected(
+        f"{source}: no known layout; expected {gibson.MESH} (gibson) or {scan2cad.ANNOTATION} (scan2cad) in "
+        f"it"
+    )
+
+
+def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
+    """Upright placements from the annotations, and the report that compares them with re-solved ones."""
+    placements, rows = [], []
+    for name, annotation in zip(name_objects(raw.annotations), raw.annotations, strict=True):
+        vertices = raw.cads[annotation.cad_id].vertices
+        pivot = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        placed, tilt = upright(annotation.pose, pivot)
+        placements.append(placed)
+        rows.append(compare(annotation, placed, tilt, pivot, name))
+    return placements, rows
+
+
+def _structure_visual(
+    raw: RawScene, vertices_w: np.ndarray, keep: np.ndarray, plan: FloorPlan, config: ConvertConfig
+) -> VisualMesh:
+    """The cleaned scan with a level floor, patched where furniture hid it, simplified and textured."""
+    kept = np.flatnonzero(keep)
+    level = level_floor(vertices_w, raw.scan.labels)
+    cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
+    seen_floor = np.flatnonzero((np.abs(cloud.points[:, 2]) < 0.02) & (np.abs(cloud.normals[:, 2]) > 0.7))
+    patch_vertices, patch_faces, patch_cloud = floor_patch(plan, cloud, seen_floor)
+    both = ColourCloud(
+        *(np.vstack([getattr(cloud, f), getattr(patch_cloud, f)]) for f in ("points", "normals", "colours"))
+    )
+    return bake_structure(
+        level,
+        raw.scan.faces[kept],
+        patch_vertices,
+        patch_faces,
+        both,
+        config.structure_faces,
+        config.structure_texture,
+    )
+
+
+def _object_visual(
+    raw: RawScene, vertices_w: np.ndarray, removed: np.ndarray, annotated: PlacedObject, config: ConvertConfig
+) -> tuple[VisualMesh, float]:
+    """The CAD model retextured at its annotated pose (where the scan showed it), in the body frame."""
+    cloud = colour_cloud(raw.scan, vertices_w, raw.scan.faces, removed)
+    visual, seen = bake_object(
+        to_world(annotated, annotated.vertices_b),
+        annotated.faces,
+        annotated.face_colours,
+        cloud,
+        config.object_faces,
+        config.object_texture,
+    )
+    back = (visual.vertices - annotated.position_w) @ rotation_of(annotated.quaternion_w)
+    return dataclasses.replace(visual, vertices=back), seen
+
+
+def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
+    """Every stage after reading; writes into `folder`, which exists and is empty."""
+    with clock.stage("align"):
+        placements, rows = align_objects(raw)
+        if not raw.annotations:
+            raise SceneRejected(
+                f"{raw.name}: no annotated object, expected at least one; annotate the furniture"
+            )
+        floor_height = raw.floor_height_m
+        if floor_height is None:
+            floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)
+        vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
+        walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
+    decompose_config = DecomposeConfig(seed=config.seed)
+    with clock.stage("decompose") as progress:
+        hulls = decompose_all(
+            {k: (c.vertices, c.faces) for k, c in sorted(raw.cads.items())},
+            decompose_config,
+            config.jobs,
+            cache,
+            progress,
+        )
+        annotated = tuple(
+            place_object(name, a, raw.cads[a.cad_id], hulls[a.cad_id], pose, floor_height, walls_yaw)
+            for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, placements, strict=True)
+        )
+        physical = tuple(physical_properties(o.category, o.hulls_b) for o in annotated)
+    with clock.stage("cut"):
+        cut = cut_furniture(vertices_w, raw.scan.faces, raw.scan.labels, annotated)
+    with clock.stage("map"):
+        plan = make_floor_plan(
+            vertices_w, raw.scan.faces[cut.keep], raw.scan.labels, annotated, raw.given_map, walls_yaw
+        )
+        walls = wall_boxes(plan)
+        traversable, origin = resample(plan.grid, plan.traversable, plan.grid.resolution_m)
+        if not traversable.any():
+            raise SceneRejected("scan: the traversable map is empty; the scan needs visible floor")
+        maps = SceneMaps(traversable, plan.grid.resolution_m, origin, floor_height)
+    with clock.stage("settle"):
+        settled = settle(SceneParts(raw.name, annotated, physical, walls))
+    with clock.stage("texture") as progress:
+        structure = _structure_visual(raw, vertices_w, cut.keep, plan, config)
+        visuals, seen = [], []
+        for k, placed in enumerate(annotated):
+            progress(0.5 + 0.5 * k / len(annotated))
+            visual, share = _object_visual(raw, vertices_w, np.flatnonzero(cut.owner == k), placed, config)
+            visuals.append(visual)
+            seen.append(share)
+    for row, moved, drop, share, placed in zip(
+        rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
+    ):
+        row |= {"settle_shift_m": moved, "settle_drop_m": drop, "texture_seen_share": round(share, 3)}
+        if placed.hinge is not None:
+            row["hinge_assumed"] = placed.hinge.assumed
+    with clock.stage("write"):
+        parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=tuple(visuals))
+        write_scene(parts, folder)
+        save_maps(maps, folder)
+    with clock.stage("gates"):
+        spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+        gates = evaluate(spec, maps, tuple(o.name for o in parts.objects))
+        area = float(plan.traversable.sum()) * plan.grid.resolution_m**2
+        manifest = make_manifest(raw, config.split, parts, area, rows, gates, decompose_config)
+        save_manifest(manifest, folder)
+    return Converted(manifest, gates, settled, len(walls), clock.seconds)
+
+
+@contextlib.contextmanager
+def fresh_folder(target: Path, overwrite: bool) -> Iterator[Path]:
+    """A folder beside `target` that becomes it on success and vanishes on failure or interruption.
+
+    Raises:
+        SceneRejected: the target exists, or its parent cannot be written.
+    """
+    if target.exists() and not overwrite:
+        raise SceneRejected(f"{target}: exists already; give another OUT or add --overwrite")
+    if target.exists() and not target.is_dir():
+        raise SceneRejected(f"{target}: is a file, expected a folder to write; give another OUT")
+    temporary = target.parent / f".{target.name}.part-{os.getpid()}"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
+    except OSError as error:
+        raise SceneRejected(f"{target}: cannot be written ({error.strerror}); give another OUT") from error
+    try:
+        yield temporary
+        if target.exists():
+            shutil.rmtree(target)
+        temporary.rename(target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def convert(
+    source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
+) -> Converted:
+    """Converts one raw folder; `target` appears whole or not at all.
+
+    Args:
+        source: folder in one of the layouts of `READERS`.
+        target: scene folder to make; its name becomes the scene's.
+        config: choices.
+        report: progress callback.
+        cache: folder of decomposed hulls; default `cache_folder()`.
+
+    Raises:
+        SceneRejected: bad input.
+        StageFailed: a stage broke.
+    """
+    clock = _Clock(report or (lambda stage, share: None))
+    with fresh_folder(target, config.overwrite) as folder:
+        with clock.stage("read"):
+            name = config.format if config.format != "auto" else detect_format(source)
+            raw = dataclasses.replace(READERS[name][1](source), name=target.name)
+        return convert_raw(raw, folder, config, clock, cache or cache_folder())

@@ -1,0 +1,65 @@
+"""A folder with one ScanNet scan, its labels, Scan2CAD's annotation and the CAD models in, `RawScene` out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from converters.annotations import parse_annotations
+from converters.cad import read_cad
+from converters.errors import SceneRejected
+from converters.files import SourceFolder, read_json, read_mesh, vertex_colours
+from converters.raw import RawScene, ScanMesh
+
+ANNOTATION = "full_annotations.json"
+LICENCE = "ScanNet terms of use and ShapeNet terms of use: research only, no redistribution"
+
+
+def looks_like(root: Path) -> bool:
+    """True when the folder has Scan2CAD's annotation file."""
+    return (root / ANNOTATION).is_file()
+
+
+def read_scan2cad(root: Path) -> RawScene:
+    """Reads `full_annotations.json`, `scan/<id>_vh_clean_2.ply`, its `.labels.ply` and `cad/`.
+
+    Raises:
+        SceneRejected: a file is missing or damaged, or label and vertex counts differ.
+    """
+    source = SourceFolder(root)
+    path = source.use(ANNOTATION, "expected Scan2CAD's annotation of one scan beside scan/ and cad/")
+    scan_id, records = parse_annotations(read_json(path), path)
+    stem = f"scan/{scan_id}_vh_clean_2"
+    mesh = read_mesh(source.use(f"{stem}.ply", f"expected ScanNet's reconstruction of {scan_id}"))
+    label_path = source.use(f"{stem}.labels.ply", f"expected ScanNet's per-vertex labels of {scan_id}")
+    labels = _labels(label_path)
+    if len(labels) != len(mesh.vertices):
+        raise SceneRejected(
+            f"{label_path}: {len(labels)} labels for the {len(mesh.vertices)} vertices of {stem}.ply, "
+            f"expected one "
+            "a vertex; take both files from the same ScanNet release"
+        )
+    colours = vertex_colours(mesh)
+    cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
+    return RawScene(
+        name=scan_id,
+        source_format="scan2cad",
+        scan=ScanMesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), labels, colours),
+        cads=cads,
+        annotations=tuple(a for _, a in records),
+        floor_height_m=None,
+        given_map=None,
+        licence=LICENCE,
+        sources=dict(sorted(source.sha256.items())),
+    )
+
+
+def _labels(path: Path) -> np.ndarray:
+    """(n,) int64 property `label` of a PLY's vertices."""
+    mesh = read_mesh(path)
+    try:
+        raw = mesh.metadata["_ply_raw"]["vertex"]["data"]["label"]
+    except (KeyError, IndexError, ValueError) as error:
+        raise SceneRejected(f"{path}: its vertices have no property 'label', expected NYU40 ids") from error
+    return np.asarray(raw).reshape(-1).astype(np.int64)

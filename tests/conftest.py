@@ -1,0 +1,36 @@
+"""Shared fixtures: toy scene folders, built once per test process, and the licensed sample where it lies."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
+import pytest
+
+from tests.toys import write_room
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory) -> Path:
+    """A 4 x 3 m room with one 5 kg cube."""
+    return write_room(tmp_path_factory.mktemp("scenes") / "room")
+
+
+@pytest.fixture(scope="session")
+def two_rooms(tmp_path_factory) -> Path:
+    """A 5 x 4 m room cut by a partition, with two cubes and a door leaf."""
+    blocks = (("chair", 1.2, 0.0, 5.0, 0.5), ("table", -1.2, 1.0, 10.0, 0.4))
+    return write_room(
+        tmp_path_factory.mktemp("scenes") / "two_rooms", (5.0, 4.0), blocks, door=True, partition=True, split="test"
+    )
+
+
+@pytest.fixture(scope="session")
+def sample_data() -> Path:
+    """The licensed sample data's folder; tests that ask for it skip where it is absent."""
+    places = [os.environ.get("INTERACTIVE_NAV_DATA"), Path(__file__).parents[2] / "shared" / "data"]
+    for place in places:
+        if place and (Path(place) / "scan2cad_scene0470_00" / "full_annotations.json").is_file():
+            return Path(place)
+    pytest.skip("the licensed ScanNet sample is not on this machine (set INTERACTIVE_NAV_DATA to its folder)")

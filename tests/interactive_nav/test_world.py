@@ -1,0 +1,117 @@
+"""Padded worlds: equal structure, right masses, furniture at rest; and the refusals of bad scenes."""
+
+import json
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from interactive_nav import objects
+from interactive_nav.config import NavConfig
+from interactive_nav.physics.mjx_batch import differing_fields
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import load_scene
+from interactive_nav.tables import build_tables, furniture_map
+from interactive_nav.world import build_world
+from scenes_mjcf.schema import SceneError, load_maps, save_maps
+from tests.toys import write_room
+
+
+@pytest.fixture(scope="module")
+def world(room, two_rooms):
+    return build_world(get_robot("turtlebot"), (load_scene(room), load_scene(two_rooms)), NavConfig(num_objects=3))
+
+
+def test_slots_masses_and_names(world):
+    # Three small objects, two free slots, one hinge; the first scene leaves a free slot and the hinge empty.
+    assert world.layout.slot_kind == ("small", "small", "small", "free", "free", "hinge")
+    np.testing.assert_array_equal(world.occupied, [[1, 1, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]])
+    assert world.names[0][3:] == ("chair_0", "", "") and world.names[1][3:] == ("chair_0", "table_0", "door_0")
+    np.testing.assert_allclose(world.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
+    assert world.robot_mass_kg == pytest.approx(2.673)
+    assert world.settle_m.max() < 0.01
+
+
+def test_models_differ_only_in_fields_that_mjx_can_batch(world):
+    names = differing_fields(world.models)
+    assert {"geom_size", "body_mass", "qpos0"} <= set(names)
+    a, b = world.models
+    assert (a.nq, a.nv, a.ngeom, a.nsensordata) == (b.nq, b.nv, b.ngeom, b.nsensordata)
+
+
+def test_an_empty_slot_floats_in_place(world):
+    model, layout = world.models[0], world.layout
+    data = mujoco.MjData(model)
+    data.qpos[:] = world.rest_qpos[0]
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+    empty = layout.slot_qpos[4]
+    np.testing.assert_allclose(data.qpos[empty : empty + 3], world.rest_qpos[0, empty : empty + 3], atol=1e-3)
+
+
+def test_furniture_map_covers_the_cube_and_nothing_else(room):
+    scene = load_scene(room)
+    chair = scene.movables[0]
+    covered = furniture_map(scene, {chair.name: (chair.pos_w, chair.quat_w)}, 0.41)
+    # The 0.4 m cube at (0.7, 0): 8 x 8 cells of 0.05 m, plus the half-cell rim that counts as covered.
+    assert 64 <= covered.sum() <= 100
+    r, c = np.nonzero(covered)
+    assert scene.maps.origin_w[0] + (c.mean() + 0.5) * 0.05 == pytest.approx(0.7, abs=0.03)
+    lifted = furniture_map(scene, {chair.name: (chair.pos_w + [0, 0, 1.0], chair.quat_w)}, 0.41)
+    assert not lifted.any()  # the robot passes underneath
+
+
+def test_small_objects_are_of_four_kinds_with_real_masses():
+    ten = objects.pick(10)
+    assert [sum(o.category == k for o in ten) for k in ("basket", "shoe", "pot", "toy")] == [3, 3, 2, 2]
+    assert all(0.2 < o.mass_kg < 2.0 and 0.09 < o.radius_m < 0.25 for o in ten)
+    with pytest.raises(ValueError, match="num_objects is -1"):
+        objects.pick(-1)
+
+
+def test_hulls_take_one_scene_only(room, two_rooms):
+    scenes = (load_scene(room), load_scene(two_rooms))
+    with pytest.raises(ValueError, match="collision='hulls' with 2 scenes"):
+        build_world(get_robot("turtlebot"), scenes, NavConfig(collision="hulls"))
+    with pytest.raises(ValueError, match="scenes is empty"):
+        build_world(get_robot("turtlebot"), (), NavConfig())
+
+
+def test_a_scene_with_no_room_is_refused(tmp_path):
+    closet = load_scene(write_room(tmp_path / "closet", (1.0, 0.8), blocks=()))
+    world = build_world(get_robot("turtlebot"), (closet,), NavConfig(num_objects=0))
+    with pytest.raises(SceneError, match="no room for a start and a goal 1.0 m apart"):
+        build_tables(world, NavConfig(num_objects=0))
+    slit = load_scene(write_room(tmp_path / "slit", (3.0, 0.3), blocks=()))
+    world = build_world(get_robot("turtlebot"), (slit,), NavConfig(num_objects=0))
+    with pytest.raises(SceneError, match="no room for robot 'turtlebot'"):
+        build_tables(world, NavConfig(num_objects=0))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda d: (d / "scene.xml").unlink(), "scene.xml: no such file"),
+        (lambda d: (d / "scene.xml").write_text("<mujoco>"), "MuJoCo cannot compile it"),
+        (lambda d: _rename(d, "chair_0", "chair_7"), "no body named 'chair_7', which scene.json lists"),
+        (lambda d: _empty(d), "traversable map is empty"),
+    ],
+)
+def test_bad_scene_folders_are_refused_in_one_line(room, tmp_path, spoil, message):
+    folder = shutil.copytree(room, tmp_path / "copy")
+    spoil(folder)
+    with pytest.raises(SceneError, match=message) as caught:
+        load_scene(folder)
+    assert "\n" not in str(caught.value)
+
+
+def _rename(folder, old, new):
+    data = json.loads((folder / "scene.json").read_text())
+    data["objects"][0]["name"] = new
+    (folder / "scene.json").write_text(json.dumps(data))
+
+
+def _empty(folder):
+    maps = load_maps(folder)
+    save_maps(type(maps)(maps.traversable & False, maps.resolution_m, maps.origin_w, 0.0), folder)

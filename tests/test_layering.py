@@ -1,0 +1,39 @@
+"""Imports run one way: converters and interactive_nav know only the schema; train knows interactive_nav."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+MAY_IMPORT = {
+    "scenes_mjcf": set(),
+    "converters": {"scenes_mjcf"},
+    "interactive_nav": {"scenes_mjcf"},
+    "train": {"interactive_nav", "scenes_mjcf"},
+}
+
+
+def back_edges(root: Path) -> list[str]:
+    """'file imports package' for each import against the grain."""
+    found = []
+    for package, allowed in MAY_IMPORT.items():
+        for path in (root / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.ImportFrom) and node.module:
+                    names = [node.module]
+                for name in names:
+                    top = name.split(".")[0]
+                    if top in MAY_IMPORT and top != package and top not in allowed:
+                        found.append(f"{path.relative_to(root)} imports {top}")
+    return found
+
+
+def test_no_import_runs_backwards():
+    assert back_edges(ROOT) == []
+
+
+def test_the_gate_fails_on_a_back_edge(tmp_path):
+    for package in MAY_IMPORT:
+        (tmp_path / package).mkdir()
+    (tmp_path / "interactive_nav" / "bad.py").write_text("from train.config import TrainConfig\n")
+    assert back_edges(tmp_path) == ["interactive_nav/bad.py imports train"]

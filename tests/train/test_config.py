@@ -1,0 +1,151 @@
+"""Settings from files and words: what is read is what was written, and every mistake is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+from train import config_io
+from train.config import AUTO_PPO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
+from train.config_io import apply_overrides, field_docs, flatten, from_yaml, help_text, load, to_yaml
+from train.errors import ConfigError
+
+BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
+
+
+def test_round_trip_of_every_kind_of_value():
+    config = TrainConfig(
+        env=EnvConfig(scenes=("a", "b c"), k_int=1.0, success_distance_m=0.4),
+        ppo=PPOConfig(learning_rate=1e-7, num_envs=8, policy_hidden_layer_sizes=(3,)),
+        run=RunConfig(name="x", tensorboard=False, num_timesteps=10**12),
+    )
+    assert from_yaml(to_yaml(config)) == config
+    assert from_yaml(to_yaml(TrainConfig())) == TrainConfig()
+    assert from_yaml("") == TrainConfig()
+
+
+@pytest.mark.parametrize("name", config_io.presets())
+def test_presets_load_resolve_and_differ_only_where_they_say(name):
+    config = load(name)
+    resolved = resolve(config, "native")
+    assert from_yaml(to_yaml(resolved)) == resolved
+    assert resolved.run.name == f"{name}-seed0"
+    defaults, given = flatten(TrainConfig()), flatten(config)
+    plain = (config_io.PRESET_DIR / f"{name}.yaml").read_text()
+    for key, value in given.items():
+        if value != defaults[key] and key != "run.name":
+            assert f"{key.rpartition('.')[2]}:" in plain
+
+
+def test_overrides():
+    config = apply_overrides(
+        BASE,
+        [
+            "ppo.learning_rate=1e-4",
+            "env.scenes=a,b",
+            "ppo.value_hidden_layer_sizes=[8, 9]",
+            "run.num_timesteps=2e6",
+        ],
+    )
+    assert config.ppo.learning_rate == 1e-4
+    assert config.env.scenes == ("a", "b")
+    assert config.ppo.value_hidden_layer_sizes == (8, 9)
+    assert config.run.num_timesteps == 2_000_000 and isinstance(config.run.num_timesteps, int)
+    assert apply_overrides(BASE, ["ppo.num_envs=5", "ppo.num_envs=auto"]).ppo.num_envs is None
+    assert BASE.ppo.learning_rate == 3e-4  # nothing is changed in place
+
+
+def test_two_words_that_only_fit_together():
+    words = ["run.log_every_steps=2000000", "run.checkpoint_every_steps=4000000"]
+    assert apply_overrides(BASE, words).run.log_every_steps == 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("ppo.learnin_rate=1", "unknown key 'ppo.learnin_rate', did you mean 'ppo.learning_rate'?"),
+        ("k_int=1", "unknown key 'k_int', did you mean 'env.k_int'?"),
+        ("ppo.seed=1", "unknown key 'ppo.seed', did you mean 'run.seed'?"),
+        ("ppo.num_envs=2.5", "ppo.num_envs: got 2.5 (float), expected a whole number"),
+        ("ppo.num_envs=true", "ppo.num_envs: got True (bool), expected a whole number"),
+        ("ppo.num_envs=0", "ppo.num_envs is 0, expected at least 1"),
+        ("ppo.learning_rate=fast", "ppo.learning_rate: got 'fast' (str), expected a number"),
+        ("ppo.learning_rate=nan", "ppo.learning_rate: got 'nan' (str), expected a number"),
+        ("ppo.learning_rate=0", "ppo.learning_rate is 0.0, expected a positive number"),
+        ("ppo.discounting=1.5", "ppo.discounting is 1.5, expected between 0.0 and 1.0"),
+        ("ppo.policy_hidden_layer_sizes=[64, x]", "ppo.policy_hidden_layer_sizes: got 'x' (str)"),
+        ("run.tensorboard=1", "run.tensorboard: got 1 (int), expected true or false"),
+        ("run.name=a/b", "run.name is 'a/b', expected one folder name"),
+        ("env.k_int=-1", "env.k_int is -1.0, expected 0 or more"),
+        ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
+        ("algorithm=pop", "got 'pop' (str), expected one of ppo, did you mean 'ppo'?"),
+        ("ppo=3", "ppo: got 3 (int), expected a mapping"),
+        ("ppo.num_envs", "expected key=value"),
+        (
+            "run.log_every_steps=2000000",
+            "checkpoint_every_steps is 1000000, expected at least log_every_steps",
+        ),
+    ],
+)
+def test_mistakes_are_named(word, message):
+    with pytest.raises(ConfigError) as caught:
+        apply_overrides(BASE, [word])
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_minibatches_must_share_the_environments_out():
+    config = apply_overrides(BASE, ["ppo.num_envs=48", "ppo.batch_size=16", "ppo.num_minibatches=4"])
+    with pytest.raises(ConfigError, match="is 64 sequences, expected a multiple of ppo.num_envs \\(48\\)"):
+        validate(config)
+    with pytest.raises(ConfigError, match="env.scenes is empty"):
+        validate(TrainConfig())
+
+
+@pytest.mark.parametrize("backend", sorted(AUTO_PPO))
+def test_resolve_fills_what_was_left_open(backend):
+    resolved = resolve(dataclasses.replace(BASE, ppo=PPOConfig(unroll_length=7)), backend)
+    assert resolved.env.backend == backend
+    assert resolved.ppo.unroll_length == 7
+    assert resolved.ppo.num_envs == AUTO_PPO[backend]["num_envs"]
+    assert None not in (resolved.ppo.batch_size, resolved.ppo.num_minibatches)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ConfigError, match="no preset 'demos', did you mean 'demo'"):
+        load("demos")
+    with pytest.raises(ConfigError, match="No such file"):
+        load(str(tmp_path / "none.yaml"))
+    (tmp_path / "bad.yaml").write_text("env: [1")
+    with pytest.raises(ConfigError, match="bad.yaml: not readable as YAML"):
+        load(str(tmp_path / "bad.yaml"))
+    (tmp_path / "list.yaml").write_text("- 1")
+    with pytest.raises(ConfigError, match="list.yaml: the file: got"):
+        load(str(tmp_path / "list.yaml"))
+    (tmp_path / "mine.yaml").write_text("env: {scenes: [a]}\nrun: {seed: 4}\n")
+    assert load(str(tmp_path / "mine.yaml")).run.name == "mine-seed4"
+
+
+def test_help_lists_every_setting_with_default_and_meaning():
+    lines = {line.split("=")[0].strip(): line for line in help_text().splitlines()}
+    for name in flatten(TrainConfig()):
+        assert len(lines[name].split(None, 1)) == 2 and lines[name].split(None, 1)[1]
+    assert "ppo.learning_rate=0.0003" in lines["ppo.learning_rate"]
+    assert "warp: 4096" in lines["ppo.num_envs"]
+    for part in (EnvConfig, PPOConfig, RunConfig, TrainConfig):
+        assert set(field_docs(part)) >= {field.name for field in dataclasses.fields(part)}
+
+
+def test_command_line_says_one_line_and_exits_2():
+    done = subprocess.run(
+        [sys.executable, "-m", "train", "--config", "demo", "ppo.learnin_rate=1"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(
+        "train: override: unknown key 'ppo.learnin_rate', did you mean 'ppo.learning_rate'?"
+    )

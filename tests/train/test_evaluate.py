@@ -1,0 +1,141 @@
+"""From a run folder to rows, a table and pictures, through the command lines, on the toy."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from interactive_nav.env import EPISODE_METRICS
+from tests.train.toy_run import build_toy, toy_config
+from train import checkpoint, evaluate, figures
+from train.rows import score_table
+from train.run import train_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    config = toy_config(tmp_path_factory.mktemp("runs"), updates=2)
+    _, folder, _ = train_run(config, Console(file=io.StringIO()), build_env=build_toy)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(run):
+    assert evaluate.main([str(run.path), "--episodes", "12", "--seed", "4"], build_env=build_toy) == 0
+    return run.path / "evaluation" / "episodes.parquet"
+
+
+def test_rows(evaluated):
+    rows = pq.read_table(evaluated)
+    assert rows.num_rows == 36
+    assert set(EPISODE_METRICS) <= set(rows.column_names)
+    frame = rows.to_pydict()
+    assert frame["policy"] == ["learned"] * 12 + ["random"] * 12 + ["follower"] * 12
+    assert frame["episode"] == list(range(12)) * 3
+    assert (
+        set(frame["run"]) == {"toy"} and set(frame["scene"]) == {"plane"} and set(frame["split"]) == {"train"}
+    )
+    assert frame["algorithm"][:13] == ["ppo"] * 12 + [None]
+    assert frame["checkpoint_steps"][:13] == [512] * 12 + [None]
+    assert set(frame["k_int"]) == {0.1} and set(frame["evaluation_seed"]) == {4}
+    # The same episodes for every policy: the shortest path belongs to the episode, not to who drives.
+    shortest = np.array(frame["shortest_path_m"]).reshape(3, 12)
+    np.testing.assert_array_equal(shortest[0], shortest[1])
+    np.testing.assert_array_equal(shortest[0], shortest[2])
+    assert np.unique(shortest[0]).size == 12
+    # The follower arrives within the toy's 60 steps far more often than chance.
+    success = np.array(frame["success"]).reshape(3, 12).mean(1)
+    assert success[2] >= success[1] + 0.4
+    ins = 0.5 * np.array(frame["path_efficiency"]) + 0.5 * np.array(frame["effort_efficiency"])
+    np.testing.assert_allclose(frame["ins_0.5"], ins, rtol=1e-6)
+
+
+def test_table_shows_means_and_intervals(evaluated):
+    rows = pq.read_table(evaluated)
+    console = Console(file=io.StringIO(), width=160)
+    console.print(score_table(rows, "title"))
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    random_success = rows["success"].to_numpy()[12:24].mean()
+    line = next(line for line in printed.splitlines() if " random " in line)
+    assert f"{random_success:.3f} [" in line and " 12 " in line
+    assert "Wilson" in printed and "bootstrap" in printed
+
+
+def test_evaluation_is_repeatable_and_choosable(run, evaluated, tmp_path):
+    out = tmp_path / "again.parquet"
+    words = [
+        str(run.path),
+        "--episodes",
+        "5",
+        "--seed",
+        "4",
+        "--policies",
+        "follower,learned",
+        "--checkpoint",
+        "last",
+    ]
+    assert evaluate.main([*words, "--out", str(out), "--record", "0"], build_env=build_toy) == 0
+    first, again = pq.read_table(evaluated).to_pydict(), pq.read_table(out).to_pydict()
+    np.testing.assert_allclose(again["robot_path_m"][:5], first["robot_path_m"][24:29], rtol=1e-5)
+    np.testing.assert_allclose(again["robot_path_m"][5:], first["robot_path_m"][:5], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["--policies", "lerned"],
+            "--policies: got 'lerned', expected a choice from learned, random, follower",
+        ),
+        (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
+        (["--episodes", "0"], "--episodes is 0, expected at least 1"),
+        (["ppo.learning_rate=1"], "expected env.<setting>=value"),
+        (["env.k_in=1"], "unknown key 'env.k_in', did you mean 'env.k_int'?"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_2(run, capsys, words, message):
+    assert evaluate.main([str(run.path), *words], build_env=build_toy) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train.evaluate: ") and message in line
+
+
+def test_no_run_folder(tmp_path, capsys):
+    assert evaluate.main([str(tmp_path)], build_env=build_toy) == 2
+    assert "is no run folder (no config.yaml)" in capsys.readouterr().err
+
+
+def test_checkpoint_of_another_robot(run, tmp_path, capsys):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(run.path, copy)
+    path, meta = checkpoint.find(copy / "checkpoints", "last")
+    (path / checkpoint.META).write_text(json.dumps({**dataclasses.asdict(meta), "robot": "fetch"}))
+    out = copy / "rows.parquet"
+    assert evaluate.main([str(copy), "--out", str(out)], build_env=build_toy) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "the checkpoint's robot is 'fetch', the environment's 'turtlebot'" in line
+    assert not out.exists()
+
+
+def test_figures(run, evaluated, tmp_path, capsys):
+    assert figures.main([str(run.path), "-o", str(tmp_path / "f")]) == 0
+    made = sorted(path.name for path in (tmp_path / "f").iterdir())
+    assert made == ["learning_curves.png", "trajectories_toy.png"]
+    assert all((tmp_path / "f" / name).stat().st_size > 10_000 for name in made)
+    capsys.readouterr()
+    (tmp_path / "empty").mkdir()
+    assert figures.main([str(tmp_path / "empty")]) == 2
+    assert "nothing to draw" in capsys.readouterr().err
+
+
+def test_curves_show_what_was_logged():
+    figure = figures.learning_curves({"a": [{"env_steps": 10, "episode/success": 0.25}, {"env_steps": 20}]})
+    (line,) = figure.axes[0].lines
+    np.testing.assert_array_equal(line.get_xydata(), [[10, 0.25]])

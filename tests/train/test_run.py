@@ -1,0 +1,272 @@
+"""Run folders: what is in them, and that a run survives whatever ends it."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tests.train.toy_env import ToyConfig, ToyEnv
+from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
+from train import checkpoint, run_folder
+from train.config_io import from_yaml
+from train.errors import CheckpointError, ConfigError, DivergedError, RunFolderError
+from train.run import check_fits, mean_score, train_run
+from train.run_folder import RunFolder, claim, read_metrics
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+def learner_of(folder: RunFolder, template: Any) -> Any:
+    return checkpoint.load_learner(checkpoint.find(folder.checkpoints, "last")[0], template)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    console = quiet()
+    config = toy_config(tmp_path_factory.mktemp("runs"), updates=5)
+    result, folder, stopped_by = train_run(config, console, build_env=build_toy)
+    assert stopped_by is None
+    return result, folder, config, console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_folder_of_a_finished_run(finished):
+    result, folder, config, printed = finished
+    assert result.completed and result.snapshot.env_steps == 5 * UPDATE_STEPS
+    # A checkpoint every two updates and one at the end; all three are kept.
+    assert [c.env_steps for c in checkpoint.list_checkpoints(folder.checkpoints)] == [512, 1024, 1280]
+    assert [line["env_steps"] for line in read_metrics(folder.metrics)] == [256, 512, 768, 1024, 1280]
+    assert {"loss/total_loss", "env_steps_per_s", "episodes", "wall_s"} <= read_metrics(folder.metrics)[
+        0
+    ].keys()
+    assert list(folder.tensorboard.glob("events.out.tfevents.*"))
+    written = from_yaml(folder.config.read_text())
+    assert written == config and None not in dataclasses.astuple(written.ppo)
+    versions = json.loads((folder.path / "versions.json").read_text())
+    assert versions["packages"]["brax"] == "0.14.2" and versions["device"]["platform"] == "cpu"
+    summary = json.loads((folder.path / "summary.json").read_text())
+    assert summary["env_steps"] == 1280 and summary["completed"] and summary["run"] == "toy"
+    assert "100 %" in printed and "steps/s" in printed and "success" in printed and "s left" in printed
+    assert not list(folder.path.rglob("*partial*"))
+
+
+def test_finished_run_is_not_trained_again(finished):
+    result, folder, config, _ = finished
+    before = folder.metrics.read_text()
+    again, _, _ = train_run(config, quiet(), build_env=build_toy)
+    assert again.completed and again.snapshot.env_steps == result.snapshot.env_steps
+    assert folder.metrics.read_text() == before
+
+
+def test_resume_through_files_equals_uninterrupted_run(finished, tmp_path):
+    """Two updates, then the same command with five: checkpoint and metrics equal those of five at once."""
+    result, folder, _, _ = finished
+    train_run(toy_config(tmp_path, updates=2), quiet(), build_env=build_toy)
+    half = RunFolder(tmp_path / "toy")
+    with open(half.metrics, "a") as file:  # a killed run's lines beyond its checkpoint, the last cut short
+        file.write('{"env_steps": 700}\n{"env_st')
+    (half.checkpoints / ".partial-000000000768").mkdir()
+    resumed, half, _ = train_run(toy_config(tmp_path, updates=5), quiet(), build_env=build_toy)
+    jax.tree.map(np.testing.assert_array_equal, resumed.snapshot.learner, result.snapshot.learner)
+    saved = learner_of(half, result.snapshot.learner)
+    jax.tree.map(np.testing.assert_array_equal, saved, result.snapshot.learner)
+    clocks = ("wall_s", "env_steps_per_s", "compile_s")
+    lines = [
+        [{k: v for k, v in line.items() if k not in clocks} for line in read_metrics(f.metrics)]
+        for f in (half, folder)
+    ]
+    assert lines[0] == lines[1]
+    assert not list(half.checkpoints.glob(".partial*"))
+
+
+def test_another_config_in_the_same_folder_is_refused(finished):
+    _, folder, config, _ = finished
+    other = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, learning_rate=1e-2))
+    with pytest.raises(RunFolderError, match="has ppo.learning_rate = 0.0003, this one 0.01; set run.name"):
+        train_run(other, quiet(), build_env=build_toy)
+    assert from_yaml(folder.config.read_text()) == config
+
+
+def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
+    meta = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)
+    scores = {100: None, 200: 0.9, 300: 0.5, 400: 0.7, 500: 0.8}
+    for steps, score in scores.items():
+        snapshot = type(
+            "S", (), {"learner": {"w": np.full(3, steps, np.float32)}, "env_state": {"x": np.arange(4)}}
+        )()
+        checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps, score=score), 2, 1.0)
+    assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [200, 400, 500]
+    assert checkpoint.find(tmp_path, "best")[1].env_steps == 200
+    assert checkpoint.find(tmp_path, "last")[1].env_steps == 500
+    path, _ = checkpoint.find(tmp_path, "400")
+    np.testing.assert_array_equal(
+        checkpoint.load_learner(path, {"w": np.zeros(3, np.float32)})["w"], [400.0] * 3
+    )
+    # Environments are kept with the newest only; another size of them is as good as none.
+    newest, _ = checkpoint.find(tmp_path, "last")
+    assert checkpoint.load_env_state(path, {"x": np.zeros(4, np.int32)}) is None
+    kept = checkpoint.load_env_state(newest, {"x": np.zeros(4, np.int32)})
+    assert kept is not None
+    np.testing.assert_array_equal(kept["x"], np.arange(4))
+    assert checkpoint.load_env_state(newest, {"x": np.zeros(5, np.int32)}) is None
+    with pytest.raises(
+        CheckpointError, match="no checkpoint '300'; expected best, last or one of 200, 400, 500"
+    ):
+        checkpoint.find(tmp_path, "300")
+    with pytest.raises(CheckpointError, match=r"\['w'\] has shape \(3,\), expected \(4,\)"):
+        checkpoint.load_learner(path, {"w": np.zeros(4)})
+    (path / checkpoint.LEARNER).write_bytes(b"\x00garbage")
+    with pytest.raises(CheckpointError, match="not a checkpoint of this learner"):
+        checkpoint.load_learner(path, {"w": np.zeros(3)})
+    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+        checkpoint.find(tmp_path / "none", "best")
+
+
+def test_score_of_a_checkpoint_weighs_episodes_alike():
+    lines = [
+        {"episodes": 1.0, "episode/success": 1.0},
+        {"episodes": 3.0, "episode/success": 0.2},
+        {"episodes": 0.0},
+    ]
+    assert mean_score(lines, "success") == pytest.approx(0.4)  # (1 + 3 * 0.2) / 4
+    assert mean_score(lines[2:], "success") is None
+
+
+def test_checkpoint_of_another_robot_is_refused():
+    env = ToyEnv()
+    config = toy_config("x").env
+    meta = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", config.observations, 29, 2)
+    check_fits(meta, Path("c"), config, env)
+    with pytest.raises(CheckpointError, match="checkpoint's robot is 'fetch', the environment's 'turtlebot'"):
+        check_fits(dataclasses.replace(meta, robot="fetch"), Path("c"), config, env)
+    with pytest.raises(CheckpointError, match="observation size is 9, the environment's 29"):
+        check_fits(dataclasses.replace(meta, observation_size=9), Path("c"), config, env)
+
+
+def test_large_environments_are_left_out_of_checkpoints(tmp_path):
+    config = toy_config(tmp_path, updates=2, env_state_limit_mb=0.0)
+    _, folder, _ = train_run(config, quiet(), build_env=build_toy)
+    path, _ = checkpoint.find(folder.checkpoints, "last")
+    assert not (path / checkpoint.ENV_STATE).exists()
+    more = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=3 * UPDATE_STEPS))
+    result, _, _ = train_run(more, quiet(), build_env=build_toy)
+    assert result.snapshot.env_steps == 3 * UPDATE_STEPS
+
+
+def test_folder_trouble_is_found_before_training(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="cannot be written"):
+        train_run(toy_config(tmp_path / "file"), quiet(), build_env=lambda _: pytest.fail("too late"))
+    usage = type("Usage", (), {"free": 10_000_000})
+    monkeypatch.setattr(run_folder.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(RunFolderError, match="10 MB free on its disk, expected 64 MB"):
+        train_run(toy_config(tmp_path), quiet(), build_env=lambda _: pytest.fail("too late"))
+    with pytest.raises(RunFolderError, match="10 MB free on its disk, expected 164 MB"):
+        claim(tmp_path, 100.0)
+
+
+def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path, monkeypatch):
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    meta = checkpoint.CheckpointMeta(100, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)
+    snapshot = type("S", (), {"learner": {"w": np.zeros(3)}, "env_state": None})()
+    checkpoint.save(tmp_path, snapshot, meta, 2, 1.0)
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    with pytest.raises(RunFolderError, match="cannot write the checkpoint \\(No space left on device\\)"):
+        checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=200), 2, 1.0)
+    assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [100]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000000000100"]
+
+
+def test_unknown_best_metric_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="run.best_metric is 'sucess', expected one of .*success"):
+        train_run(toy_config(tmp_path, best_metric="sucess"), quiet(), build_env=build_toy)
+
+
+def test_nan_guard_saves_the_batch_and_stops(tmp_path):
+    """A reward that is NaN at an episode's 20th step: updates take 16 steps, so the second one meets it."""
+    toy = toy_config(tmp_path, updates=5)
+    with pytest.raises(DivergedError) as caught:
+        train_run(toy, quiet(), build_env=lambda _: ToyEnv(ToyConfig(episode_steps=60), nan_at_step=20))
+    message = str(caught.value)
+    assert "diverged after env step 256" in message and "total_loss" in message and "\n" not in message
+    saved = tmp_path / "toy" / "diverged-000000000256"
+    assert str(saved) in message
+    with np.load(saved / "batch.npz") as batch:
+        rewards = batch[".reward"]
+        assert rewards.shape == (32, 8) and np.isnan(rewards).any()
+    assert (saved / checkpoint.LEARNER).stat().st_size > 1000
+
+
+def _start(tmp_path: Path, *words: str) -> subprocess.Popen:
+    cache = str(getattr(jax.config, "jax_compilation_cache_dir", ""))  # conftest.py made it
+    env = {
+        **os.environ,
+        "JAX_COMPILATION_CACHE_DIR": cache,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+    }
+    command = [sys.executable, "-m", "tests.train.toy_run", str(tmp_path), *words]
+    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _wait_for_checkpoint(folder: RunFolder, after: int, process: subprocess.Popen) -> None:
+    until = time.monotonic() + 120
+    while time.monotonic() < until:
+        assert process.poll() is None, process.communicate()
+        saved = checkpoint.list_checkpoints(folder.checkpoints)
+        if saved and saved[-1].env_steps > after:
+            return
+        time.sleep(0.1)
+    raise AssertionError("no checkpoint in 120 s")
+
+
+@pytest.mark.slow
+def test_sigterm_saves_and_kill_loses_one_interval_at_most(tmp_path):
+    folder = RunFolder(tmp_path / "toy")
+    process = _start(tmp_path)
+    try:
+        _wait_for_checkpoint(folder, 0, process)
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 128 + signal.SIGTERM, err
+    assert "stopped at" in out and "the same command continues" in out
+    lines, saved = read_metrics(folder.metrics), checkpoint.list_checkpoints(folder.checkpoints)
+    assert saved[-1].env_steps == lines[-1]["env_steps"]
+    assert json.loads((folder.path / "summary.json").read_text())["completed"] is False
+
+    # Killed without warning: what is lost lies after the last checkpoint, at most two updates of 256.
+    reached = saved[-1].env_steps
+    process = _start(tmp_path)
+    try:
+        _wait_for_checkpoint(folder, reached + 4 * UPDATE_STEPS, process)
+    finally:
+        process.kill()
+        process.communicate()
+    lines, saved = read_metrics(folder.metrics), checkpoint.list_checkpoints(folder.checkpoints)
+    assert lines[-1]["env_steps"] - saved[-1].env_steps <= 2 * UPDATE_STEPS
+    steps = [line["env_steps"] for line in lines]
+    assert steps == sorted(set(steps))
+    # And it goes on from there, to an end.
+    total = saved[-1].env_steps + 2 * UPDATE_STEPS
+    result, _, _ = train_run(
+        toy_config(tmp_path, updates=total // UPDATE_STEPS), quiet(), build_env=build_toy
+    )
+    assert result.completed and result.snapshot.env_steps == total
+    assert [line["env_steps"] for line in read_metrics(folder.metrics)] == list(range(256, total + 1, 256))

@@ -1,0 +1,1 @@
+"""Env + typed config -> trained policies, scored episodes and figures."""

@@ -1,0 +1,58 @@
+"""`python -m train`: words on the command line in, a trained run folder and an exit code out."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from train import config_io
+from train.config import TrainConfig
+from train.errors import TrainError
+from train.run import train_run
+from train.run_folder import RunFolder
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m train",
+        description="Trains a policy. The same command continues a run that was stopped or killed.",
+        epilog=f"settings (key=default):\n{config_io.help_text()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    known = ", ".join(config_io.presets())
+    source = made.add_mutually_exclusive_group(required=True)
+    source.add_argument("--config", metavar="NAME|PATH", help=f"a preset ({known}) or a YAML file")
+    source.add_argument("--resume", metavar="RUN_DIR", help="continue this run folder with its own config")
+    made.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, see below")
+    return made
+
+
+def read_config(arguments: argparse.Namespace) -> TrainConfig:
+    """The config that the command line means."""
+    if arguments.config:
+        return config_io.load(arguments.config, arguments.overrides)
+    path = Path(arguments.resume)
+    config = RunFolder(path).read_config()
+    run = dataclasses.replace(config.run, out_dir=str(path.parent), name=path.resolve().name)
+    return config_io.apply_overrides(dataclasses.replace(config, run=run), arguments.overrides)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs; 0 when done, 2 on a user's error, 128 + signal when asked to stop (after saving)."""
+    arguments = parser().parse_intermixed_args(argv)
+    try:
+        _, _, stopped_by = train_run(read_config(arguments), Console())
+    except TrainError as error:
+        print(f"train: {error}", file=sys.stderr)
+        return 2
+    return 128 + stopped_by if stopped_by else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,257 @@
+"""YAML text and `key=value` words -> a `TrainConfig`, and back; every mistake named in one line."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import difflib
+import functools
+import inspect
+import math
+import textwrap
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from train.config import AUTO_PPO, TrainConfig, validate
+from train.errors import ConfigError
+
+PRESET_DIR = Path(__file__).parent / "configs"
+AUTO = "auto"  # how None ("chosen for you") is written in files and on the command line
+
+
+def flatten(config: TrainConfig) -> dict[str, Any]:
+    """Dotted name -> value of every setting, in order of definition."""
+
+    def walk(part: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            if dataclasses.is_dataclass(value):
+                yield from walk(value, f"{prefix}{field.name}.")
+            else:
+                yield prefix + field.name, value
+
+    return dict(walk(config, ""))
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Nested plain values as YAML holds them: lists for tuples, `auto` for None."""
+    plain: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            value = to_dict(value)
+        elif isinstance(value, tuple):
+            value = list(value)
+        plain[field.name] = AUTO if value is None else value
+    return plain
+
+
+def to_yaml(config: TrainConfig) -> str:
+    """YAML text that `from_yaml` reads back to an equal config."""
+    return yaml.safe_dump(to_dict(config), sort_keys=False)
+
+
+def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
+    """`base` with nested plain values laid over it.
+
+    Args:
+        plain: nested mapping as read from YAML; names any part of the settings.
+        base: what `plain` does not name; the defaults where None.
+        where: file or word the values come from, for messages.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type or a value out of range.
+    """
+    return _overlay(base or TrainConfig(), {} if plain is None else plain, where, "")
+
+
+def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
+    """As `from_dict`, from YAML text."""
+    try:
+        plain = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where}: not readable as YAML: {' '.join(str(error).split())}") from None
+    return from_dict(plain, base, where)
+
+
+def presets() -> list[str]:
+    """Names that `--config` knows."""
+    return sorted(path.stem for path in PRESET_DIR.glob("*.yaml"))
+
+
+def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
+    """Reads a preset (by name) or a YAML file (by path) and applies `key=value` words to it.
+
+    Raises:
+        ConfigError: no such config, or one of its values or an override is wrong.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = PRESET_DIR / f"{name_or_path}.yaml"
+        if not path.is_file():
+            raise ConfigError(
+                f"--config: no preset {name_or_path!r}{_nearest(name_or_path, presets())}; "
+                f"expected one of {', '.join(presets())}, or the path of a .yaml file"
+            )
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise ConfigError(f"--config: cannot read {path} ({reason}); expected a YAML file") from None
+    config = apply_overrides(from_yaml(text, where=path.name), overrides)
+    if not config.run.name:
+        run = dataclasses.replace(config.run, name=f"{path.stem}-seed{config.run.seed}")
+        config = dataclasses.replace(config, run=run)
+    validate(config)
+    return config
+
+
+def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
+    """The config with `dotted.name=value` words laid over it; values are read as YAML.
+
+    Raises:
+        ConfigError: a word without `=`, an unknown name, a wrong type or a value out of range.
+    """
+    nested: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"override {word!r}: expected key=value, for example ppo.learning_rate=1e-4")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            value = text
+        *sections, last = name.split(".")
+        place = nested
+        for section in sections:
+            inner = place.setdefault(section, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"override {word!r}: {section} was given a value by an earlier override")
+            place = inner
+        place[last] = value
+    # All words at once, so that two values that only fit together may both change.
+    return _overlay(config, nested, "override", "")
+
+
+def help_text() -> str:
+    """One line a setting: dotted name, default, meaning."""
+    lines: list[tuple[str, str]] = []
+
+    def walk(part: Any, prefix: str) -> None:
+        docs, hints = field_docs(type(part)), typing.get_type_hints(type(part))
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            if dataclasses.is_dataclass(value):
+                walk(value, f"{prefix}{field.name}.")
+                continue
+            doc = docs[field.name]
+            if typing.get_origin(hints[field.name]) is Literal:
+                doc += f" [{' | '.join(typing.get_args(hints[field.name]))}]"
+            if value is None and field.name in AUTO_PPO["native"]:
+                sizes = (f"{backend}: {auto[field.name]}" for backend, auto in AUTO_PPO.items())
+                doc += f" [{', '.join(sizes)}]"
+            shown = AUTO if value is None else value
+            if isinstance(value, tuple):
+                shown = ",".join(map(str, value))
+            lines.append((f"{prefix}{field.name}={shown}", doc))
+
+    walk(TrainConfig(), "")
+    width = max(len(left) for left, _ in lines) + 2
+    return "\n".join(f"  {left:<{width}}{doc}" for left, doc in lines)
+
+
+@functools.cache
+def field_docs(config_type: type) -> dict[str, str]:
+    """Field name -> the docstring written under it, of the class and the classes it extends."""
+    docs: dict[str, str] = {}
+    for cls in reversed(config_type.__mro__[:-1]):
+        (class_node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+        assert isinstance(class_node, ast.ClassDef)
+        for field, after in zip(class_node.body, class_node.body[1:], strict=False):
+            doc = after.value if isinstance(after, ast.Expr) else None
+            if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Constant):
+                docs[ast.unparse(field.target)] = " ".join(str(doc.value).split())
+    return docs
+
+
+def _overlay(base: Any, plain: Any, where: str, prefix: str) -> Any:
+    if not isinstance(plain, Mapping):
+        section = prefix.rstrip(".") or "the file"
+        raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
+    hints = typing.get_type_hints(type(base))
+    changes: dict[str, Any] = {}
+    for key, value in plain.items():
+        name = f"{prefix}{key}"
+        if key not in hints:
+            known = [f"{prefix}{field}" for field in hints] + list(flatten(TrainConfig()))
+            raise ConfigError(f"{where}: unknown key {name!r}{_nearest(name, known)} (--help lists them)")
+        if dataclasses.is_dataclass(hints[key]):
+            changes[key] = _overlay(getattr(base, key), value, where, f"{name}.")
+        else:
+            changes[key] = _convert(value, hints[key], f"{where}: {name}")
+    try:
+        return dataclasses.replace(base, **changes)
+    except ConfigError:
+        raise
+    except ValueError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
+        raise ConfigError(f"{where}: {prefix}{error}") from None
+
+
+def _convert(value: Any, kind: Any, where: str) -> Any:
+    """One value as the type of its field, or a `ConfigError` that says what was expected."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:  # `X | None`
+        if value is None or value == AUTO:
+            return None
+        return _convert(value, arguments[0], where)
+    if origin is Literal:
+        if value not in arguments:
+            near = _nearest(str(value), arguments)
+            raise ConfigError(f"{where}: got {_shown(value)}, expected one of {', '.join(arguments)}{near}")
+        return value
+    if origin is tuple:
+        items = [item for item in value.split(",") if item] if isinstance(value, str) else value
+        items = items if isinstance(items, (list, tuple)) else [items]
+        return tuple(_convert(item, arguments[0], where) for item in items)
+    converted = _scalar(value, kind)
+    if converted is None:
+        names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+        raise ConfigError(f"{where}: got {_shown(value)}, expected {names[kind]}")
+    return converted
+
+
+def _scalar(value: Any, kind: type) -> Any:
+    """`value` as `kind`, or None where it is not one. YAML takes 1e-4 for text: text is read as a number."""
+    if kind is bool or isinstance(value, bool):
+        return value if kind is bool and isinstance(value, bool) else None
+    if kind is str:
+        return "" if value is None else str(value) if isinstance(value, (str, int, float)) else None
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            return None
+    if not isinstance(value, (int, float)) or math.isnan(value):
+        return None
+    if kind is int:
+        return int(value) if float(value).is_integer() else None
+    return float(value)
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    tails = {name.rpartition(".")[2]: name for name in known}
+    tail = word.rpartition(".")[2]
+    if tail in tails:  # the right name in the wrong section, or without its section
+        return f", did you mean {tails[tail]!r}?"
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    near = near or [tails[match] for match in difflib.get_close_matches(tail, list(tails), n=1, cutoff=0.6)]
+    return f", did you mean {near[0]!r}?" if near else ""
+
+
+def _shown(value: Any) -> str:
+    return f"{value!r} ({type(value).__name__})"

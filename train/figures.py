@@ -1,0 +1,176 @@
+"""`python -m train.figures RESULTS_DIR -o figures/`: metrics, rows and recorded paths in, pictures out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from train.errors import RunFolderError, TrainError
+from train.files import whole_file
+from train.run_folder import read_metrics
+
+CURVES = (
+    ("episode/success", "success"),
+    ("episode/ins_0.5", "INS$_{0.5}$"),
+    ("episode/sum_reward", "episode reward"),
+)
+COLOURS = {"learned": "#0072b2", "follower": "#009e73", "random": "#cc79a7"}
+MOVED_M = 0.02
+"""Objects moved less than this are drawn once."""
+
+
+def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
+    """Success, INS_0.5 and reward of training episodes over environment steps, a line a run.
+
+    Args:
+        runs: name -> lines of its metrics.jsonl.
+    """
+    figure, axes = plt.subplots(1, len(CURVES), figsize=(4 * len(CURVES), 3.2), layout="constrained")
+    for axis, (key, label) in zip(axes, CURVES, strict=True):
+        for name, lines in runs.items():
+            seen = [(line["env_steps"], line[key]) for line in lines if key in line]
+            axis.plot(*np.array(seen).reshape(-1, 2).T, label=name, marker="." if len(seen) < 30 else None)
+        if key != "episode/sum_reward":
+            axis.set_ylim(-0.02, 1.02)
+        axis.set_xlabel("environment steps")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    figure.suptitle("training episodes (exploring policy), means over log intervals", fontsize=10)
+    return figure
+
+
+def trajectories(paths: Mapping[str, np.ndarray], most: int = 6) -> Figure:
+    """Top views: where each policy's robot went in the same episodes, and what it moved.
+
+    Args:
+        paths: arrays that `train.evaluate` recorded.
+        most: episodes to draw.
+    """
+    policies = [str(name) for name in paths["policies"]]
+    count = min(most, len(paths[f"{policies[0]}/goal_xy_w"]))
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    aspect = _aspect(paths)
+    size = (4.6 * columns, 4.6 * aspect * rows + 0.9)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis in grid.flat[count:]:
+        axis.set_axis_off()
+    for i in range(count):
+        _draw_episode(grid.flat[i], paths, policies, i)
+    handles = [Line2D([], [], color=_colour(p, k), label=p) for k, p in enumerate(policies)]
+    grey: dict[str, Any] = {"color": "0.35", "linestyle": ""}
+    handles += [
+        Line2D([], [], marker="o", markerfacecolor="w", label="start", markersize=8, **grey),
+        Line2D([], [], marker="*", label="goal", markersize=11, **grey),
+        Line2D([], [], marker="s", markerfacecolor="none", label="object at start", markersize=6, **grey),
+        Line2D([], [], marker="s", label="object at end (coloured by who moved it)", markersize=6, **grey),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[str], i: int) -> None:
+    scene = int(paths[f"{policies[0]}/scene_index"][i])
+    free = paths[f"scene/{scene}/traversable"]
+    resolution_m, origin = float(paths[f"scene/{scene}/resolution_m"]), paths[f"scene/{scene}/origin_w"]
+    rows, columns = free.shape
+    extent = (origin[0], origin[0] + columns * resolution_m, origin[1], origin[1] + rows * resolution_m)
+    axis.imshow(free, origin="lower", extent=extent, cmap=ListedColormap(["0.75", "1.0"]), vmin=0, vmax=1)
+    begin = paths[f"{policies[0]}/object_start_w"][i, :, :2]
+    # Empty slots and objects that found no place wait far outside the map.
+    inside = ((begin > [extent[0], extent[2]]) & (begin < [extent[1], extent[3]])).all(-1)
+    axis.scatter(*begin[inside].T, s=26, marker="s", facecolors="none", edgecolors="0.35", linewidths=0.9)
+    for k, policy in enumerate(policies):
+        colour = _colour(policy, k)
+        end = paths[f"{policy}/object_end_w"][i, :, :2]
+        moved = inside & (np.linalg.norm(end - begin, axis=-1) > MOVED_M)
+        for a, b in zip(begin[moved], end[moved], strict=True):
+            axis.plot(*np.stack([a, b]).T, color=colour, linewidth=0.8, linestyle=":")
+        axis.scatter(*end[moved].T, s=26, marker="s", color=colour, linewidths=0)
+        track = paths[f"{policy}/robot_xy_w"][i]
+        track = track[np.isfinite(track[:, 0])]
+        axis.plot(*track.T, color=colour, linewidth=1.6, alpha=0.85)
+        if not paths[f"{policy}/success"][i]:
+            axis.plot(*track[-1], marker="x", color=colour, markersize=7, markeredgewidth=2)
+    start, goal = paths[f"{policies[0]}/start_xy_w"][i], paths[f"{policies[0]}/goal_xy_w"][i]
+    axis.plot(*start, marker="o", markerfacecolor="w", markeredgecolor="k", markersize=8, zorder=5)
+    axis.plot(*goal, marker="*", color="#e69f00", markeredgecolor="k", markersize=14, zorder=5)
+    reached = [policy for policy in policies if paths[f"{policy}/success"][i]]
+    axis.set_title(
+        f"{paths[f'scene/{scene}/name']}, episode {i}\nreached by: {', '.join(reached) or 'none'}", fontsize=9
+    )
+    axis.set_aspect("equal")
+    axis.tick_params(labelsize=7)
+    axis.set_xlabel("x [m]", fontsize=8)
+    axis.set_ylabel("y [m]", fontsize=8)
+
+
+def _aspect(paths: Mapping[str, np.ndarray]) -> float:
+    shapes = [paths[name].shape for name in paths if name.endswith("/traversable")]
+    return float(np.clip(max(rows / columns for rows, columns in shapes), 0.5, 1.6))
+
+
+def _colour(policy: str, index: int) -> str:
+    return COLOURS.get(policy, f"C{index}")
+
+
+def figures_of(results: Path) -> Iterator[tuple[str, Figure]]:
+    """Every picture that the files under a folder give: (name, figure).
+
+    Raises:
+        RunFolderError: there is nothing to draw.
+    """
+    logs = sorted(results.rglob("metrics.jsonl"))
+    records = sorted(path for path in results.rglob("*.npz") if "checkpoints" not in path.parts)
+    records = [path for path in records if not path.parent.name.startswith("diverged-")]
+    curves = {log.parent.name: lines for log in logs if (lines := read_metrics(log))}
+    if not curves and not records:
+        raise RunFolderError(
+            f"{results}: nothing to draw (no metrics.jsonl, no recorded paths); expected a run folder"
+        )
+    if curves:
+        yield "learning_curves", learning_curves(curves)
+    for path in records:
+        with np.load(path) as stored:
+            if "policies" in stored.files:
+                run = path.parent.parent.name if path.parent.name == "evaluation" else path.stem
+                yield f"trajectories_{run}", trajectories(dict(stored))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draws; 0 when done, 2 on a user's error."""
+    parser = argparse.ArgumentParser(
+        prog="python -m train.figures", description="Draws what runs have written."
+    )
+    parser.add_argument("results", metavar="RESULTS_DIR", help="a run folder, or a folder of run folders")
+    parser.add_argument("-o", "--out", default="figures", metavar="DIR", help="where to (default figures/)")
+    arguments = parser.parse_args(argv)
+    try:
+        for name, figure in figures_of(Path(arguments.results)):
+            path = Path(arguments.out) / f"{name}.png"
+            with whole_file(path) as partial:
+                figure.savefig(partial, dpi=150, format="png")
+            plt.close(figure)
+            print(path)
+    except TrainError as error:
+        print(f"train.figures: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""An update function and run settings in, a trained learner out: face and loop that all learners share."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from train.config import RunConfig
+from train.errors import DivergedError
+
+PyTree = Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """All that a learner needs to go on exactly where it was."""
+
+    env_steps: int
+    """Environment steps taken since the start of the run."""
+    learner: PyTree
+    """Networks, optimiser, normaliser, random key."""
+    env_state: PyTree | None
+    """The batched environments; None where the checkpoint left them out, so that new episodes begin."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Update:
+    """What one update leaves behind for the loop to look at (a pytree)."""
+
+    losses: dict[str, jax.Array]
+    """name -> scalar."""
+    episode_sums: dict[str, jax.Array]
+    """name -> sum over the episodes that ended; `episodes` -> how many did."""
+    finite: jax.Array
+    """() bool: losses and everything learned are finite numbers."""
+    batch: PyTree
+    """The data learned from, saved if the numbers blow up."""
+
+
+jax.tree_util.register_dataclass(Update, ["losses", "episode_sums", "finite", "batch"], [])
+
+UpdateFn = Callable[[PyTree, PyTree], tuple[PyTree, PyTree, Update]]
+"""(learner, env_state) -> (learner, env_state, update); pure, compiled by the loop."""
+
+
+class Callbacks(Protocol):
+    """Where a learner meets the world: everything that reads clocks of others, files or signals."""
+
+    def restore(self, template: Snapshot) -> Snapshot | None:
+        """The snapshot to continue from, shaped like `template`; None to begin."""
+        ...
+
+    def should_stop(self) -> bool:
+        """Asked between updates; True saves a checkpoint and ends the loop."""
+        ...
+
+    def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
+        """Before anything is compiled: the state to begin from and the steps to reach."""
+        ...
+
+    def on_update(self, env_steps: int) -> None:
+        """After each update; must be cheap."""
+        ...
+
+    def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
+        """The means of a log interval."""
+        ...
+
+    def on_checkpoint(self, snapshot: Snapshot) -> None:
+        """A snapshot to keep; its arrays may be overwritten once this returns."""
+        ...
+
+    def on_diverged(self, before: Snapshot, update: Update) -> str:
+        """The state before the update that blew up, and that update; returns where they were saved."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """What training ends with."""
+
+    snapshot: Snapshot
+    metrics: dict[str, float]
+    """The last log interval's."""
+    completed: bool
+    """False when it was asked to stop before its last step."""
+
+
+def whole_updates(steps: int, steps_per_update: int) -> int:
+    """Updates that cover `steps`: at least one."""
+    return max(1, math.ceil(steps / steps_per_update))
+
+
+def run_loop(
+    update_fn: UpdateFn, start: Snapshot, steps_per_update: int, run: RunConfig, callbacks: Callbacks
+) -> TrainResult:
+    """Updates until `run.num_timesteps`, reporting and saving on the way.
+
+    Logs and checkpoints fall on fixed update counts, so a run that was killed and resumed takes the same
+    updates as one that was not.
+
+    Args:
+        update_fn: one update; its env_state argument is donated.
+        start: where to begin.
+        steps_per_update: environment steps that one update takes.
+        run: lengths and intervals, in environment steps.
+        callbacks: see `Callbacks`.
+
+    Raises:
+        DivergedError: the learner is no longer finite; the batch was handed to `on_diverged`.
+    """
+    total = whole_updates(run.num_timesteps, steps_per_update)
+    log_every = whole_updates(run.log_every_steps, steps_per_update)
+    save_every = log_every * whole_updates(run.checkpoint_every_steps, log_every * steps_per_update)
+
+    learner, env_state = strong_types((start.learner, start.env_state))
+    done = start.env_steps // steps_per_update
+    callbacks.on_start(start, total * steps_per_update)
+    metrics: dict[str, float] = {}
+    stop = done >= total or callbacks.should_stop()
+    if stop:
+        return TrainResult(start, metrics, completed=done >= total)
+
+    clock = time.perf_counter()
+    compiled = jax.jit(_strongly_typed(update_fn), donate_argnums=1).lower(learner, env_state).compile()
+    compile_s = time.perf_counter() - clock
+
+    interval: list[Update] = []
+    clock = time.perf_counter()
+    while not stop:
+        before = learner
+        learner, env_state, update = compiled(learner, env_state)
+        if not bool(update.finite):
+            at = Snapshot(done * steps_per_update, before, None)
+            bad = [name for name, loss in sorted(update.losses.items()) if not np.isfinite(loss)]
+            saved = callbacks.on_diverged(at, update)
+            raise DivergedError(
+                f"diverged after env step {at.env_steps}: {', '.join(bad or ['parameters'])} not finite; "
+                f"batch and learner before it are in {saved}; lower the learning rate or mend the batch"
+            )
+        done += 1
+        interval.append(dataclasses.replace(update, batch=None))
+        callbacks.on_update(done * steps_per_update)
+        stop = done >= total or callbacks.should_stop()
+        if done % log_every == 0 or stop:
+            seconds = time.perf_counter() - clock
+            metrics = interval_metrics(interval)
+            metrics["env_steps_per_s"] = len(interval) * steps_per_update / seconds
+            metrics["compile_s"] = compile_s
+            interval, clock = [], time.perf_counter()
+            callbacks.on_log(done * steps_per_update, metrics)
+        if done % save_every == 0 or stop:
+            callbacks.on_checkpoint(Snapshot(done * steps_per_update, learner, env_state))
+            clock = time.perf_counter()
+    return TrainResult(
+        Snapshot(done * steps_per_update, learner, env_state), metrics, completed=done >= total
+    )
+
+
+def interval_metrics(updates: list[Update]) -> dict[str, float]:
+    """Means over updates (losses) and over the episodes that ended in them; no episode, no episode means."""
+    losses = {name: np.mean([float(u.losses[name]) for u in updates]) for name in updates[0].losses}
+    sums = {name: np.sum([float(u.episode_sums[name]) for u in updates]) for name in updates[0].episode_sums}
+    episodes = sums.pop("episodes")
+    means = {name: total / episodes for name, total in sums.items()} if episodes else {}
+    metrics = {"episodes": episodes}
+    metrics |= {f"episode/{name}": mean for name, mean in means.items()}
+    metrics |= {f"loss/{name}": mean for name, mean in losses.items()}
+    return {name: float(value) for name, value in metrics.items()}
+
+
+def episode_sums(info: dict[str, Any]) -> dict[str, jax.Array]:
+    """Sums over the episodes that ended, from an auto-resetting environment's `info`.
+
+    Args:
+        info: `episode_done` [...] and `episode_metrics` {name: [...]}; scores count where an episode ended,
+            and what stands elsewhere (even NaN) does not.
+
+    Returns:
+        name -> scalar sum, and `episodes` -> number of episodes.
+    """
+    ended = info["episode_done"] > 0
+    sums = {name: jnp.sum(jnp.where(ended, value, 0.0)) for name, value in info["episode_metrics"].items()}
+    return {**sums, "episodes": jnp.sum(ended.astype(jnp.float32))}
+
+
+def all_finite(tree: PyTree) -> jax.Array:
+    """() bool: every floating number of the tree is finite."""
+    floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats]))
+
+
+def strong_types(tree: PyTree) -> PyTree:
+    """The tree with weakly typed leaves made strong, so that every update has one and the same signature."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(jnp.asarray(x), jnp.asarray(x).dtype), tree)
+
+
+def _strongly_typed(update_fn: UpdateFn) -> UpdateFn:
+    def update(learner: PyTree, env_state: PyTree) -> tuple[PyTree, PyTree, Update]:
+        learner, env_state, seen = update_fn(learner, env_state)
+        return strong_types(learner), strong_types(env_state), seen
+
+    return update

@@ -1,0 +1,69 @@
+"""Metrics in, lines or a live bar on the console out."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+class TrainingDisplay:
+    """A live bar on a terminal; one line a log interval elsewhere."""
+
+    def __init__(self, console: Console):
+        self.console = console
+        self._bar = Progress(
+            TextColumn("training"),
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TextColumn("[dim]elapsed[/]"),
+            TimeElapsedColumn(),
+            TextColumn("[dim]left[/]"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[status]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=None, status="compiling")
+        self._total = 0
+
+    def __enter__(self) -> TrainingDisplay:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def begin(self, env_steps: int, total_steps: int) -> None:
+        """The range of steps to show."""
+        self._total = total_steps
+        self._bar.update(self._task, completed=env_steps, total=total_steps)
+
+    def update(self, env_steps: int) -> None:
+        """Moves the bar."""
+        self._bar.update(self._task, completed=env_steps)
+
+    def log(self, env_steps: int, metrics: dict[str, float]) -> None:
+        """Shows a log interval's scores."""
+        status = describe(metrics)
+        self._bar.update(self._task, completed=env_steps, status=status)
+        if not self.console.is_terminal:
+            left = (self._total - env_steps) / max(metrics["env_steps_per_s"], 1e-9)
+            share = 100.0 * env_steps / max(self._total, 1)
+            reached = f"training {share:3.0f} %  {env_steps:,} of {self._total:,} steps  {left:.0f} s left"
+            self.console.print(f"{reached}  {status}", highlight=False, soft_wrap=True)
+
+
+def describe(metrics: dict[str, float]) -> str:
+    """Speed and scores of a log interval in a few words."""
+    words = [f"{metrics['env_steps_per_s']:,.0f} steps/s"]
+    for label, name in (("success", "success"), ("INS", "ins_0.5"), ("reward", "sum_reward")):
+        value = metrics.get(f"episode/{name}")
+        words.append(f"{label} {'-' if value is None else format(value, '.2f')}")
+    return "  ".join(words)

@@ -1,0 +1,138 @@
+"""An environment, a policy and one key an episode in; every episode's scores, and some of the paths, out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from train.policies import PolicyFn
+
+CHUNK_STEPS = 50
+"""Steps between two looks at which episodes are over."""
+SHRINK = 4
+"""Once only one episode in so many still runs, those go on in a batch of their own: a compilation for a
+batch that is no longer stepped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Paths:
+    """Where the robot went and what it moved, in the first E episodes; world frame, m."""
+
+    scene_index: np.ndarray
+    """[E] i32."""
+    start_xy_w: np.ndarray
+    """[E, 2]."""
+    goal_xy_w: np.ndarray
+    """[E, 2]."""
+    robot_xy_w: np.ndarray
+    """[E, T + 1, 2], NaN after the episode's end."""
+    object_start_w: np.ndarray
+    """[E, M, 3]."""
+    object_end_w: np.ndarray
+    """[E, M, 3]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """N finished episodes."""
+
+    scene_index: np.ndarray
+    """[N] i32."""
+    metrics: dict[str, np.ndarray]
+    """name -> [N], the environment's metrics at the step that ended the episode."""
+    paths: Paths
+
+
+def episode_keys(seed: int, episodes: int) -> jax.Array:
+    """[N, 2] keys of fixed episodes: number i is the same whatever their number and whoever plays them."""
+    return jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
+
+
+def run_episodes(
+    env: Any,
+    policy: PolicyFn,
+    keys: jax.Array,
+    record: int = 0,
+    on_progress: Callable[[int, int], None] = lambda finished, step: None,
+) -> Episodes:
+    """Plays every episode to its end, all in one batch.
+
+    Args:
+        env: one environment, not batched, not resetting itself.
+        policy: see `train.policies`.
+        keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
+        record: for how many of the first episodes to return paths.
+        on_progress: told (episodes finished, steps taken) now and then.
+    """
+    count, record = len(keys), min(record, len(keys))
+    state = jax.jit(jax.vmap(env.reset))(keys)
+    policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
+    first = jax.tree.map(np.asarray, state.info["nav"])
+    metrics = {name: np.full(count, np.nan, np.float32) for name in state.metrics}
+    object_end = first.object_pos_w.copy()
+    tracks = [[first.robot_pos_w[:record, :2]]]
+
+    episode_of = np.arange(count)  # episode played by each place in the batch
+    finished = np.zeros(count, bool)
+    chunk = jax.jit(functools.partial(_play_chunk, env, policy))
+    step = 0
+    while not finished.all():
+        ended_here = jnp.asarray(finished[episode_of])
+        state, ended, final, moved, track = chunk(state, policy_keys[episode_of], ended_here, step)
+        step += CHUNK_STEPS
+        new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
+        for name, values in final.items():
+            metrics[name][episode_of[new]] = np.asarray(values)[new]
+        object_end[episode_of[new]] = np.asarray(moved)[new]
+        finished[episode_of[new]] = True
+        places = np.full((CHUNK_STEPS, record, 2), np.nan, np.float32)
+        seen = episode_of < record
+        places[:, episode_of[seen]] = np.asarray(track)[:, seen]
+        tracks.append(list(places))
+        on_progress(int(finished.sum()), step)
+        running = np.flatnonzero(~finished[episode_of])
+        if 0 < len(running) <= len(episode_of) // SHRINK:
+            state = jax.tree.map(operator.itemgetter(running), state)
+            episode_of = episode_of[running]
+    robot_xy = np.stack([place for part in tracks for place in part], 1)
+    longest = np.isfinite(robot_xy[..., 0]).any(0).sum() if record else 0
+    paths = Paths(
+        scene_index=first.scene_index[:record],
+        start_xy_w=first.start_xy_w[:record],
+        goal_xy_w=first.goal_xy_w[:record],
+        robot_xy_w=robot_xy[:, :longest],
+        object_start_w=first.object_pos_w[:record],
+        object_end_w=object_end[:record],
+    )
+    return Episodes(first.scene_index, metrics, paths)
+
+
+def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: jax.Array, step: int) -> Any:
+    """Steps all environments; what belongs to an episode is frozen at the step that ended it.
+
+    Returns:
+        state, ended [N], metrics at the end {name: [N]}, objects at the end [N, M, 3],
+        robot positions [T, N, 2] (NaN after the end).
+    """
+
+    def one_step(carry: Any, t: jax.Array) -> tuple[Any, jax.Array]:
+        state, ended, final, moved = carry
+        action = jax.vmap(policy)(state.obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
+        state = jax.vmap(env.step)(state, action)
+        ends = (state.done > 0) & ~ended
+        nav = state.info["nav"]
+        final = {name: jnp.where(ends, state.metrics[name], value) for name, value in final.items()}
+        moved = jnp.where(ends[:, None, None], nav.object_pos_w, moved)
+        track = jnp.where(ended[:, None], jnp.nan, nav.robot_pos_w[:, :2])
+        return (state, ended | ends, final, moved), track
+
+    carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
+    (state, ended, final, moved), track = jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))
+    return state, ended, final, moved, track

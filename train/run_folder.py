@@ -1,0 +1,185 @@
+"""One run's folder: config, versions, metrics, TensorBoard events, summary; nothing else writes there.
+
+<out_dir>/<name>/config.yaml       what was run, every value resolved
+                 versions.json     packages, device, commit
+                 metrics.jsonl     one line a log interval
+                 tensorboard/      the same as events
+                 checkpoints/      see `checkpoint`
+                 summary.json      how it ended
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from train.config import TrainConfig
+from train.config_io import flatten, from_yaml, to_yaml
+from train.errors import RunFolderError
+from train.files import write_text
+
+PACKAGES = (
+    *("interactive-nav", "brax", "flax", "jax", "jaxlib", "jax-cuda13-plugin", "mujoco", "mujoco-mjx"),
+    *("numpy", "optax", "warp-lang"),
+)
+MAY_CHANGE = (
+    *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),
+    *("run.env_state_limit_mb", "env.threads"),
+)
+"""Settings that a run may be continued with at other values: they do not change what an update does."""
+HEADROOM_MB = 64.0
+
+
+class RunFolder:
+    """Paths of a run, and the small files in it."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.config = path / "config.yaml"
+        self.metrics = path / "metrics.jsonl"
+        self.checkpoints = path / "checkpoints"
+        self.tensorboard = path / "tensorboard"
+
+    def read_config(self) -> TrainConfig:
+        """The resolved config of the run.
+
+        Raises:
+            RunFolderError: the folder is no run.
+            ConfigError: its config does not fit this version.
+        """
+        if not self.config.is_file():
+            raise RunFolderError(
+                f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run"
+            )
+        return from_yaml(self.config.read_text(), where=str(self.config))
+
+    def open(self, config: TrainConfig) -> bool:
+        """Writes config and versions of a new run, or checks that an existing one is continued as it began.
+
+        Returns:
+            True where the run exists already.
+
+        Raises:
+            RunFolderError: the run exists with another value of a setting that decides its meaning.
+        """
+        exists = self.config.is_file()
+        if exists:
+            old, new = flatten(self.read_config()), flatten(config)
+            for name, value in new.items():
+                if old[name] != value and name not in MAY_CHANGE:
+                    raise RunFolderError(
+                        f"{self.path}: the run there has {name} = {old[name]!r}, this one {value!r}; "
+                        "set run.name to begin another run, or remove the folder"
+                    )
+        write_text(self.config, to_yaml(config))
+        write_text(self.path / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        return exists
+
+    def append_metrics(self, line: dict[str, Any]) -> None:
+        """Adds one line to metrics.jsonl.
+
+        Raises:
+            RunFolderError: the disk is full or no longer writable.
+        """
+        try:
+            with open(self.metrics, "a") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise RunFolderError(
+                f"{self.metrics}: cannot be written ({error.strerror or error}); make room and start again: "
+                "the run continues from its last checkpoint"
+            ) from None
+
+    def cut_metrics(self, env_steps: int) -> None:
+        """Drops the lines after a checkpoint that a run continues from: their steps are taken again."""
+        if self.metrics.is_file():
+            kept = [line for line in read_metrics(self.metrics) if line["env_steps"] <= env_steps]
+            write_text(self.metrics, "".join(json.dumps(line) + "\n" for line in kept))
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics.jsonl; an unfinished last line (a killed run) is left out."""
+    lines = []
+    for text in path.read_text().splitlines():
+        try:
+            lines.append(json.loads(text))
+        except ValueError:
+            break
+    return lines
+
+
+def claim(path: Path, needed_mb: float = 0.0) -> None:
+    """Makes a folder and makes sure that it can be written to.
+
+    Args:
+        path: made with its parents.
+        needed_mb: room that the run will need, beside some head room.
+
+    Raises:
+        RunFolderError: it cannot be made or written, or the disk is too full.
+    """
+    needed_mb += HEADROOM_MB
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".write-probe"
+        probe.write_bytes(bytes(1 << 16))
+        probe.unlink()
+        free_mb = shutil.disk_usage(path).free / 1e6
+    except OSError as error:
+        raise RunFolderError(
+            f"{path}: cannot be written ({error.strerror or error}); expected a writable folder (run.out_dir)"
+        ) from None
+    if free_mb < needed_mb:
+        raise RunFolderError(
+            f"{path}: {free_mb:.0f} MB free on its disk, expected {needed_mb:.0f} MB for checkpoints; "
+            "make room, or set run.out_dir or run.env_state_limit_mb"
+        )
+
+
+def versions() -> dict[str, Any]:
+    """Packages, Python, platform, device and commit that a result depends on."""
+    packages = {}
+    for name in PACKAGES:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    device = jax.devices()[0]
+    return {
+        "packages": packages,
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
+        "cpu_count": os.cpu_count(),
+        "matmul_precision": str(getattr(jax.config, "jax_default_matmul_precision", None) or "default"),
+        "commit": commit(),
+        "argv": sys.argv,
+    }
+
+
+def commit() -> str | None:
+    """The project's git commit, with `+dirty` if files differ from it; None outside a git checkout."""
+    root = Path(__file__).resolve().parents[1]
+
+    def git(*words: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(root), *words], capture_output=True, text=True, timeout=20
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if git("rev-parse", "--show-toplevel") != str(root):  # installed as a package inside some other checkout
+        return None
+    head = git("rev-parse", "HEAD")
+    return head and head + ("+dirty" if git("status", "--porcelain") else "")
