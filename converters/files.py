@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from converters.errors import SceneRejected
 
@@ -59,6 +59,20 @@ def read_json(path: Path) -> Any:
         raise SceneRejected(f"{path}: not readable as JSON ({error}); fetch the file again") from error
 
 
+def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
+    """One array of an NPZ file.
+
+    Raises:
+        SceneRejected: not an NPZ, damaged, or without the array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return np.asarray(arrays[name])
+    except Exception as error:  # a damaged archive fails in zipfile, zlib, struct or NumPy, each in its own way
+        reason = " ".join(str(error).split())
+        raise SceneRejected(f"{path}: not readable ({type(error).__name__}: {reason}); {remedy}") from error
+
+
 def read_image(path: Path, mode: str) -> np.ndarray:
     """Reads an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w).
 
@@ -68,7 +82,7 @@ def read_image(path: Path, mode: str) -> np.ndarray:
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert(mode))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # Pillow's decoders raise anything on a broken file
         raise SceneRejected(f"{path}: not readable as an image ({error}); fetch the file again") from error
 
 

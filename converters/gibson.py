@@ -9,7 +9,7 @@ import numpy as np
 from converters.annotations import parse_annotations
 from converters.cad import read_cad
 from converters.errors import SceneRejected
-from converters.files import SourceFolder, read_image, read_json, read_textured_obj
+from converters.files import SourceFolder, read_image, read_json, read_npz, read_textured_obj
 from converters.raw import GivenMap, RawScene, ScanMesh
 
 MESH = "mesh_z_up.obj"
@@ -61,13 +61,10 @@ def read_gibson(root: Path) -> RawScene:
 
 
 def _labels(path: Path) -> np.ndarray:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return np.asarray(arrays["label"]).reshape(-1).astype(np.int64)
-    except (OSError, KeyError, ValueError, EOFError) as error:
-        raise SceneRejected(
-            f"{path}: not readable ({error}); expected an NPZ with the array 'label'"
-        ) from error
+    labels = read_npz(path, "label", "expected an NPZ with the array 'label' of NYU40 ids")
+    if labels.dtype.kind not in "iu":
+        raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
+    return labels.reshape(-1).astype(np.int64)
 
 
 def _texture(source: SourceFolder) -> np.ndarray:

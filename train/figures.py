@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter
 
 from train.errors import RunFolderError, TrainError
 from train.files import whole_file
@@ -46,6 +47,7 @@ def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
         if key != "episode/sum_reward":
             axis.set_ylim(-0.02, 1.02)
         axis.set_xlabel("environment steps")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
@@ -65,7 +67,7 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6) -> Figure:
     columns = min(count, 3)
     rows = -(-count // columns)
     aspect = _aspect(paths)
-    size = (4.6 * columns, 4.6 * aspect * rows + 0.9)
+    size = (4.4 * columns, (4.0 * aspect + 0.9) * rows + 0.6)  # panels, their titles and labels, the legend
     figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     for axis in grid.flat[count:]:
         axis.set_axis_off()
@@ -100,7 +102,7 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
         moved = inside & (np.linalg.norm(end - begin, axis=-1) > MOVED_M)
         for a, b in zip(begin[moved], end[moved], strict=True):
             axis.plot(*np.stack([a, b]).T, color=colour, linewidth=0.8, linestyle=":")
-        axis.scatter(*end[moved].T, s=26, marker="s", color=colour, linewidths=0)
+        axis.scatter(*end[moved].T, s=26, marker="s", color=colour, linewidths=0, zorder=6)
         track = paths[f"{policy}/robot_xy_w"][i]
         track = track[np.isfinite(track[:, 0])]
         axis.plot(*track.T, color=colour, linewidth=1.6, alpha=0.85)

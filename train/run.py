@@ -177,7 +177,7 @@ def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) ->
     for name, got, expected in facts:
         if got != expected:
             raise CheckpointError(
-                f"{path}: the checkpoint's {name} is {got!r}, the environment's {expected!r}; "
+                f"{path}: {name} of the checkpoint: {got!r}, of the environment: {expected!r}; "
                 "choose a checkpoint of this robot and these observations, or the run's own env settings"
             )
 

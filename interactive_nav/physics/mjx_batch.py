@@ -66,7 +66,7 @@ class MjxPhysics(Physics):
     ):
         self.name = impl
         self._world, self._substeps = world, substeps
-        self._contacts, self._constraints = contacts_per_env, constraints_per_env
+        self.contacts_per_env, self.constraints_per_env = contacts_per_env, constraints_per_env
         host = world.models[0]
         self.nq, self.nv = host.nq, host.nv
         if impl == "jax":
@@ -91,7 +91,7 @@ class MjxPhysics(Physics):
         n = scene.shape[0]
         if self.name == "warp":
             template = mjx.make_data(
-                self._host, impl="warp", naconmax=n * self._contacts, njmax=self._constraints
+                self._host, impl="warp", naconmax=n * self.contacts_per_env, njmax=self.constraints_per_env
             )
         else:
             template = mjx.make_data(self._host, impl="jax")

@@ -120,7 +120,7 @@ def test_checkpoint_of_another_robot(run, tmp_path, capsys):
     out = copy / "rows.parquet"
     assert evaluate.main([str(copy), "--out", str(out)], build_env=build_toy) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "the checkpoint's robot is 'fetch', the environment's 'turtlebot'" in line
+    assert "robot of the checkpoint: 'fetch', of the environment: 'turtlebot'" in line
     assert not out.exists()
 
 

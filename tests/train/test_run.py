@@ -151,9 +151,9 @@ def test_checkpoint_of_another_robot_is_refused():
     config = toy_config("x").env
     meta = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", config.observations, 29, 2)
     check_fits(meta, Path("c"), config, env)
-    with pytest.raises(CheckpointError, match="checkpoint's robot is 'fetch', the environment's 'turtlebot'"):
+    with pytest.raises(CheckpointError, match="robot of the checkpoint: 'fetch'.*'turtlebot'"):
         check_fits(dataclasses.replace(meta, robot="fetch"), Path("c"), config, env)
-    with pytest.raises(CheckpointError, match="observation size is 9, the environment's 29"):
+    with pytest.raises(CheckpointError, match="size of the checkpoint: 9, of the environment: 29"):
         check_fits(dataclasses.replace(meta, observation_size=9), Path("c"), config, env)
 
 

@@ -1,0 +1,78 @@
+"""Decomposition: hulls of known shapes, the cache, and its two failures."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from converters import decompose
+from converters.decompose import DecomposeConfig, content_key, decompose_all
+from converters.errors import StageFailed
+from tests.converters import tiny_raw
+
+CONFIG = DecomposeConfig()
+
+
+def table() -> tuple[np.ndarray, np.ndarray]:
+    mesh = tiny_raw.table_cad()
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+
+
+def test_a_table_becomes_a_top_and_four_legs(hull_cache):
+    hulls = decompose_all({"table": table()}, CONFIG, 1, hull_cache)["table"]
+    assert 5 <= len(hulls) <= CONFIG.max_convex_hull
+    low = np.min([h.vertices.min(axis=0) for h in hulls], axis=0)
+    high = np.max([h.vertices.max(axis=0) for h in hulls], axis=0)
+    np.testing.assert_allclose([low, high], [(-0.5, -0.35, -0.3), (0.5, 0.35, 0.3)], atol=0.03)
+    # 0.06 m3 of top and 4 * 0.00384 m3 of legs; voxels of the preprocessing thicken it somewhat.
+    volume = sum(trimesh.Trimesh(h.vertices, h.faces).volume for h in hulls)
+    assert 0.06 < volume < 0.11
+    assert all(trimesh.Trimesh(h.vertices, h.faces).is_convex for h in hulls)
+
+
+def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cache, monkeypatch):
+    vertices, faces = table()
+    first = decompose_all({"a": (vertices, faces)}, CONFIG, 1, hull_cache)["a"]
+    entry = hull_cache / f"{content_key(vertices, faces, CONFIG)}.npz"
+    own = tmp_path / entry.name
+    own.write_bytes(entry.read_bytes()[:100])  # cut short
+    again = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path)["a"]
+    assert own.read_bytes() == entry.read_bytes()
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+
+    def no_process(*args, **kwargs):
+        raise AssertionError("a cached mesh must not be decomposed")
+
+    monkeypatch.setattr(decompose, "_start", no_process)
+    cached = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path)
+    assert len(cached["a"]) == len(cached["b"]) == len(first)
+
+
+def test_the_key_follows_content_and_parameters_only():
+    vertices, faces = table()
+    key = content_key(vertices, faces, CONFIG)
+    assert key == content_key(
+        vertices.copy(), faces.astype(np.int32), dataclasses.replace(CONFIG, timeout_s=1.0)
+    )
+    assert key != content_key(vertices * 1.001, faces, CONFIG)
+    assert key != content_key(vertices, faces, dataclasses.replace(CONFIG, threshold=0.2))
+
+
+def test_a_failing_and_a_slow_model_are_named(tmp_path):
+    with pytest.raises(StageFailed, match="coacd ran past 0 s on table"):
+        decompose_all({"table": table()}, dataclasses.replace(CONFIG, timeout_s=0.0), 1, tmp_path)
+    with pytest.raises(StageFailed, match="coacd failed on broken"):
+        decompose_all({"broken": (np.zeros((0, 3)), np.zeros((0, 3), np.int64))}, CONFIG, 1, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path))
+    assert decompose.cache_folder() == tmp_path / "hulls"
+    monkeypatch.delenv("INTERACTIVE_NAV_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "x"))
+    assert decompose.cache_folder() == tmp_path / "x" / "interactive_nav" / "hulls"

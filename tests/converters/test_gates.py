@@ -1,0 +1,156 @@
+"""Gates: values by hand, and each physical gate shown to fail once on purpose."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from converters.gates import (
+    LIMITS,
+    check_folder,
+    collide_with,
+    eroded,
+    evaluate,
+    free_space_values,
+    judge,
+    physical_values,
+)
+from scenes_mjcf.schema import SceneMaps, load_maps
+
+
+def maps_of(traversable: np.ndarray) -> SceneMaps:
+    return SceneMaps(traversable, 0.05, (0.0, 0.0), 0.0)
+
+
+def failed(gates) -> set[str]:
+    return {g.name for g in gates if not g.passed}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "passed"),
+    [
+        ("drift_hulls", 0.01, True),
+        ("drift_hulls", 0.0101, False),
+        ("drift_hulls", float("nan"), False),
+        ("start_goal", 0.99, False),
+        ("start_goal", 1.0, True),
+    ],
+)
+def test_judge_holds_values_against_the_table(name, value, passed):
+    gate = judge(name, value)
+    assert gate.passed is passed
+    json.dumps(gate.as_dict(), allow_nan=False)
+
+
+def test_erosion_by_hand():
+    free = np.ones((20, 20), bool)
+    # A cell's middle in row r is (r + 0.5) * 0.05 m from the map's edge: 0.175 in row 3, 0.225 in row 4.
+    inner = eroded(free, 0.05, 0.18)
+    assert inner.sum() == 12 * 12 and inner[4, 4] and not inner[3, 10]
+
+
+def test_free_space_of_two_rooms_and_a_slit():
+    free = np.zeros((40, 100), bool)
+    free[:, :60] = True  # 2 x 3 m
+    free[:, 70:] = True  # 2 x 1.5 m
+    free[20:22, 60:70] = True  # a slit of 10 cm: too narrow for the disc
+    values = free_space_values(maps_of(free))
+    assert values["traversable_area"] == pytest.approx((40 * 60 + 40 * 30 + 20) * 0.0025)
+    # Eroded by 4 cells on each side: 32 x 52 and 32 x 22.
+    assert values["connected_share"] == pytest.approx(52 / 74)
+    assert values["start_goal"] == pytest.approx(np.hypot(31, 51) * 0.05)
+
+
+@pytest.mark.parametrize(("shape", "farthest"), [((9, 40), 31 * 0.05), ((9, 9), 0.0), ((4, 40), 0.0)])
+def test_a_corridor_one_cell_wide_and_one_too_narrow(shape, farthest):
+    values = free_space_values(maps_of(np.ones(shape, bool)))
+    assert values["start_goal"] == pytest.approx(farthest)
+
+
+def spec_of(folder: Path) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+
+
+def test_the_tiny_scene_passes_every_gate(tiny_scene):
+    folder, converted = tiny_scene
+    manifest, gates = check_folder(folder)
+    assert failed(gates) == set()
+    assert {g.name: g.as_dict() for g in gates} == manifest.gates == converted.manifest.gates
+    assert [g.name for g in gates] == list(LIMITS)
+
+
+def test_collision_switches_between_hulls_and_boxes(tiny_scene):
+    folder, _ = tiny_scene
+    for shape in ("hull", "box"):
+        model = collide_with(spec_of(folder), shape)
+        for kind in ("hull", "box"):
+            on = {
+                bool(model.geom_contype[g]) for g in range(model.ngeom) if f"_{kind}_" in model.geom(g).name
+            }
+            assert on == {kind == shape}
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data)
+        assert data.ncon > 0  # the objects stand on the floor, whichever shape collides
+
+
+def change(folder: Path, edit) -> set[str]:
+    spec = spec_of(folder)
+    edit(spec)
+    return failed(evaluate(spec, load_maps(folder), ("table_0", "basket_0")))
+
+
+def test_a_floating_object_drifts(tiny_scene):
+    def lift(spec):
+        spec.body("basket_0").pos = np.array(spec.body("basket_0").pos) + [0, 0, 0.1]
+
+    assert {"drift_hulls", "drift_boxes"} <= change(tiny_scene[0], lift)
+
+
+def test_an_object_in_a_wall_penetrates(tiny_scene):
+    def push(spec):
+        spec.body("basket_0").pos = np.array([2.95, 0.6, 0.0])
+
+    assert {"penetration_hulls", "penetration_boxes"} <= change(tiny_scene[0], push)
+
+
+def test_a_missing_object_is_counted(tiny_scene):
+    def drop(spec):
+        spec.delete(spec.body("basket_0"))
+
+    assert change(tiny_scene[0], drop) == {"unmatched_objects"}
+
+
+def test_no_room_for_start_and_goal(tiny_scene):
+    folder, _ = tiny_scene
+    maps = load_maps(folder)
+    small = dataclasses.replace(maps, traversable=np.ones((15, 15), bool))
+    assert failed(evaluate(spec_of(folder), small, ("table_0", "basket_0"))) == {
+        "traversable_area",
+        "start_goal",
+    }
+
+
+def test_a_scene_that_does_not_compile_fails_its_first_gate(tiny_scene, tmp_path):
+    folder = Path(shutil.copytree(tiny_scene[0], tmp_path / "scene"))
+    (folder / "scene.xml").write_text("<mujoco><worldbody><geom type='box'/></worldbody></mujoco>")
+    assert failed(check_folder(folder)[1]) >= {"compiles"}
+
+
+def test_physical_values_of_a_ball_in_free_fall():
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="ball", pos=[0, 0, 100.0])
+    body.add_freejoint()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
+    values = physical_values(spec.compile())
+    assert values["drift"] == pytest.approx(0.5 * 9.81 * 2.0**2, rel=0.01)  # g t^2 / 2
+    assert (
+        values["turn"] == pytest.approx(0.0, abs=1e-6)
+        and values["penetration"] == 0.0
+        and values["finite"] == 1.0
+    )

@@ -1,0 +1,46 @@
+"""The licensed ScanNet room end to end; skipped with a reason where the data is absent."""
+
+from __future__ import annotations
+
+import time
+
+import mujoco
+import pytest
+
+from converters.gates import check_folder
+from converters.pipeline import ConvertConfig, convert
+from scenes_mjcf.schema import load_maps
+
+pytestmark = [pytest.mark.data, pytest.mark.slow]
+
+LIMIT_S = 180.0
+
+
+def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_path):
+    start = time.monotonic()
+    out = tmp_path / "scenes" / "room"
+    converted = convert(
+        sample_data / "scan2cad_scene0470_00", out, ConvertConfig(format="scan2cad"), cache=tmp_path / "cache"
+    )
+    seconds = time.monotonic() - start
+    assert seconds < LIMIT_S, f"took {seconds:.0f} s"
+    manifest, gates = check_folder(out)
+    assert {g.name for g in gates if not g.passed} == set()
+    assert sorted(o.category for o in manifest.objects) == ["basket", *["chair"] * 5, "table"]
+    for item in manifest.objects:
+        low, high = {"chair": (4, 8), "table": (10, 40), "basket": (0.5, 2)}[item.category]
+        assert low <= item.mass_kg <= high
+    for row in manifest.alignment:
+        # People clicked these keypoints on a scan of 2 cm: residuals of centimetres, and no gross disagreement.
+        assert 0.01 < row["rms_m"] < 0.1
+        assert row["translation_difference_m"] < 0.05 and row["yaw_difference_deg"] < 5.0
+        assert all(0.8 < v < 1.2 for v in row["scale_ratio"])
+        assert row["texture_seen_share"] > 0.5
+        assert row["settle_shift_m"] < 0.2 and abs(row["settle_drop_m"]) < 0.1
+    maps = load_maps(out)
+    assert 6.5 < maps.traversable.sum() * maps.resolution_m**2 < 9.0  # of the room's 3.5 x 2.9 m
+    assert converted.n_walls <= 64
+    assert 0.03 < maps.floor_height_m < 0.1
+    assert sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) < 3 * 2**20
+    model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
+    assert sum(int(n) for n in model.body_jntnum) == 7

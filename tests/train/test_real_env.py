@@ -1,0 +1,57 @@
+"""Training, resuming and scoring on the real environment: a room with one chair, on C MuJoCo."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from tests.toys import write_room
+from tests.train.toy_run import UPDATE_STEPS, toy_config
+from train import checkpoint, evaluate
+from train.config import EnvConfig, TrainConfig
+from train.run import train_run
+from train.run_folder import read_metrics
+
+
+@pytest.mark.slow
+def test_train_resume_and_evaluate(tmp_path, capsys):
+    room = write_room(tmp_path / "room")
+    toy = toy_config(tmp_path / "runs", updates=2)
+    env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=12, num_objects=2)
+    config = TrainConfig(env=env, ppo=toy.ppo, run=toy.run)
+    result, folder, _ = train_run(config, Console(file=io.StringIO()))
+    assert result.completed
+    # 16 environments for 32 steps with a limit of 12: two time limits each, if none succeeds.
+    assert sum(line["episodes"] for line in read_metrics(folder.metrics)) >= 32
+    more = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=3 * UPDATE_STEPS))
+    result, folder, _ = train_run(more, Console(file=io.StringIO()))
+    assert [c.env_steps for c in checkpoint.list_checkpoints(folder.checkpoints)] == [512, 768]
+    assert all(np.isfinite(value) for line in read_metrics(folder.metrics) for value in line.values())
+
+    assert evaluate.main([str(folder.path), "--episodes", "6", "env.episode_steps=30"]) == 0
+    rows = pq.read_table(folder.path / "evaluation" / "episodes.parquet").to_pydict()
+    assert len(rows["policy"]) == 18 and set(rows["scene"]) == {"room"} and set(rows["backend"]) == {"native"}
+    steps, success = np.array(rows["episode_steps"]), np.array(rows["success"])
+    assert ((steps == 30) | (success == 1)).all() and (steps <= 30).all()
+    assert (np.array(rows["nonfinite"]) == 0).all()
+    # The paths that were recorded are the paths that were scored.
+    with np.load(folder.path / "evaluation" / "episodes.npz") as paths:
+        track = paths["follower/robot_xy_w"][0]
+        track = track[np.isfinite(track[:, 0])]
+        assert len(track) == steps[12] + 1
+        travelled = np.linalg.norm(np.diff(track, axis=0), axis=-1).sum()
+        assert travelled == pytest.approx(rows["robot_path_m"][12], rel=0.02)  # scored in 3-D
+        assert paths["scene/0/object_names"].tolist()[-1] == "chair_0"
+
+    capsys.readouterr()
+    assert evaluate.main([str(folder.path), "env.robot=turtlebott"]) == 2
+    assert "train.evaluate: env: unknown robot 'turtlebott'" in capsys.readouterr().err
+    assert evaluate.main([str(folder.path), "env.observations=goal,velocity"]) == 2
+    assert "observations of the checkpoint: " in capsys.readouterr().err
+    assert evaluate.main([str(folder.path), "--scenes", str(tmp_path / "absent")]) == 2
+    assert str(tmp_path / "absent") in capsys.readouterr().err
