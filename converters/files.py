@@ -68,7 +68,7 @@ def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return np.asarray(arrays[name])
-    except Exception as error:  # a damaged archive fails in zipfile, zlib, struct or NumPy, each in its own way
+    except Exception as error:  # damaged archives fail in zipfile, zlib or NumPy, each in its own way
         reason = " ".join(str(error).split())
         raise SceneRejected(f"{path}: not readable ({type(error).__name__}: {reason}); {remedy}") from error
 

@@ -6,7 +6,7 @@ import dataclasses
 from importlib.metadata import version
 from typing import Any
 
-from converters.decompose import DecomposeConfig
+from converters.decompose import DOOR_OVERRIDES, DecomposeConfig
 from converters.emit import SceneParts
 from converters.gates import Gate
 from converters.raw import RawScene
@@ -54,7 +54,8 @@ def make_manifest(
         licence=raw.licence,
         floor_area_m2=round(floor_area_m2, 3),
         objects=objects,
-        collision={"method": "coacd", "boxes": "oriented box of each hull", **parameters},
+        collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES}
+        | parameters,
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),

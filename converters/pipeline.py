@@ -20,7 +20,7 @@ import numpy as np
 from converters import gibson, scan2cad
 from converters.alignment import Alignment, compare, upright
 from converters.cut import cut_furniture
-from converters.decompose import DecomposeConfig, cache_folder, decompose_all
+from converters.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
 from converters.emit import SceneParts, write_scene
 from converters.errors import SceneRejected
 from converters.floor import floor_patch, level_floor
@@ -197,6 +197,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
             config.jobs,
             cache,
             progress,
+            {k: DOOR_OVERRIDES for k, c in raw.cads.items() if c.category == "door"},
         )
         annotated = tuple(
             place_object(name, a, raw.cads[a.cad_id], hulls[a.cad_id], pose, floor_height, walls_yaw)

@@ -246,7 +246,12 @@ def navigation_grid(
 
 
 def distance_table(
-    free: np.ndarray, cell_m: float, origin_w: tuple[float, float], max_goals: int, seed: int = 0
+    free: np.ndarray,
+    cell_m: float,
+    origin_w: tuple[float, float],
+    max_goals: int,
+    seed: int = 0,
+    goals: np.ndarray | None = None,
 ) -> DistanceTable:
     """Solves all-free-cells-to-goal shortest paths for a uniform draw of goal cells.
 
@@ -254,18 +259,19 @@ def distance_table(
         free: [rows, columns] bool, one connected component.
         cell_m: cell side.
         origin_w: world corner of cell [0, 0].
-        max_goals: goals are all free cells, or this many drawn without replacement.
+        max_goals: goals are all eligible cells, or this many drawn without replacement.
         seed: of that draw.
+        goals: [rows, columns] bool, eligible cells; None: all free cells.
 
     Returns:
         The table. Memory is 8 bytes x G x n.
     """
     graph, nodes = grid_graph(free, cell_m)
     n = len(nodes)
-    goals = np.arange(n)
-    if n > max_goals:
-        goals = np.sort(np.random.default_rng(seed).choice(n, max_goals, replace=False))
-    distance, previous = scipy.sparse.csgraph.dijkstra(graph, indices=goals, return_predecessors=True)
+    chosen = np.arange(n) if goals is None else np.flatnonzero(goals[free])
+    if len(chosen) > max_goals:
+        chosen = np.sort(np.random.default_rng(seed).choice(chosen, max_goals, replace=False))
+    distance, previous = scipy.sparse.csgraph.dijkstra(graph, indices=chosen, return_predecessors=True)
     own = previous < 0
     previous = np.where(own, np.arange(n)[None, :], previous)
     _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
@@ -280,7 +286,7 @@ def distance_table(
         node_of_cell=index[near_r, near_c].astype(np.int32),
         offset_of_cell_m=(np.hypot(near_r - rows, near_c - columns) * cell_m).astype(np.float32),
         node_xy_w=xy.astype(np.float32),
-        goal_node=goals.astype(np.int32),
+        goal_node=chosen.astype(np.int32),
         distance_m=distance.astype(np.float32),
         next_node=previous.astype(np.int32),
     )

@@ -46,7 +46,8 @@ def draw_episode(
         jitter_m: half side of the square about a tabulated start in which the start is uniform.
 
     Returns:
-        The episode's start. Small objects keep clear of the robot and of each other.
+        The episode's start. Start and goal are free of contact: small objects keep
+        clear of the robot at both, and of each other.
     """
     key_scene, key_start, key_goal, key_jitter, key_yaw, key_clutter = jax.random.split(key, 6)
     scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
@@ -75,6 +76,7 @@ def draw_episode(
         gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - small_radius_m
         ok = ((gaps > reach) | ~oks).all(-1)
         ok &= jnp.linalg.norm(xy - start_xy, axis=-1) > robot_radius_m + reach
+        ok &= jnp.linalg.norm(xy - goal_xy[chosen], axis=-1) > robot_radius_m + reach
         ok &= tables.num_clutter[scene] > 0
         best = jnp.argmax(ok)
         return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None

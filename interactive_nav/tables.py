@@ -86,7 +86,6 @@ def _scene_places(world: World, index: int, config: NavConfig) -> tuple[Distance
             f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "
             "map; use a smaller robot or check the scan's floor"
         )
-    table = distance_table(free, cell, maps.origin_w, config.max_goals, seed=int(scene.digest[:8], 16))
     open_m = clearance(
         maps.traversable & ~furniture_map(scene, _poses(world, index), robot.height_m), maps.resolution_m
     )
@@ -97,10 +96,15 @@ def _scene_places(world: World, index: int, config: NavConfig) -> tuple[Distance
         r, c = np.nonzero(mask)
         return np.stack([maps.origin_w[0] + (c + 0.5) * cell, maps.origin_w[1] + (r + 0.5) * cell], -1)
 
+    # The robot must fit at the goal too, or a goal under a sofa could never be reached.
+    goal_cells = free & (margin >= robot.footprint_radius_m + CLEARANCE_M)
+    table = distance_table(
+        free, cell, maps.origin_w, config.max_goals, seed=int(scene.digest[:8], 16), goals=goal_cells
+    )
     starts = centres(free & (margin >= robot.footprint_radius_m + 0.75 * cell + CLEARANCE_M))
     clutter = centres(margin >= largest + CLEARANCE_M)
     goals = table.node_xy_w[table.goal_node]
-    far = len(starts) and np.linalg.norm(starts[:, None] - goals[None], axis=-1).max() >= config.min_goal_distance_m
+    far = len(starts) and len(goals) and np.linalg.norm(starts[:, None] - goals[None], axis=-1).max() >= config.min_goal_distance_m
     if not far:
         raise SceneError(
             f"{scene.path}: no room for a start and a goal {config.min_goal_distance_m} m apart for robot "

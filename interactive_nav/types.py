@@ -33,7 +33,7 @@ class SceneTables:
     node_xy_w: jax.Array
     """[S, n, 2] f32 centres of the free cells."""
     goal_node: jax.Array
-    """[S, G] i32."""
+    """[S, G] i32 goals: free cells where the robot stands clear of furniture."""
     num_goals: jax.Array
     """[S] i32."""
     distance_m: jax.Array

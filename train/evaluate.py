@@ -166,7 +166,12 @@ def parser() -> argparse.ArgumentParser:
     names = ",".join((LEARNED, *YARDSTICKS))
     made.add_argument("--policies", default=names, help=f"comma-separated choice from {names} (default: all)")
     made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
-    made.add_argument("--stochastic", action="store_true", help="sample the learned policy's actions")
+    made.add_argument(
+        "--stochastic",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="sample the learned policy's actions, as the original did (default), or take their mode",
+    )
     made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
     made.add_argument(
         "--out", metavar="PATH", help="Parquet file (default RUN_DIR/evaluation/episodes.parquet)"

@@ -1,9 +1,14 @@
 """The whole converter on the tiny room: what it writes, that it writes it twice alike, and how it stops."""
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
+
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -149,8 +154,8 @@ def test_a_failure_half_way_leaves_nothing_and_keeps_the_old_scene(gibson_raw, t
 
 
 def test_no_annotation_at_all(gibson_raw, tmp_path, hull_cache):
-    (gibson_raw / "alignments.json").write_text('[{"trs": {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], '
-                                                '"scale": [1, 1, 1]}, "aligned_models": []}]')  # fmt: skip
+    empty = [tiny_raw.annotation()[0] | {"aligned_models": []}]
+    (gibson_raw / "alignments.json").write_text(json.dumps(empty))
     with pytest.raises(SceneRejected, match="no annotated object"):
         convert(gibson_raw, tmp_path / "out", SMALL, cache=hull_cache)
 
@@ -186,8 +191,6 @@ def test_commands_and_their_exit_codes(tiny_scene, tmp_path, capsys):
 
 
 def test_check_exits_one_when_a_gate_fails(tiny_scene, tmp_path, capsys):
-    import shutil
-
     folder = Path(shutil.copytree(tiny_scene[0], tmp_path / "scene"))
     spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
     spec.body("basket_0").pos = np.array([2.4, 0.6, 0.2])
@@ -202,8 +205,12 @@ def test_interruption_leaves_nothing(pristine, tmp_path, sent, code):
     out = tmp_path / "scenes" / "out"
     process = subprocess.Popen(
         [sys.executable, "-m", "converters", "convert", str(pristine / "gibson"), str(out)],
-        env=environment, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        env=environment,
+        cwd=Path(__file__).parents[2],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     deadline = time.monotonic() + 60
     while not (out.parent.is_dir() and list(out.parent.iterdir())) and time.monotonic() < deadline:
         time.sleep(0.02)

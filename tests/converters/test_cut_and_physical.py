@@ -50,7 +50,7 @@ def test_the_cut_takes_exactly_the_furniture(scan2cad_raw):
 def test_unlabelled_things_on_a_table_go_with_it_and_a_shelf_beside_stays(scan2cad_raw):
     raw = read_scan2cad(scan2cad_raw)
     book = trimesh.creation.box((0.2, 0.2, 0.05)).subdivide().subdivide().apply_translation((0.9, 1.6, 0.75))
-    shelf = trimesh.creation.box((0.3, 0.8, 1.0)).subdivide_to_size(0.1).apply_translation((2.0, 1.8, 0.5))
+    shelf = trimesh.creation.box((0.3, 0.8, 1.0)).subdivide().subdivide().apply_translation((2.0, 1.8, 0.5))
     vertices, faces = raw.scan.vertices - [0, 0, 0.3], raw.scan.faces
     labels = np.concatenate(
         [raw.scan.labels, np.zeros(len(book.vertices), int), np.full(len(shelf.vertices), 3)]

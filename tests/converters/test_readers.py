@@ -1,4 +1,4 @@
-"""Readers: known values in, the same values out; each kind of bad input gives one line that says what to do."""
+"""Readers: known values in, the same values out; each kind of bad input gives one helpful line."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def test_annotation_file_with_something_else(scan2cad_raw, text):
         ("floors.txt", "0.1\n2.9\n", ("2 floor heights", "expected one")),
         ("floors.txt", "ground\n", ("floors.txt", "expected one floor height")),
         ("mesh_z_up.mtl", "newmtl scan\n", ("names 0 textures", "expected exactly one")),
-        ("mesh_z_up.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3 1\n", ("mesh_z_up.obj:4", "4 corners", "triangulate")),
+        ("mesh_z_up.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3 1\n", ("obj:4", "4 corners", "triangulate")),
         ("mesh_z_up.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 9\n", ("names vertex 8 of 3",)),
         ("mesh_z_up.obj", "v 0 0 nan\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", ("1 vertices are not finite",)),
         ("mesh_z_up.obj", "v 0 0\nv 1 0 0\nf 1 2 3\n", ("not readable as OBJ",)),

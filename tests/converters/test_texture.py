@@ -36,7 +36,7 @@ def test_texels_of_a_square_that_fills_the_image():
     texel, point, face = texel_surface(SQUARE, TRIANGLES, uv, TRIANGLES, 4)
     np.testing.assert_array_equal(texel, np.arange(16))
     row, column = np.divmod(texel, 4)
-    # Image rows run downwards: the middle of texel (row, column) is at u = (column + 0.5) / 4, v = 1 - (row + 0.5) / 4.
+    # Image rows run downwards: a texel's middle is at u = (column + 0.5) / 4, v = 1 - (row + 0.5) / 4.
     np.testing.assert_allclose(point[:, 0], (column + 0.5) / 4)
     np.testing.assert_allclose(point[:, 1], 1 - (row + 0.5) / 4)
     assert set(face) == {0, 1}

@@ -1,4 +1,4 @@
-"""A tiny raw room with known content, written in both layouts: 3 x 2.5 m, a table and a basket, floor at 0.3 m."""
+"""A tiny raw room in both layouts: 3 x 2.5 m, a table and a basket, floor at 0.3 m."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def table_cad() -> trimesh.Trimesh:
     for x in (-0.45, 0.45):
         for z in (-0.25, 0.25):
             parts.append(trimesh.creation.box((0.08, 0.6, 0.08)).apply_translation((x, -0.05, z)))
-    return trimesh.util.concatenate(parts)
+    joined = trimesh.util.concatenate(parts)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
 
 
 def basket_cad() -> trimesh.Trimesh:
@@ -78,7 +80,9 @@ def scan() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ]
     pieces = [(_sheet((lx / 2, ly / 2, 0), (lx, ly, 0)), 2)] + [(_sheet(*w), 1) for w in walls]
     for item in ITEMS:
-        pieces.append((placed(item).subdivide_to_size(0.05), item.label))
+        fine = placed(item).subdivide_to_size(0.05)
+        assert isinstance(fine, trimesh.Trimesh)
+        pieces.append((fine, item.label))
     vertices, faces, labels = [], [], []
     count = 0
     for mesh, label in pieces:
@@ -170,7 +174,8 @@ def write_label_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, labels:
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"property ushort label\nelement face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"property ushort label\nelement face {len(faces)}\nproperty list uchar int vertex_indices\n"
+        "end_header\n"
     )
     rows = np.zeros(len(vertices), [("p", "<f4", 3), ("l", "<u2")])
     rows["p"], rows["l"] = vertices, labels
