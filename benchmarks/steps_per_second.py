@@ -19,14 +19,13 @@ import statistics
 import subprocess
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
-import interactive_nav
 import jax
 import jax.numpy as jnp
 from rich.console import Console
 
+import interactive_nav
 from interactive_nav.wrappers import AutoResetEnv
 from train import config_io
 from train.run import train_run

@@ -171,15 +171,11 @@ def _positive(text: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m converters", description="Raw scans to MuJoCo scene folders."
-    )
+    parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     convert = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
     convert.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
-    convert.add_argument(
-        "out", type=Path, metavar="OUT", help="scene folder to make; its name becomes the scene's"
-    )
+    convert.add_argument("out", type=Path, metavar="OUT", help="scene folder to make; its name becomes the scene's")
     convert.add_argument(
         "--format",
         choices=("auto", "gibson", "scan2cad"),
@@ -197,9 +193,7 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(run=_convert)
-    check = commands.add_parser(
-        "check", help="run the acceptance gates on a scene folder; exit 1 if one fails"
-    )
+    check = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
     check.add_argument("scene", type=Path, metavar="SCENE_DIR")
     check.set_defaults(run=_check)
     generate = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")

@@ -64,9 +64,7 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray) -> Alignmen
     """
     p, q = np.asarray(cad_points, float), np.asarray(scan_points, float)
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
-        raise AlignmentError(
-            f"keypoints have shapes {p.shape} and {q.shape}, expected two equal (k, 3) arrays"
-        )
+        raise AlignmentError(f"keypoints have shapes {p.shape} and {q.shape}, expected two equal (k, 3) arrays")
     if len(p) < MIN_POINTS:
         raise AlignmentError(f"{len(p)} keypoint pairs, expected at least {MIN_POINTS}")
     p_mean, q_mean = p.mean(axis=0), q.mean(axis=0)
@@ -92,9 +90,7 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray) -> Alignmen
     if c * a + s * b <= 0 or c * e - s * d <= 0:
         yaw = _best_positive_yaw(a, b, d, e, power)
     c, s = math.cos(yaw), math.sin(yaw)
-    scale = np.array(
-        [(c * a + s * b) / power[0], (c * e - s * d) / power[1], (qc[:, 2] @ pc[:, 2]) / power[2]]
-    )
+    scale = np.array([(c * a + s * b) / power[0], (c * e - s * d) / power[1], (qc[:, 2] @ pc[:, 2]) / power[2]])
     if (scale <= 0).any():
         raise AlignmentError("the best fit mirrors the model: the keypoint pairs contradict each other")
     turn = yaw_matrix(yaw)

@@ -59,9 +59,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
     """
     if not isinstance(data, list) or len(data) != 1:
         got = f"a list of {len(data)}" if isinstance(data, list) else type(data).__name__
-        raise SceneRejected(
-            f"{path}: got {got}, expected a list with the annotation of one scan; cut it to one scan"
-        )
+        raise SceneRejected(f"{path}: got {got}, expected a list with the annotation of one scan; cut it to one scan")
     records = []
     where = str(path)
     try:
@@ -77,9 +75,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
                 raise SceneRejected(f"{where}: category id is {synset}, expected one of {known}")
             pose_y_up = trs_matrix(model["trs"])
             if abs(np.linalg.det(pose_y_up)) < 1e-9:
-                raise SceneRejected(
-                    f"{where}: the scale is {model['trs']['scale']}, expected three non-zero numbers"
-                )
+                raise SceneRejected(f"{where}: the scale is {model['trs']['scale']}, expected three non-zero numbers")
             pose = world_to_scan @ pose_y_up @ cad_to_y_up
             cad_points = _apply(np.linalg.inv(pose_y_up @ cad_to_y_up), _keypoints(model, "keypoints_cad"))
             scan_points = _apply(world_to_scan, _keypoints(model, "keypoints_scan"))

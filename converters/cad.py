@@ -42,9 +42,7 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     """
     if synset not in SYNSETS:
         known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
-        raise SceneRejected(
-            f"{source.root}: CAD model {cad_id} has category id {synset}, expected one of {known}"
-        )
+        raise SceneRejected(f"{source.root}: CAD model {cad_id} has category id {synset}, expected one of {known}")
     relative = f"cad/{synset}/{cad_id}/models/model_normalized.obj"
     path = source.use(
         relative,
@@ -94,7 +92,5 @@ def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
         np.round(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
     )
     faces = inverse.reshape(-1)[faces]
-    keep = np.flatnonzero(
-        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    )
+    keep = np.flatnonzero((faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0]))
     return vertices[first], faces[keep], keep

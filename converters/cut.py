@@ -81,9 +81,7 @@ def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> 
     """(m,) bool: faces that show this object, by place and label."""
     local = (centres - placed.position_w) @ rotation_of(placed.quaternion_w)
     low, high = placed.vertices_b.min(axis=0), placed.vertices_b.max(axis=0)
-    around = ((local > low - NEAR_OWN_M) & (local < high + [NEAR_OWN_M, NEAR_OWN_M, LYING_ABOVE_M])).all(
-        axis=1
-    )
+    around = ((local > low - NEAR_OWN_M) & (local < high + [NEAR_OWN_M, NEAR_OWN_M, LYING_ABOVE_M])).all(axis=1)
     index = np.flatnonzero(around)
     points, label = local[index], labels[index]
     distance = KDTree(surface_samples(placed.vertices_b, placed.faces, 20000)).query(points, workers=1)[0]

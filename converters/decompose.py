@@ -78,9 +78,7 @@ def _load(path: Path) -> tuple[Hull, ...] | None:
 def _store(path: Path, hulls: tuple[Hull, ...]) -> None:
     """Writes beside and renames, so that two writers of one key leave one whole file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {f"v{i}": h.vertices for i, h in enumerate(hulls)} | {
-        f"f{i}": h.faces for i, h in enumerate(hulls)
-    }
+    arrays = {f"v{i}": h.vertices for i, h in enumerate(hulls)} | {f"f{i}": h.faces for i, h in enumerate(hulls)}
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
     os.close(handle)
     try:
@@ -149,9 +147,7 @@ def decompose_all(
                 for job in list(running):
                     if job.process.poll() is None:
                         if time.monotonic() - job.started > config.timeout_s:
-                            raise StageFailed(
-                                f"decompose: coacd ran past {config.timeout_s:.0f} s on {job.name}"
-                            )
+                            raise StageFailed(f"decompose: coacd ran past {config.timeout_s:.0f} s on {job.name}")
                         continue
                     running.remove(job)
                     hulls = _load(job.output) if job.process.returncode == 0 else None
@@ -159,8 +155,7 @@ def decompose_all(
                         log = job.output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
                         last = log[-1] if log else "no message"
                         raise StageFailed(
-                            f"decompose: coacd failed on {job.name} (exit code {job.process.returncode}: "
-                            f"{last})"
+                            f"decompose: coacd failed on {job.name} (exit code {job.process.returncode}: {last})"
                         )
                     _store(cache / f"{job.key}.npz", hulls)
                     done[job.key] = hulls

@@ -3,7 +3,6 @@
 Conventions of the written MJCF (classes, groups, names) are in `scenes_mjcf/README.md`.
 """
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -110,9 +109,7 @@ def _add_movable(
         )
         _add_textured_mesh(spec, f"{placed.name}_visual", placed.name)
     for i, (hull, box) in enumerate(zip(placed.hulls_b, placed.boxes_b, strict=True)):
-        mesh = spec.add_mesh(
-            name=f"{placed.name}_hull_{i}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        )
+        mesh = spec.add_mesh(name=f"{placed.name}_hull_{i}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
         if inline:
             mesh.uservert = _tidy(hull.vertices).reshape(-1)
         else:
@@ -216,9 +213,7 @@ def write_obj(
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     else:
         lines += [f"vt {u:.4f} {v:.4f}" for u, v in uv]
-        lines += [
-            f"f {a}/{i} {b}/{j} {c}/{k}" for (a, b, c), (i, j, k) in zip(faces + 1, uv_faces + 1, strict=True)
-        ]
+        lines += [f"f {a}/{i} {b}/{j} {c}/{k}" for (a, b, c), (i, j, k) in zip(faces + 1, uv_faces + 1, strict=True)]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
@@ -232,9 +227,7 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
     """
     assets = folder / "assets"
     assets.mkdir()
-    meshes = [
-        (f"{o.name}_visual", o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)
-    ]
+    meshes = [(f"{o.name}_visual", o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
     if parts.structure_visual is not None:
         meshes.append(("structure_visual", "structure", parts.structure_visual))
     for mesh_name, stem, visual in meshes:

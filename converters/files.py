@@ -41,9 +41,7 @@ class SourceFolder:
         try:
             self.sha256[relative] = hashlib.sha256(path.read_bytes()).hexdigest()
         except OSError as error:
-            raise SceneRejected(
-                f"{path}: cannot be read ({error.strerror}); check its permissions"
-            ) from error
+            raise SceneRejected(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
         return path
 
 
@@ -119,13 +117,11 @@ def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     """
     if len(vertices) == 0 or len(faces) == 0:
         raise SceneRejected(
-            f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; fetch the "
-            f"file again"
+            f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; fetch the file again"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SceneRejected(
-            f"{path}: a face names vertex {int(faces.max())} of {len(vertices)}; "
-            "the file is truncated, fetch it again"
+            f"{path}: a face names vertex {int(faces.max())} of {len(vertices)}; the file is truncated, fetch it again"
         )
     bad = int((~np.isfinite(vertices).all(axis=1)).sum())
     if bad:
@@ -155,8 +151,7 @@ def read_textured_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
                     words = line.split()[1:]
                     if len(words) != 3:
                         raise SceneRejected(
-                            f"{path}:{number}: a face has {len(words)} corners, expected 3; triangulate the "
-                            f"mesh"
+                            f"{path}:{number}: a face has {len(words)} corners, expected 3; triangulate the mesh"
                         )
                     corners.extend(words)
         vertices = np.array(" ".join(positions).split(), float).reshape(-1, 3)
@@ -168,9 +163,7 @@ def read_textured_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
     except (ValueError, UnicodeDecodeError) as error:
         if isinstance(error, SceneRejected):
             raise
-        raise SceneRejected(
-            f"{path}: not readable as OBJ ({error}); the file is damaged, fetch it again"
-        ) from error
+        raise SceneRejected(f"{path}: not readable as OBJ ({error}); the file is damaged, fetch it again") from error
     check_mesh(path, vertices, faces - 1)
     if uv_index is None:
         return vertices, faces - 1, None

@@ -63,7 +63,5 @@ def floor_patch(
     distance, index = KDTree(seen[:, :2]).query(points[:, :2], k=count)
     distance, index = distance.reshape(-1, count), index.reshape(-1, count)
     weight = 1.0 / (distance + 0.05)
-    shade = (cloud.colours[floor_points][index] * weight[..., None]).sum(axis=1) / weight.sum(
-        axis=1, keepdims=True
-    )
+    shade = (cloud.colours[floor_points][index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)
     return vertices, faces, ColourCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), shade)

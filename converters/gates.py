@@ -1,6 +1,5 @@
 """A scene's model, manifest and maps in; acceptance values against one table of limits out."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -42,18 +41,14 @@ LIMITS: dict[str, Limit] = {
     "objects": Limit("count", least=1, meaning="movable bodies, each named in scene.json and in scene.xml"),
     "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml"),
     "finite": Limit("bool", least=1, meaning="no non-finite number after 2 s"),
-    "drift_hulls": Limit(
-        "m", most=0.01, meaning="largest move in 2 s untouched, hulls at the scene's timestep"
-    ),
+    "drift_hulls": Limit("m", most=0.01, meaning="largest move in 2 s untouched, hulls at the scene's timestep"),
     "drift_boxes": Limit("m", most=0.01, meaning="the same with boxes at 0.01 s"),
     "turn_hulls": Limit("deg", most=2.0, meaning="largest turn in 2 s untouched, hulls"),
     "turn_boxes": Limit("deg", most=2.0, meaning="the same with boxes at 0.01 s"),
     "penetration_hulls": Limit("m", most=0.01, meaning="deepest contact at rest, hulls"),
     "penetration_boxes": Limit("m", most=0.02, meaning="deepest contact at rest, boxes"),
     "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),
-    "connected_share": Limit(
-        "share", least=0.8, meaning="largest piece of the free space for a disc of 0.18 m"
-    ),
+    "connected_share": Limit("share", least=0.8, meaning="largest piece of the free space for a disc of 0.18 m"),
     "start_goal": Limit("m", least=START_GOAL_M, meaning="farthest two cells in that piece, straight line"),
     "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
     "hulls": Limit("count", most=400, meaning="hulls in all"),
@@ -80,11 +75,7 @@ def judge(name: str, value: float) -> Gate:
     """Holds a value against the table; a non-finite value fails."""
     limit = LIMITS[name]
     passed = math.isfinite(value)
-    passed = (
-        passed
-        and (limit.least is None or value >= limit.least)
-        and (limit.most is None or value <= limit.most)
-    )
+    passed = passed and (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
     return Gate(name, float(value) if math.isfinite(value) else -1.0, passed, limit)
 
 

@@ -89,8 +89,7 @@ def _floor_height(source: SourceFolder) -> float:
         raise SceneRejected(f"{path}: {error}; expected one floor height in metres a line") from error
     if len(heights) != 1 or not np.isfinite(heights[0]):
         raise SceneRejected(
-            f"{path}: holds {len(heights)} floor heights, expected one; convert each floor from a folder of "
-            f"its own"
+            f"{path}: holds {len(heights)} floor heights, expected one; convert each floor from a folder of its own"
         )
     return heights[0]
 
@@ -102,8 +101,7 @@ def _traversable(source: SourceFolder) -> GivenMap | None:
     image = read_image(source.use("floor_trav_0.png", ""), "L")
     if image.shape[0] != image.shape[1]:
         raise SceneRejected(
-            f"{source.root / 'floor_trav_0.png'}: is {image.shape[1]} x {image.shape[0]}, expected a square "
-            f"image"
+            f"{source.root / 'floor_trav_0.png'}: is {image.shape[1]} x {image.shape[0]}, expected a square image"
         )
     half = image.shape[0] / 2 * MAP_RESOLUTION_M
     return GivenMap(image > 127, MAP_RESOLUTION_M, (-half, -half))

@@ -54,8 +54,7 @@ def make_manifest(
         licence=raw.licence,
         floor_area_m2=round(floor_area_m2, 3),
         objects=objects,
-        collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES}
-        | parameters,
+        collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES} | parameters,
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),

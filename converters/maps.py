@@ -270,9 +270,7 @@ def make_floor_plan(
         )
     heights = points[np.isin(label, STRUCTURE_LABELS) & (label != FLOOR) & (label != CEILING), 2]
     tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
-    return FloorPlan(
-        grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, round(tall, 3)
-    )
+    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, round(tall, 3))
 
 
 def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
@@ -280,12 +278,7 @@ def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
     centres = grid.centres_w()
     index = np.floor((centres - given.origin) / given.resolution_m).astype(int)
     row, column = index[..., 1], index[..., 0]
-    inside = (
-        (row >= 0)
-        & (column >= 0)
-        & (row < given.traversable.shape[0])
-        & (column < given.traversable.shape[1])
-    )
+    inside = (row >= 0) & (column >= 0) & (row < given.traversable.shape[0]) & (column < given.traversable.shape[1])
     result = np.zeros(grid.shape, bool)
     result[inside] = given.traversable[row[inside], column[inside]]
     return result

@@ -163,9 +163,7 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0) -> Box:
     return dataclasses.replace(chosen, half=np.maximum(chosen.half, MIN_THICKNESS_M / 2))
 
 
-def _door_hinge(
-    annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray
-) -> BodyHinge:
+def _door_hinge(annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray) -> BodyHinge:
     """The door's hinge in the body frame; without an articulation, one at the leaf's edge is assumed."""
     hinge = annotation.hinge
     if hinge is None:
@@ -217,9 +215,7 @@ def place_object(
         boxes_b=tuple(fit_box(h, 0.0, walls_yaw - pose.yaw) for h in hulls),
         position_w=position,
         quaternion_w=np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)]),
-        hinge=_door_hinge(annotation, pose.scale, base, high - low)
-        if annotation.category == "door"
-        else None,
+        hinge=_door_hinge(annotation, pose.scale, base, high - low) if annotation.category == "door" else None,
     )
 
 

@@ -1,6 +1,5 @@
 """A raw folder in, a scene folder out: read, stages that are functions of arrays, write, rename."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -119,8 +118,7 @@ def detect_format(source: Path) -> str:
     if not source.exists():
         raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
     raise SceneRejected(
-        f"{source}: no known layout; expected {gibson.MESH} (gibson) or {scan2cad.ANNOTATION} (scan2cad) in "
-        f"it"
+        f"{source}: no known layout; expected {gibson.MESH} (gibson) or {scan2cad.ANNOTATION} (scan2cad) in it"
     )
 
 
@@ -181,9 +179,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
     with clock.stage("align"):
         placements, rows = align_objects(raw)
         if not raw.annotations:
-            raise SceneRejected(
-                f"{raw.name}: no annotated object, expected at least one; annotate the furniture"
-            )
+            raise SceneRejected(f"{raw.name}: no annotated object, expected at least one; annotate the furniture")
         floor_height = raw.floor_height_m
         if floor_height is None:
             floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)

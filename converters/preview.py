@@ -1,6 +1,5 @@
 """A scene folder in, one top-down PNG out: textured scene beside its collision shapes."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -102,9 +101,7 @@ def draw(folder: Path, model: mujoco.MjModel, manifest: SceneManifest, maps: Sce
         body = model.body(item.name).id
         clouds.append((points @ data.xmat[body].reshape(3, 3).T + data.xpos[body], colours))
     shape = (int(np.ceil(size_m[1] / pixel_m)), int(np.ceil(size_m[0] / pixel_m)))
-    view = _view_from_above(
-        np.vstack([p for p, _ in clouds]), np.vstack([c for _, c in clouds]), low, shape, pixel_m
-    )
+    view = _view_from_above(np.vstack([p for p, _ in clouds]), np.vstack([c for _, c in clouds]), low, shape, pixel_m)
     left.imshow(
         view,
         origin="lower",
@@ -126,9 +123,7 @@ def draw(folder: Path, model: mujoco.MjModel, manifest: SceneManifest, maps: Sce
             right.fill(*_outline(model, data, geom).T, facecolor="0.75", edgecolor="0.45", linewidth=0.4)
         elif "_hull_" in name and body in category:
             colour = CATEGORY_COLOURS[category[body]]
-            right.fill(
-                *_outline(model, data, geom).T, facecolor=(*colour[:3], 0.35), edgecolor=colour, linewidth=0.6
-            )
+            right.fill(*_outline(model, data, geom).T, facecolor=(*colour[:3], 0.35), edgecolor=colour, linewidth=0.6)
         elif "_box_" in name and body in category:
             corners = _outline(model, data, geom)
             right.plot(*np.vstack([corners, corners[:1]]).T, color="black", linewidth=0.35, alpha=0.7)
@@ -167,16 +162,14 @@ def preview(folder: Path, target: Path) -> None:
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     except ValueError as error:
-        raise SceneError(
-            f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again"
-        ) from error
+        raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
     if not target.parent.is_dir():
         raise SceneError(f"{target.parent}: no such folder; give another -o")
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".preview-") as scratch:
         picture = Path(scratch) / "preview.png"
         draw(folder, model, manifest, maps, picture)
         with Image.open(picture) as image:
-            image.convert("RGB").quantize(
-                256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
-            ).save(picture, optimize=True)
+            image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+                picture, optimize=True
+            )
         picture.replace(target)

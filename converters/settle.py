@@ -1,6 +1,5 @@
 """Objects at their annotated poses and wall boxes in, objects at rest out."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -72,9 +71,7 @@ def push_apart(parts: SceneParts) -> SceneParts:
             if contact.dist > -0.0005 or 0 in (a, b) or (a not in free and b not in free):
                 continue
             depth, normal = -float(contact.dist), np.array(contact.frame[:2])
-            if (
-                np.linalg.norm(normal) < 0.5
-            ):  # one above the other: apart along the line between their middles
+            if np.linalg.norm(normal) < 0.5:  # one above the other: apart along the line between their middles
                 normal = data.xipos[b, :2] - data.xipos[a, :2]
             normal = normal / max(np.linalg.norm(normal), 1e-9)
             if depth > deepest.get((a, b), (0.0, normal))[0]:

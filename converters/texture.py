@@ -167,12 +167,8 @@ def texel_surface(
     det = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
     good = np.abs(det) > 1e-12
     det = np.where(good, det, 1.0)
-    v = (
-        (middle[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1])
-    ) / det
-    w = (
-        (b[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1]) - (middle[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
-    ) / det
+    v = ((middle[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1])) / det
+    w = ((b[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1]) - (middle[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])) / det
     slack = 0.02
     inside = good & (v >= -slack) & (w >= -slack) & (v + w <= 1 + slack)
     face, v, w = face[inside], v[inside], w[inside]
@@ -188,9 +184,7 @@ def fill_image(texel: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
     image = np.zeros((size * size, 3))
     covered = np.zeros(size * size, bool)
     image[texel], covered[texel] = colours, True
-    nearest = ndimage.distance_transform_edt(
-        ~covered.reshape(size, size), return_distances=False, return_indices=True
-    )
+    nearest = ndimage.distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
     assert nearest is not None
     return np.clip(np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]]), 0, 255).astype(np.uint8)
 

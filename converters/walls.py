@@ -93,12 +93,8 @@ def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
     side = plan.grid.resolution_m
     boxes = []
     for r0, r1, c0, c1 in cover_rectangles(needed, allowed | needed):
-        middle = np.array(
-            [(c0 + c1) / 2 * side + plan.grid.origin[0], (r0 + r1) / 2 * side + plan.grid.origin[1], 0.0]
-        )
+        middle = np.array([(c0 + c1) / 2 * side + plan.grid.origin[0], (r0 + r1) / 2 * side + plan.grid.origin[1], 0.0])
         centre = turn @ middle
         centre[2] = plan.wall_height_m / 2
-        boxes.append(
-            Box(centre, turn, np.array([(c1 - c0) * side, (r1 - r0) * side, plan.wall_height_m]) / 2)
-        )
+        boxes.append(Box(centre, turn, np.array([(c1 - c0) * side, (r1 - r0) * side, plan.wall_height_m]) / 2))
     return tuple(boxes)

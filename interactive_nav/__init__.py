@@ -3,27 +3,46 @@
     env = interactive_nav.make("turtlebot", scenes=["scenes_mjcf/apartment_0"])
     state = jax.jit(jax.vmap(env.reset))(keys)
     state = jax.jit(jax.vmap(env.step))(state, action)
+
+Importing the package is cheap: JAX and MuJoCo are imported with what is first used of it.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
+import importlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 # The scenes' tables are constants of `reset` and `step`, tens to hundreds of megabytes. Without this, JAX
 # writes them as text into every program that it compiles (measured: 23 s instead of 8 s for a small room).
 # JAX reads it once, at its own import: import interactive_nav first, or set the variable yourself.
 os.environ.setdefault("JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS", "1")
 
-from interactive_nav import geodesic, metrics, reward  # noqa: E402
-from interactive_nav.config import NavConfig  # noqa: E402
-from interactive_nav.env import InteractiveNav  # noqa: E402
-from interactive_nav.robots import get_robot, robot_names  # noqa: E402
-from interactive_nav.scene import load_scene  # noqa: E402
+if TYPE_CHECKING:
+    from interactive_nav import geodesic, metrics, reward
+    from interactive_nav.config import NavConfig
+    from interactive_nav.env import InteractiveNav
+    from interactive_nav.robots import get_robot, robot_names
+    from interactive_nav.scene import load_scene
+
+_HOME = {
+    "InteractiveNav": "env",
+    "NavConfig": "config",
+    "get_robot": "robots",
+    "load_scene": "scene",
+    "robot_names": "robots",
+}
+_MODULES = ("geodesic", "metrics", "reward")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"interactive_nav.{name}")
+    if name in _HOME:
+        return getattr(importlib.import_module(f"interactive_nav.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'interactive_nav' has no attribute {name!r}; it has {', '.join(__all__)}")
 
 
 def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> InteractiveNav:
@@ -41,17 +60,15 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
         ValueError: unknown robot or setting (the message names the nearest valid one), impossible value,
             or an unusable scene (`SceneError`).
     """
-    fields = {f.name for f in dataclasses.fields(NavConfig)}
-    for key in settings:
-        if key not in fields:
-            near = difflib.get_close_matches(key, fields, 1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise ValueError(f"unknown setting '{key}'; {hint}known settings: {', '.join(sorted(fields))}")
+    from interactive_nav.config import make_config
+    from interactive_nav.env import InteractiveNav
+    from interactive_nav.robots import get_robot
+    from interactive_nav.scene import load_scene
+
     if isinstance(scenes, (str, Path)):
         raise ValueError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
-    spec = get_robot(robot)
-    config = NavConfig(**settings)
-    return InteractiveNav(spec, tuple(load_scene(s) for s in scenes), config)
+    config = make_config(**settings)
+    return InteractiveNav(get_robot(robot), tuple(load_scene(s) for s in scenes), config)
 
 
 __all__ = [

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
+from typing import Any
 
 BACKENDS = ("auto", "warp", "jax", "native")
 OBSERVATIONS = ("goal", "velocity", "waypoints")
@@ -79,7 +81,10 @@ class NavConfig:
             if not getattr(self, field) > 0:
                 refuse(field, "a positive number")
         if self.min_goal_distance_m < 0 or self.min_goal_distance_m >= self.max_goal_distance_m:
-            refuse("min_goal_distance_m", f"0 or more and less than max_goal_distance_m ({self.max_goal_distance_m})")
+            refuse(
+                "min_goal_distance_m",
+                f"0 or more and less than max_goal_distance_m ({self.max_goal_distance_m})",
+            )
         if self.success_distance_m is not None and not self.success_distance_m > 0:
             refuse("success_distance_m", "a positive number or none")
         ratio = self.control_dt_s / self.sim_dt_s
@@ -90,3 +95,18 @@ class NavConfig:
     def substeps(self) -> int:
         """Physics steps per control step."""
         return round(self.control_dt_s / self.sim_dt_s)
+
+
+def make_config(**settings: Any) -> NavConfig:
+    """A `NavConfig` from settings by name.
+
+    Raises:
+        ValueError: unknown setting (the message names the nearest valid one) or impossible value.
+    """
+    fields = {f.name for f in dataclasses.fields(NavConfig)}
+    for key in settings:
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, 1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            raise ValueError(f"unknown setting '{key}'; {hint}known settings: {', '.join(sorted(fields))}")
+    return NavConfig(**settings)

@@ -161,7 +161,7 @@ class InteractiveNav(Env):
         info = {"nav": nav, "rng": rng, "truncation": zero, "time_out": zero}
         obs = self._observe(physics, nav, rotation)
         names = (*EPISODE_METRICS, *REWARD_TERMS)
-        return State(physics, obs, zero, zero, {name: zero for name in names}, info)
+        return State(physics, obs, zero, zero, {name: zero for name in names}, info)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one environment by one control period.
@@ -173,7 +173,8 @@ class InteractiveNav(Env):
         nav: NavInfo = state.info["nav"]
         action = jnp.where(jnp.isfinite(action), action, 0.0)
         ctrl = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
-        physics, signals = self.physics.step(nav.scene_index, state.pipeline_state, ctrl)
+        before: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        physics, signals = self.physics.step(nav.scene_index, before, ctrl)
         broken = signals.nonfinite > 0
         nav, rotation = self._advance(nav, physics, signals, broken)
 

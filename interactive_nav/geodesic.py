@@ -218,7 +218,11 @@ class DistanceTable:
 
 
 def navigation_grid(
-    traversable: np.ndarray, resolution_m: float, origin_w: tuple[float, float], radius_m: float, cell_m: float
+    traversable: np.ndarray,
+    resolution_m: float,
+    origin_w: tuple[float, float],
+    radius_m: float,
+    cell_m: float,
 ) -> np.ndarray:
     """Free cells of a grid of `cell_m` squares sharing the map's origin: the body fits at their centre.
 

@@ -30,9 +30,7 @@ class SmallObject:
     @property
     def radius_m(self) -> float:
         """Radius of the disc about the origin that holds the object's footprint."""
-        return max(
-            math.hypot(abs(b.centre_m[0]) + b.half_m[0], abs(b.centre_m[1]) + b.half_m[1]) for b in self.boxes
-        )
+        return max(math.hypot(abs(b.centre_m[0]) + b.half_m[0], abs(b.centre_m[1]) + b.half_m[1]) for b in self.boxes)
 
 
 def _basket(width: float, depth: float, height: float, mass: float) -> SmallObject:
@@ -106,7 +104,7 @@ MODELS: tuple[SmallObject, ...] = (
 
 
 def pick(num_objects: int) -> tuple[SmallObject, ...]:
-    """The first `num_objects` of the models, repeated in order: ten give three baskets, three shoes, two pots, two toys.
+    """The first `num_objects` of the models, repeated in order: ten give 3 baskets, 3 shoes, 2 pots, 2 toys.
 
     Raises:
         ValueError: a negative number.

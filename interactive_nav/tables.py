@@ -104,7 +104,11 @@ def _scene_places(world: World, index: int, config: NavConfig) -> tuple[Distance
     starts = centres(free & (margin >= robot.footprint_radius_m + 0.75 * cell + CLEARANCE_M))
     clutter = centres(margin >= largest + CLEARANCE_M)
     goals = table.node_xy_w[table.goal_node]
-    far = len(starts) and len(goals) and np.linalg.norm(starts[:, None] - goals[None], axis=-1).max() >= config.min_goal_distance_m
+    far = (
+        len(starts)
+        and len(goals)
+        and np.linalg.norm(starts[:, None] - goals[None], axis=-1).max() >= config.min_goal_distance_m
+    )
     if not far:
         raise SceneError(
             f"{scene.path}: no room for a start and a goal {config.min_goal_distance_m} m apart for robot "
@@ -139,7 +143,9 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
     navs = [p[0] for p in places]
     layout, slots = world.layout, world.layout.num_slots
     com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
-    hinge = {k: np.zeros((len(world.scenes), slots, n)) for k, n in (("pos", 3), ("quat", 4), ("axis", 3), ("anchor", 3))}
+    hinge = {
+        k: np.zeros((len(world.scenes), slots, n)) for k, n in (("pos", 3), ("quat", 4), ("axis", 3), ("anchor", 3))
+    }
     hinge["quat"][..., 0] = 1.0
     for s, model in enumerate(world.models):
         for k in range(slots):

@@ -179,11 +179,16 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> N
 
 
 def _build_spec(
-    robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], small: tuple[SmallObject, ...], config: NavConfig
+    robot: RobotSpec,
+    scene_index: int,
+    scenes: tuple[Scene, ...],
+    small: tuple[SmallObject, ...],
+    config: NavConfig,
 ) -> tuple[mujoco.MjSpec, list[tuple[str, str]]]:
     """The padded spec of one scene, and the movable slots as (body name, kind)."""
     spec = mujoco.MjSpec()
     spec.modelname = "interactive_nav"
+    spec.compiler.degree = False
     option = spec.option
     option.timestep = config.sim_dt_s
     option.gravity = [0, 0, -9.81]
@@ -330,7 +335,7 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         names.append(tuple(label))
         mass.append(np.where(own, model.body_mass[layout.slot_body], 0.0))
         rest.append(qpos)
-        moved.append(np.where(own, shift, 0.0))
+        moved.append(np.where(own, np.asarray(shift, float), 0.0))
     return World(
         robot=robot,
         scenes=scenes,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
 import pytest
 
+import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
 from tests.toys import write_room
 
 
@@ -22,7 +22,12 @@ def two_rooms(tmp_path_factory) -> Path:
     """A 5 x 4 m room cut by a partition, with two cubes and a door leaf."""
     blocks = (("chair", 1.2, 0.0, 5.0, 0.5), ("table", -1.2, 1.0, 10.0, 0.4))
     return write_room(
-        tmp_path_factory.mktemp("scenes") / "two_rooms", (5.0, 4.0), blocks, door=True, partition=True, split="test"
+        tmp_path_factory.mktemp("scenes") / "two_rooms",
+        (5.0, 4.0),
+        blocks,
+        door=True,
+        partition=True,
+        split="test",
     )
 
 

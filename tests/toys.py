@@ -33,6 +33,7 @@ def write_room(
     folder = Path(folder)
     (folder / "assets").mkdir(parents=True)
     spec = mujoco.MjSpec()
+    spec.compiler.degree = False
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
     structure = spec.worldbody.add_body(name="structure")
     lx, ly = size_m

@@ -13,7 +13,6 @@ from rich.console import Console
 from train import config_io
 from train.config import TrainConfig
 from train.errors import TrainError
-from train.run import train_run
 from train.run_folder import RunFolder
 
 
@@ -47,7 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs; 0 when done, 2 on a user's error, 128 + signal when asked to stop (after saving)."""
     arguments = parser().parse_intermixed_args(argv)
     try:
-        _, _, stopped_by = train_run(read_config(arguments), Console())
+        config = read_config(arguments)
+        # Heavy: after the config is known to be right.
+        from train.run import train_run
+
+        _, _, stopped_by = train_run(config, Console())
     except TrainError as error:
         print(f"train: {error}", file=sys.stderr)
         return 2

@@ -167,9 +167,7 @@ def validate(config: TrainConfig) -> None:
     """Raises `ConfigError` where values exclude each other; what is still None is not looked at."""
     ppo = config.ppo
     if not config.env.scenes:
-        raise ConfigError(
-            "env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]"
-        )
+        raise ConfigError("env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]")
     if ppo.num_envs and ppo.batch_size and ppo.num_minibatches:
         collected = ppo.batch_size * ppo.num_minibatches
         if collected % ppo.num_envs:

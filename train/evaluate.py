@@ -156,12 +156,8 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.evaluate", description="Plays fixed episodes.")
     made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
-    made.add_argument(
-        "--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on"
-    )
-    made.add_argument(
-        "--episodes", type=int, default=200, help="fixed episodes for each policy (default 200)"
-    )
+    made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
+    made.add_argument("--episodes", type=int, default=200, help="fixed episodes for each policy (default 200)")
     made.add_argument("--seed", type=int, default=1_000_000, help="which episodes (default 1000000)")
     names = ",".join((LEARNED, *YARDSTICKS))
     made.add_argument("--policies", default=names, help=f"comma-separated choice from {names} (default: all)")
@@ -173,9 +169,7 @@ def parser() -> argparse.ArgumentParser:
         help="sample the learned policy's actions, as the original did (default), or take their mode",
     )
     made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
-    made.add_argument(
-        "--out", metavar="PATH", help="Parquet file (default RUN_DIR/evaluation/episodes.parquet)"
-    )
+    made.add_argument("--out", metavar="PATH", help="Parquet file (default RUN_DIR/evaluation/episodes.parquet)")
     made.add_argument("overrides", nargs="*", metavar="env.key=value", help="environment settings to change")
     return made
 
@@ -191,14 +185,10 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         config = folder.read_config()
         for word in arguments.overrides:
             if not word.startswith("env."):
-                raise ConfigError(
-                    f"override {word!r}: expected env.<setting>=value: the rest is the run's own"
-                )
+                raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
         config = config_io.apply_overrides(config, arguments.overrides)
         if arguments.scenes:
-            config = dataclasses.replace(
-                config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes))
-            )
+            config = dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
         out = Path(arguments.out) if arguments.out else folder.path / "evaluation" / "episodes.parquet"
         claim(out.parent)
         env = build_env(config.env)
@@ -223,9 +213,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     for name in ("nonfinite", "overflow_steps"):
         bad = int((rows[name].to_numpy() > 0).sum())
         if bad:
-            console.print(
-                f"[yellow]{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt[/]"
-            )
+            console.print(f"[yellow]{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt[/]")
     console.print(f"rows: {out}", highlight=False, soft_wrap=True)
     return 0
 

@@ -141,9 +141,7 @@ def figures_of(results: Path) -> Iterator[tuple[str, Figure]]:
     records = [path for path in records if not path.parent.name.startswith("diverged-")]
     curves = {log.parent.name: lines for log in logs if (lines := read_metrics(log))}
     if not curves and not records:
-        raise RunFolderError(
-            f"{results}: nothing to draw (no metrics.jsonl, no recorded paths); expected a run folder"
-        )
+        raise RunFolderError(f"{results}: nothing to draw (no metrics.jsonl, no recorded paths); expected a run folder")
     if curves:
         yield "learning_curves", learning_curves(curves)
     for path in records:
@@ -155,9 +153,7 @@ def figures_of(results: Path) -> Iterator[tuple[str, Figure]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Draws; 0 when done, 2 on a user's error."""
-    parser = argparse.ArgumentParser(
-        prog="python -m train.figures", description="Draws what runs have written."
-    )
+    parser = argparse.ArgumentParser(prog="python -m train.figures", description="Draws what runs have written.")
     parser.add_argument("results", metavar="RESULTS_DIR", help="a run folder, or a folder of run folders")
     parser.add_argument("-o", "--out", default="figures", metavar="DIR", help="where to (default figures/)")
     arguments = parser.parse_args(argv)

@@ -26,9 +26,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             partial.unlink()
         reason = error.strerror or error
-        raise RunFolderError(
-            f"{path}: cannot be written ({reason}); make room or choose another place"
-        ) from None
+        raise RunFolderError(f"{path}: cannot be written ({reason}); make room or choose another place") from None
 
 
 def write_text(path: Path, text: str) -> None:

@@ -159,9 +159,7 @@ def run_loop(
         if done % save_every == 0 or stop:
             callbacks.on_checkpoint(Snapshot(done * steps_per_update, learner, env_state))
             clock = time.perf_counter()
-    return TrainResult(
-        Snapshot(done * steps_per_update, learner, env_state), metrics, completed=done >= total
-    )
+    return TrainResult(Snapshot(done * steps_per_update, learner, env_state), metrics, completed=done >= total)
 
 
 def interval_metrics(updates: list[Update]) -> dict[str, float]:

@@ -49,8 +49,7 @@ def drive_of(robot: RobotSpec) -> Drive:
     wheels = {"turtlebot": (WHEEL_RADIUS_M, 2 * HALF_TRACK_M)}
     if robot.name not in wheels:
         raise TrainError(
-            f"policy follower: robot is {robot.name!r}, expected one of {', '.join(wheels)}; "
-            "leave it out of --policies"
+            f"policy follower: robot is {robot.name!r}, expected one of {', '.join(wheels)}; leave it out of --policies"
         )
     return Drive(*wheels[robot.name], robot.action_low[0], robot.action_high[0])
 

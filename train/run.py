@@ -67,9 +67,7 @@ def stop_signals() -> Iterator[list[int]]:
 class FolderCallbacks:
     """Learner callbacks that write a run folder and show progress."""
 
-    def __init__(
-        self, folder: RunFolder, config: TrainConfig, env: Any, display: TrainingDisplay, stops: list[int]
-    ):
+    def __init__(self, folder: RunFolder, config: TrainConfig, env: Any, display: TrainingDisplay, stops: list[int]):
         self._folder, self._config, self._env = folder, config, env
         self._display, self._stops = display, stops
         self._wall_before_s = 0.0
@@ -99,8 +97,7 @@ class FolderCallbacks:
         known = getattr(snapshot.env_state, "info", {}).get("episode_metrics", {})
         if self._config.run.best_metric not in known:
             raise ConfigError(
-                f"run.best_metric is {self._config.run.best_metric!r}, "
-                f"expected one of {', '.join(sorted(known))}"
+                f"run.best_metric is {self._config.run.best_metric!r}, expected one of {', '.join(sorted(known))}"
             )
         one_mb = checkpoint.megabytes(snapshot.learner)
         env_mb = checkpoint.megabytes(snapshot.env_state)
@@ -139,9 +136,7 @@ class FolderCallbacks:
             observation_size=int(self._env.observation_size),
             action_size=int(self._env.action_size),
         )
-        checkpoint.save(
-            self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb
-        )
+        checkpoint.save(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
 
     def on_diverged(self, before: Snapshot, update: Update) -> str:
         """Saves the batch and the learner that met it."""
@@ -220,9 +215,7 @@ def train_run(
         finally:
             callbacks.close()
     metrics = result.metrics or last_metrics(folder)
-    write_text(
-        folder.path / "summary.json", json.dumps(summary(config, folder, result, metrics), indent=1) + "\n"
-    )
+    write_text(folder.path / "summary.json", json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
     best = checkpoint.best_checkpoint(checkpoint.list_checkpoints(folder.checkpoints))
     console.print(
         f"{folder.path}: {'done' if result.completed else 'stopped'} at {result.snapshot.env_steps:,} steps; "
@@ -241,9 +234,7 @@ def last_metrics(folder: RunFolder) -> dict[str, Any]:
     return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
 
 
-def summary(
-    config: TrainConfig, folder: RunFolder, result: TrainResult, metrics: dict[str, Any]
-) -> dict[str, Any]:
+def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics: dict[str, Any]) -> dict[str, Any]:
     """How a run ended, for tables over many runs."""
     saved = checkpoint.list_checkpoints(folder.checkpoints)
     best = checkpoint.best_checkpoint(saved)

@@ -57,9 +57,7 @@ class RunFolder:
             ConfigError: its config does not fit this version.
         """
         if not self.config.is_file():
-            raise RunFolderError(
-                f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run"
-            )
+            raise RunFolderError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
         return from_yaml(self.config.read_text(), where=str(self.config))
 
     def open(self, config: TrainConfig) -> bool:
@@ -172,9 +170,7 @@ def commit() -> str | None:
 
     def git(*words: str) -> str | None:
         try:
-            done = subprocess.run(
-                ["git", "-C", str(root), *words], capture_output=True, text=True, timeout=20
-            )
+            done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=20)
         except (OSError, subprocess.TimeoutExpired):
             return None
         return done.stdout.strip() if done.returncode == 0 else None

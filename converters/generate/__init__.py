@@ -72,9 +72,7 @@ def design_building(seed: int, config: BuildingConfig | None = None, max_plans: 
     raise no_place(cfg, seed)
 
 
-def render_building(
-    building: Building, seed: int, config: BuildingConfig, progress: Progress
-) -> tuple[Scan, Atlas]:
+def render_building(building: Building, seed: int, config: BuildingConfig, progress: Progress) -> tuple[Scan, Atlas]:
     """Scans and paints a building."""
     streams = _streams(seed)
     progress("scanning", 0.1)
@@ -106,9 +104,7 @@ def generate_building(
         raise GenerationError(f"{out_dir} exists and is not an empty folder: name a new folder or remove it")
     existing = next(p for p in out_dir.absolute().parents if p.exists())
     if not existing.is_dir():
-        raise GenerationError(
-            f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder"
-        )
+        raise GenerationError(f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder")
     tell = progress or (lambda stage, share: None)
     cfg = (config or BuildingConfig()).validate()
     tell("drawing the plan", 0.0)
@@ -127,9 +123,7 @@ def generate_building(
     tell("done", 1.0)
 
 
-def _write(
-    folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: BuildingConfig
-) -> None:
+def _write(folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: BuildingConfig) -> None:
     write_scan(folder, scan, atlas, building.floor_height_m)
     (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
     obstacles, traversable = floor_maps(building.plan)
@@ -137,9 +131,7 @@ def _write(
     write_png(folder / "floor_trav_0.png", traversable)
     items = list(building.items)
     rng = _streams(seed)[3]
-    write_json(
-        folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, cfg, seed, rng)
-    )
+    write_json(folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, cfg, seed, rng))
     for model in {item.model.name: item.model for item in items}.values():
         write_cad(folder / "cad", model)
     about = {

@@ -36,9 +36,7 @@ def _trs(translation: np.ndarray, rotation: Rotation, scale: np.ndarray) -> dict
     }
 
 
-def pose_in_world(
-    item: Instance, scan_to_world_m: np.ndarray, floor_height_m: float
-) -> tuple[np.ndarray, Rotation]:
+def pose_in_world(item: Instance, scan_to_world_m: np.ndarray, floor_height_m: float) -> tuple[np.ndarray, Rotation]:
     """The exact pose of a piece of furniture.
 
     Args:

@@ -84,18 +84,14 @@ def _chair_slat(width=0.44, depth=0.43, seat=0.45, back=0.46, slats=3, wood="oak
 def _chair_panel(width=0.47, depth=0.46, seat=0.46, back=0.38, shell="white", leg="oak") -> list[Part]:
     parts = four_legs(width - 0.06, depth - 0.06, seat - 0.02, 0.045, leg, splay=0.05, square=False)
     parts.append(cushion((0, seat, 0.01), (width, 0.05, depth), shell, 0.015))
-    parts.append(
-        cushion((0, seat + back / 2, -depth / 2 - 0.02), (width - 0.02, back, 0.045), shell, 0.015, 0.2)
-    )
+    parts.append(cushion((0, seat + back / 2, -depth / 2 - 0.02), (width - 0.02, back, 0.045), shell, 0.015, 0.2))
     return parts
 
 
 def _chair_arm(width=0.58, depth=0.54, seat=0.42, back=0.44, cloth="moss", wood="walnut") -> list[Part]:
     parts = four_legs(width, depth, seat - 0.04, 0.05, wood)
     parts.append(cushion((0, seat, 0.02), (width - 0.1, 0.11, depth - 0.06), cloth, 0.03))
-    parts.append(
-        cushion((0, seat + back / 2, -depth / 2 + 0.04), (width - 0.1, back, 0.09), cloth, 0.03, 0.16)
-    )
+    parts.append(cushion((0, seat + back / 2, -depth / 2 + 0.04), (width - 0.1, back, 0.09), cloth, 0.03, 0.16))
     for sx in (-1, 1):
         x = sx * (width / 2 - 0.03)
         parts.append(box((x, seat + 0.2, 0), (0.055, 0.04, depth - 0.04), wood))
@@ -131,19 +127,13 @@ def _chair_sled(width=0.50, depth=0.50, seat=0.45, back=0.40, cloth="navy", fram
 
 def _chair_tub(width=0.64, depth=0.62, seat=0.40, back=0.33, cloth="rust", leg="black") -> list[Part]:
     parts = four_legs(width - 0.08, depth - 0.08, 0.16, 0.04, leg, square=False)
+    parts.append(box((0, 0.15 + (seat - 0.15) / 2, 0.02), (width - 0.12, seat - 0.15, depth - 0.08), cloth, open=True))
     parts.append(
-        box((0, 0.15 + (seat - 0.15) / 2, 0.02), (width - 0.12, seat - 0.15, depth - 0.08), cloth, open=True)
-    )
-    parts.append(
-        cushion(
-            (0, 0.15 + (seat + back - 0.15) / 2, -depth / 2 + 0.06), (width, seat + back - 0.15, 0.12), cloth
-        )
+        cushion((0, 0.15 + (seat + back - 0.15) / 2, -depth / 2 + 0.06), (width, seat + back - 0.15, 0.12), cloth)
     )
     for sx in (-1, 1):
         height = seat + 0.6 * back - 0.15
-        parts.append(
-            cushion((sx * (width / 2 - 0.05), 0.15 + height / 2, 0.02), (0.1, height, depth - 0.06), cloth)
-        )
+        parts.append(cushion((sx * (width / 2 - 0.05), 0.15 + height / 2, 0.02), (0.1, height, depth - 0.06), cloth))
     return parts
 
 
@@ -156,15 +146,11 @@ def _table_legs(width=1.2, depth=0.75, height=0.74, top="oak", leg="oak", apron=
     if apron:
         for sz in (-1, 1):
             parts.append(
-                box(
-                    (0, height - 0.036 - apron / 2, sz * (depth / 2 - 0.07)), (width - 0.14, apron, 0.03), leg
-                )
+                box((0, height - 0.036 - apron / 2, sz * (depth / 2 - 0.07)), (width - 0.14, apron, 0.03), leg)
             )
         for sx in (-1, 1):
             parts.append(
-                box(
-                    (sx * (width / 2 - 0.07), height - 0.036 - apron / 2, 0), (0.03, apron, depth - 0.14), leg
-                )
+                box((sx * (width / 2 - 0.07), height - 0.036 - apron / 2, 0), (0.03, apron, depth - 0.14), leg)
             )
     return parts
 
@@ -201,18 +187,14 @@ def _table_coffee(width=0.95, depth=0.55, height=0.42, top="oak", leg="white") -
 def _table_panel(width=1.1, depth=0.7, height=0.73, top="linen", side="linen") -> list[Part]:
     parts = [box((0, height - 0.02, 0), (width, 0.04, depth), top)]
     for sx in (-1, 1):
-        parts.append(
-            box((sx * (width / 2 - 0.06), (height - 0.03) / 2, 0), (0.05, height - 0.03, depth - 0.08), side)
-        )
+        parts.append(box((sx * (width / 2 - 0.06), (height - 0.03) / 2, 0), (0.05, height - 0.03, depth - 0.08), side))
     return parts
 
 
 def _desk_panel(width=1.2, depth=0.62, height=0.74, wood="oak") -> list[Part]:
     parts = [box((0, height - 0.015, 0), (width, 0.03, depth), wood)]
     for sx in (-1, 1):
-        parts.append(
-            box((sx * (width / 2 - 0.02), (height - 0.02) / 2, 0), (0.035, height - 0.02, depth - 0.03), wood)
-        )
+        parts.append(box((sx * (width / 2 - 0.02), (height - 0.02) / 2, 0), (0.035, height - 0.02, depth - 0.03), wood))
     parts.append(box((0, height - 0.22, -depth / 2 + 0.06), (width - 0.05, 0.4, 0.025), wood))
     return parts
 
@@ -245,9 +227,7 @@ def _desk_frame(width=1.25, depth=0.62, height=0.74, top="white", frame="steel")
 def _desk_hutch(width=1.15, depth=0.6, height=0.75, wood="linen", leg="oak") -> list[Part]:
     parts = _table_legs(width, depth, height, wood, leg, apron=0.12)
     for sx in (-1, 1):
-        parts.append(
-            box((sx * (width / 2 - 0.02), height + 0.14, -depth / 2 + 0.12), (0.03, 0.3, 0.22), wood)
-        )
+        parts.append(box((sx * (width / 2 - 0.02), height + 0.14, -depth / 2 + 0.12), (0.03, 0.3, 0.22), wood))
     parts.append(box((0, height + 0.28, -depth / 2 + 0.12), (width, 0.025, 0.23), wood))
     return parts
 
@@ -255,9 +235,7 @@ def _desk_hutch(width=1.15, depth=0.6, height=0.75, wood="linen", leg="oak") -> 
 # -- sofas ------------------------------------------------------------
 
 
-def _sofa(
-    width=1.6, depth=0.82, seat=0.42, back=0.42, arm=0.16, seats=2, cloth="slate", legs=0.1
-) -> list[Part]:
+def _sofa(width=1.6, depth=0.82, seat=0.42, back=0.42, arm=0.16, seats=2, cloth="slate", legs=0.1) -> list[Part]:
     inner = width - 2 * arm
     parts = [
         box(
@@ -271,9 +249,7 @@ def _sofa(
         parts += four_legs(width - 0.04, depth - 0.06, legs + 0.01, 0.06, "walnut")
     top = seat + back
     parts.append(
-        cushion(
-            (0, legs + (top - legs) / 2, -depth / 2 + 0.1), (width - 0.02, top - legs, 0.2), cloth, 0.04, 0.06
-        )
+        cushion((0, legs + (top - legs) / 2, -depth / 2 + 0.1), (width - 0.02, top - legs, 0.2), cloth, 0.04, 0.06)
     )
     for i in range(seats):
         x = inner * ((i + 0.5) / seats - 0.5)
@@ -295,16 +271,12 @@ def _sofa(
 # -- doors: leaf from x = 0 (hinge edge) to x = width, handle near the other edge
 
 
-def _door(
-    width=0.88, height=2.0, thick=0.04, paint="white", panels=2, knob=False, metal="steel"
-) -> list[Part]:
+def _door(width=0.88, height=2.0, thick=0.04, paint="white", panels=2, knob=False, metal="steel") -> list[Part]:
     parts = [box((width / 2, height / 2, 0), (width, height, thick), paint)]
     for i in range(panels):
         y = height * (i + 0.5) / panels
         for sz in (-1, 1):
-            parts.append(
-                box((width / 2, y, sz * thick / 2), (width - 0.26, height / panels - 0.2, 0.012), paint)
-            )
+            parts.append(box((width / 2, y, sz * thick / 2), (width - 0.26, height / panels - 0.2, 0.012), paint))
     # Handles lie flat: a lever that stands off makes the leaf's convex hull as thick as it reaches.
     x = width - 0.07
     for sz in (-1, 1):
@@ -330,9 +302,7 @@ LIBRARY: dict[str, Drawing] = {
     "table_apron": Drawing("table", _table_legs, "__SYM_ROTATE_UP_2"),
     "table_round": Drawing("table", _table_round, "__SYM_ROTATE_UP_INF"),
     "table_coffee": Drawing("table", _table_coffee, "__SYM_ROTATE_UP_2"),
-    "table_square": Drawing(
-        "table", _f(_table_legs, 0.8, 0.8, 0.75, "walnut", "black", 0.06), "__SYM_ROTATE_UP_4"
-    ),
+    "table_square": Drawing("table", _f(_table_legs, 0.8, 0.8, 0.75, "walnut", "black", 0.06), "__SYM_ROTATE_UP_4"),
     "table_trestle": Drawing("table", _table_trestle, "__SYM_ROTATE_UP_2"),
     "table_panel": Drawing("table", _table_panel, "__SYM_ROTATE_UP_2"),
     "desk_panel": Drawing("desk", _desk_panel),

@@ -49,6 +49,8 @@ class BuildingConfig:
     """Sofas."""
     n_doors: tuple[int, int] = (1, 2)
     """Hinged leaves, standing open."""
+    door_open_deg: tuple[float, float] = (85.0, 115.0)
+    """How far a leaf stands open, where the wall behind it allows; at 60 it would bar half of its doorway."""
     n_bottlenecks: int = 1
     """Chairs put so that they narrow the way through a doorway to `bottleneck_gap_m`."""
     bottleneck_gap_m: tuple[float, float] = (0.42, 0.62)

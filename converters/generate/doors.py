@@ -18,6 +18,9 @@ DOOR_BOTTOM_M = (0.006, 0.010)
 WALL_GAP_M = 0.08
 """Left between a leaf that is fully open and the wall beside it: room for the handle."""
 
+AJAR_RAD = math.radians(3.0)
+"""A leaf stands at least this far from the end of its swing."""
+
 
 def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: bool, open_rad: float,
               plan: Plan, lift_m: float) -> tuple[Instance, shapely.Polygon]:  # fmt: skip
@@ -31,7 +34,7 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
         model: a door model, hinge edge at its lowest x.
         high_side: it opens into the room on the high side of the doorway's axis.
         high_jamb: it hangs on the jamb with the higher coordinate.
-        open_rad: how far it stands open.
+        open_rad: how far it should stand open; the wall beside the hinge may allow less.
         plan: for the wall that ends its swing.
         lift_m: gap below the leaf.
 
@@ -58,6 +61,7 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
     corner = (room.x1, room.y1)[along] if high_jamb else (room.x0, room.y0)[along]
     behind = abs(corner - hinge[along]) - WALL_GAP_M
     most = math.pi / 2 + math.asin(min(max(behind, 0.0) / width, 0.5))
+    open_rad = min(open_rad, most - AJAR_RAD)
     leaf_half_thick = _leaf_half_thickness(model)
     origin = (
         float(model.bounds[0, 0]), float(model.bounds[0, 1]),

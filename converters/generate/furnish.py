@@ -34,9 +34,7 @@ class _Room:
         self.room_of: list[int] = []
         self.drawn: Counter[str] = Counter()
 
-    def draw_model(
-        self, category: str, cfg: BuildingConfig, rng: np.random.Generator
-    ) -> tuple[CadModel, np.ndarray]:
+    def draw_model(self, category: str, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[CadModel, np.ndarray]:
         """One of the category's models that were drawn least so far, and its scale (CAD units -> metres)."""
         names = [m for m in cfg.models if LIBRARY[m].category == category]
         least = min(self.drawn[m] for m in names)
@@ -109,11 +107,7 @@ def _seat_at(
     for _ in range(6):
         for turn in turns:
             away = front + turn
-            reach = (
-                (half[2] if round(turn / (math.pi / 2)) % 2 == 0 else half[0])
-                + depth / 2
-                + rng.uniform(0.07, 0.16)
-            )
+            reach = (half[2] if round(turn / (math.pi / 2)) % 2 == 0 else half[0]) + depth / 2 + rng.uniform(0.07, 0.16)
             spread = 0.25 * (half[0] if round(turn / (math.pi / 2)) % 2 == 0 else half[2])
             slide = rng.uniform(-spread, spread)
             xy = centre + reach * np.array([math.cos(away), math.sin(away)])
@@ -143,9 +137,7 @@ def _narrow(state: _Room, cfg: BuildingConfig, rng: np.random.Generator, used: s
             xy[1 - d.axis] += rng.uniform(-0.6, 0.6)
             item = place(model, scale, xy, rng.uniform(-math.pi, math.pi))
             sweeps = state.kept_free[len(plan.doorways) :]
-            if not state.fits(item, d.rooms[side], zones=False) or any(
-                item.footprint.intersects(s) for s in sweeps
-            ):
+            if not state.fits(item, d.rooms[side], zones=False) or any(item.footprint.intersects(s) for s in sweeps):
                 continue
             room_m = clearance(without(before, [item]), GRID_M)
             if passes(room_m, masks, low) and not passes(room_m, masks, high):
@@ -168,10 +160,8 @@ def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> list[
             continue
         model, _ = state.draw_model("door", cfg, rng)
         for side, jamb in rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
-            opened = math.radians(rng.uniform(60, 90))
-            leaf, sweep = door_leaf(
-                d, model, bool(side), bool(jamb), opened, plan, rng.uniform(*DOOR_BOTTOM_M)
-            )
+            opened = math.radians(rng.uniform(*cfg.door_open_deg))
+            leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, rng.uniform(*DOOR_BOTTOM_M))
             if any(sweep.intersects(t) for t in (*state.taken, *state.kept_free[len(plan.doorways) :])):
                 continue
             leaves.append(leaf)
@@ -187,8 +177,7 @@ def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> list[
             model, scale = state.draw_model(category, cfg, rng)
             # Large pieces go first to large rooms that are still empty.
             score = {
-                i: plan.rooms[i].area_m2 * rng.uniform(0.6, 1.4) / (1 + 1.5 * state.room_of.count(i))
-                for i in roomy
+                i: plan.rooms[i].area_m2 * rng.uniform(0.6, 1.4) / (1 + 1.5 * state.room_of.count(i)) for i in roomy
             }
             for room in sorted(roomy, key=lambda i: -score[i]):
                 find = _in_the_open if category == "table" and rng.random() < 0.7 else _against_wall

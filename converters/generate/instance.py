@@ -55,14 +55,10 @@ class Instance:
     def footprint(self) -> shapely.Polygon:
         """The rectangle it stands on."""
         (x0, _, z0), (x1, _, z1) = self.model.bounds
-        return shapely.Polygon(
-            self.to_floor(np.array([[x0, 0, z0], [x1, 0, z0], [x1, 0, z1], [x0, 0, z1]]))[:, :2]
-        )
+        return shapely.Polygon(self.to_floor(np.array([[x0, 0, z0], [x1, 0, z0], [x1, 0, z1], [x0, 0, z1]]))[:, :2])
 
 
-def place(
-    model: CadModel, scale: np.ndarray, xy: np.ndarray, facing_rad: float, lift_m: float = 0.0
-) -> Instance:
+def place(model: CadModel, scale: np.ndarray, xy: np.ndarray, facing_rad: float, lift_m: float = 0.0) -> Instance:
     """Stands a model on the floor: centre of the footprint at `xy`, front towards `facing_rad` (from +x)."""
     yaw = facing_rad + math.pi / 2 + (math.pi if model.front < 0 else 0.0)
     yaw = math.atan2(math.sin(yaw), math.cos(yaw))

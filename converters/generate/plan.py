@@ -124,9 +124,7 @@ def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, _Wall, R
     )
 
 
-def _split(
-    rect: Rect, n: int, cfg: BuildingConfig, rng: np.random.Generator
-) -> tuple[list[Rect], list[_Wall]]:
+def _split(rect: Rect, n: int, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Rect], list[_Wall]]:
     """Cuts a rectangle into n rooms, always across its longer side (mostly)."""
     if n == 1:
         return [rect], []
@@ -142,9 +140,7 @@ def _split(
     return rooms_low + rooms_high, [wall, *walls_low, *walls_high]
 
 
-def _layout(
-    cfg: BuildingConfig, rng: np.random.Generator
-) -> tuple[Rect, list[Rect], list[_Wall], int | None]:
+def _layout(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Rect, list[Rect], list[_Wall], int | None]:
     """One try at rooms and inner walls; raises nothing, the caller checks the rooms."""
     n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
     area = rng.uniform(*cfg.floor_area_m2)
@@ -271,9 +267,7 @@ def doorway_zone(doorway: Doorway, reach_m: float, side_m: float = 0.05) -> Rect
     return Rect(r.x0 - grow[0], r.y0 - grow[1], r.x1 + grow[0], r.y1 + grow[1])
 
 
-def _fixtures(
-    rooms: list[Rect], doorways: list[Doorway], cfg: BuildingConfig, rng: np.random.Generator
-) -> list[Box]:
+def _fixtures(rooms: list[Rect], doorways: list[Doorway], cfg: BuildingConfig, rng: np.random.Generator) -> list[Box]:
     """Cupboards and counters in corners of rooms, away from doorways."""
     wanted = int(rng.integers(cfg.n_static[0], cfg.n_static[1] + 1))
     boxes: list[Box] = []
@@ -344,10 +338,7 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
     for _ in range(max_tries):
         inside, rooms, walls, corridor = _layout(cfg, rng)
         plain = [r for i, r in enumerate(rooms) if i != corridor]
-        if (
-            min(min(r.size) for r in plain) < cfg.min_room_side_m
-            or max(max(r.size) / min(r.size) for r in plain) > 2.3
-        ):
+        if min(min(r.size) for r in plain) < cfg.min_room_side_m or max(max(r.size) / min(r.size) for r in plain) > 2.3:
             continue
         door_height = snap(rng.uniform(2.06, 2.12))
         doorways = _doorways(rooms, walls, corridor, cfg, rng, door_height)
@@ -355,9 +346,7 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
             continue
         height = snap(rng.uniform(*cfg.wall_height_m))
         thick = snap(cfg.wall_thickness_m[1])
-        outer = Rect(
-            *(snap(v) for v in (inside.x0 - thick, inside.y0 - thick, inside.x1 + thick, inside.y1 + thick))
-        )
+        outer = Rect(*(snap(v) for v in (inside.x0 - thick, inside.y0 - thick, inside.x1 + thick, inside.y1 + thick)))
         boxes = [b for w in walls for b in _wall_boxes(w.rect, w.axis, doorways, height)]
         boxes += [
             Box((outer.x0, outer.y0, 0.0), (inside.x0, outer.y1, height)),

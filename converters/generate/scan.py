@@ -133,9 +133,7 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
     return vertices[used], index.reshape(-1, 3)
 
 
-def nearest_solids(
-    points: np.ndarray, solids: list[Solid], reach_m: float = 0.12
-) -> tuple[np.ndarray, np.ndarray]:
+def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
     """For each point the solid whose surface is nearest, and the label of the nearest one of another class.
 
     Args:

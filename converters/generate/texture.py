@@ -78,9 +78,7 @@ def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     return corner, y + row
 
 
-def unwrap(
-    vertices: np.ndarray, faces: np.ndarray, texels_per_m: float
-) -> tuple[np.ndarray, np.ndarray, int]:
+def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tuple[np.ndarray, np.ndarray, int]:
     """Lays the faces out on a square sheet.
 
     Returns:
@@ -127,9 +125,7 @@ def face_image(uv: np.ndarray, face_uv: np.ndarray, side: int) -> np.ndarray:
     return ids[tuple(nearest)] - 1  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
-def texel_positions(
-    uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray
-) -> np.ndarray:
+def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray) -> np.ndarray:
     """(n, 3) place in the building of each texel, from its barycentric coordinates (clamped to the face)."""
     a, b, c = (uv[face_uv[ids, i]] for i in range(3))
     d = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
@@ -191,9 +187,7 @@ def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np
     colour = np.zeros((len(points), 3))
     centres = np.array([[(r[0] + r[2]) / 2, (r[1] + r[3]) / 2] for r in rooms])
     half = np.array([[(r[2] - r[0]) / 2, (r[3] - r[1]) / 2] for r in rooms])
-    outside = np.stack(
-        [(np.abs(points[:, :2] - c) - h).max(axis=1) for c, h in zip(centres, half, strict=True)], 1
-    )
+    outside = np.stack([(np.abs(points[:, :2] - c) - h).max(axis=1) for c, h in zip(centres, half, strict=True)], 1)
     room = outside.argmin(axis=1)
     paints = np.array(
         [[0.90, 0.88, 0.83], [0.80, 0.86, 0.84], [0.88, 0.82, 0.76], [0.82, 0.84, 0.90], [0.93, 0.92, 0.90]]

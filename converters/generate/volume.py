@@ -47,17 +47,13 @@ def solid_from_mesh(vertices: np.ndarray, faces: np.ndarray, label: int, materia
     normals = normals[keep] / area[keep, None]
     offsets = np.einsum("ij,ij->i", normals, a[keep])
     _, first = np.unique(np.round(np.column_stack([normals, offsets]), 4), axis=0, return_index=True)
-    return Solid(
-        normals[first], offsets[first], vertices.min(axis=0), vertices.max(axis=0), label, material, owner
-    )
+    return Solid(normals[first], offsets[first], vertices.min(axis=0), vertices.max(axis=0), label, material, owner)
 
 
 def solid_from_box(low, high, label: int, material: str) -> Solid:
     """An axis-aligned box of the static structure."""
     low, high = np.asarray(low, float), np.asarray(high, float)
-    return Solid(
-        np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]), low, high, label, material, -1
-    )
+    return Solid(np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]), low, high, label, material, -1)
 
 
 @dataclasses.dataclass(frozen=True)

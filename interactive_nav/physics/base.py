@@ -7,6 +7,7 @@ so resets are `jnp.where`, checkpoints are portable and nothing engine-specific 
 from __future__ import annotations
 
 import abc
+from typing import Any
 
 import flax.struct
 import jax
@@ -19,13 +20,13 @@ TOUCH_FORCE_N = 1e-4
 
 @flax.struct.dataclass
 class PhysicsState:
-    """State of one environment's physics (leading batch axes as the caller has them)."""
+    """State of one environment's physics: JAX or NumPy arrays, with leading batch axes as the caller has them."""
 
-    qpos: jax.Array
+    qpos: Any
     """[nq] f32."""
-    qvel: jax.Array
+    qvel: Any
     """[nv] f32."""
-    qacc_warmstart: jax.Array
+    qacc_warmstart: Any
     """[nv] f32."""
 
 
@@ -33,15 +34,15 @@ class PhysicsState:
 class StepSignals:
     """What one control step did; M movable slots."""
 
-    force_n: jax.Array
+    force_n: Any
     """[] f32: mean over substeps of the norm of the robot's summed contact force on all but the floor, N."""
-    slot_force_n: jax.Array
+    slot_force_n: Any
     """[M] f32: largest norm over substeps of the net force on each slot's body, N."""
-    structure_force_n: jax.Array
+    structure_force_n: Any
     """[] f32: the same for walls and other fixed structure, N."""
-    overflow: jax.Array
+    overflow: Any
     """[] i32: 1 if a contact or constraint buffer overflowed in any substep."""
-    nonfinite: jax.Array
+    nonfinite: Any
     """[] i32: 1 if the new state is not finite or the engine gave up on it."""
 
 
@@ -53,9 +54,7 @@ class Physics(abc.ABC):
     nv: int
 
     @abc.abstractmethod
-    def step_batch(
-        self, scene: jax.Array, state: PhysicsState, ctrl: jax.Array
-    ) -> tuple[PhysicsState, StepSignals]:
+    def step_batch(self, scene: jax.Array, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, StepSignals]:
         """Steps a batch by one control period.
 
         Args:
@@ -114,7 +113,7 @@ def _step_single(physics: Physics, scene, state, ctrl):
     return single(scene, state, ctrl)
 
 
-def summarise_forces(force_w: jax.Array, xp=jnp):
+def summarise_forces(force_w: Any, xp: Any = jnp) -> tuple[Any, Any, Any]:
     """Contact forces of all substeps to the numbers of `StepSignals`.
 
     Args:

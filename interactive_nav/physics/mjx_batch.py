@@ -30,9 +30,13 @@ _UNUSED_BY_MJX = {
     "bvh_depth",
 }
 BATCHABLE = frozenset(
-    "geom_size geom_pos geom_quat geom_rbound geom_aabb geom_friction body_mass body_inertia body_ipos body_iquat "
-    "body_pos body_quat body_subtreemass body_invweight0 body_gravcomp dof_invweight0 dof_damping dof_frictionloss "
-    "jnt_axis jnt_pos jnt_range qpos0 qpos_spring".split()
+    {
+        *("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb", "geom_friction"),
+        *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
+        *("body_subtreemass", "body_invweight0", "body_gravcomp"),
+        *("dof_invweight0", "dof_damping", "dof_frictionloss"),
+        *("jnt_axis", "jnt_pos", "jnt_range", "qpos0", "qpos_spring"),
+    }
 )
 """Model fields that may differ between scenes under one compiled program."""
 
@@ -61,9 +65,7 @@ def differing_fields(models: tuple[mujoco.MjModel, ...]) -> tuple[str, ...]:
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap."""
 
-    def __init__(
-        self, world: World, substeps: int, impl: str, contacts_per_env: int, constraints_per_env: int
-    ):
+    def __init__(self, world: World, substeps: int, impl: str, contacts_per_env: int, constraints_per_env: int):
         self.name = impl
         self._world, self._substeps = world, substeps
         self.contacts_per_env, self.constraints_per_env = contacts_per_env, constraints_per_env
@@ -98,9 +100,7 @@ class MjxPhysics(Physics):
 
         def one(scene, state: PhysicsState, ctrl):
             model = self._model.replace(**{k: table[scene] for k, table in self._tables.items()})
-            data = template.replace(
-                qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
-            )
+            data = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
             if self.name == "jax":
 
                 def substep(data, _):

@@ -87,10 +87,10 @@ class NativePhysics(Physics):
         batch = pool.batch
         if len(self._models) > 1 and not np.array_equal(pool.scene, scene):
             batch.set_models([self._models[s] for s in scene])
-            pool.qpos[pool.scene != scene] = np.nan
+            pool.qpos[np.flatnonzero(pool.scene - scene)] = np.nan
             pool.scene = scene.copy()
-        finite = np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1)
-        known = (qpos == pool.qpos).all(1) & (qvel == pool.qvel).all(1)
+        finite = np.asarray(np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1))
+        known = np.equal(qpos, pool.qpos).all(1) & np.equal(qvel, pool.qvel).all(1)
         fresh = np.flatnonzero(~known)
         if len(fresh):
             batch.reset(fresh, stage=mujoco.mjtStage.mjSTAGE_NONE.value)

@@ -1,6 +1,5 @@
 """The whole converter on the tiny room: what it writes, that it writes it twice alike, and how it stops."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -103,9 +102,7 @@ def test_a_movable_can_be_attached_to_another_scene(tiny_scene):
     target.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
     target.worldbody.add_frame(pos=[5, 0, 0]).attach_body(source.body("table_0"), "a_", "")
     model = target.compile()
-    assert model.body("a_table_0").mass[0] == pytest.approx(
-        load_manifest(folder).objects[0].mass_kg, abs=1e-4
-    )
+    assert model.body("a_table_0").mass[0] == pytest.approx(load_manifest(folder).objects[0].mass_kg, abs=1e-4)
 
 
 def test_same_inputs_same_bytes_with_and_without_the_cache(tiny_scene, pristine, tmp_path):
@@ -163,9 +160,7 @@ def test_no_annotation_at_all(gibson_raw, tmp_path, hull_cache):
 def test_settling_parts_two_objects_that_overlap(tiny_scene):
     parts = tiny_scene[1].settled.parts
     table, basket = parts.objects
-    inside = dataclasses.replace(
-        basket, position_w=table.position_w + [0.25, 0.45, 0.02]
-    )  # at the table's leg
+    inside = dataclasses.replace(basket, position_w=table.position_w + [0.25, 0.45, 0.02])  # at the table's leg
     settled = settle(dataclasses.replace(parts, objects=(table, inside)))
     assert max(settled.displacement_m) < 0.4
     heights = [o.position_w[2] for o in settled.parts.objects]

@@ -38,9 +38,7 @@ def test_place_object_states_base_and_yaw(scan2cad_raw):
 
 def test_the_cut_takes_exactly_the_furniture(scan2cad_raw):
     raw = read_scan2cad(scan2cad_raw)
-    result = cut_furniture(
-        raw.scan.vertices - [0, 0, 0.3], raw.scan.faces, raw.scan.labels, placed_objects(raw)
-    )
+    result = cut_furniture(raw.scan.vertices - [0, 0, 0.3], raw.scan.faces, raw.scan.labels, placed_objects(raw))
     label = face_labels(raw.scan.labels, raw.scan.faces)
     np.testing.assert_array_equal(result.keep, np.isin(label, (1, 2)))
     np.testing.assert_array_equal(result.owner[label == 7], 0)
@@ -52,9 +50,7 @@ def test_unlabelled_things_on_a_table_go_with_it_and_a_shelf_beside_stays(scan2c
     book = trimesh.creation.box((0.2, 0.2, 0.05)).subdivide().subdivide().apply_translation((0.9, 1.6, 0.75))
     shelf = trimesh.creation.box((0.3, 0.8, 1.0)).subdivide().subdivide().apply_translation((2.0, 1.8, 0.5))
     vertices, faces = raw.scan.vertices - [0, 0, 0.3], raw.scan.faces
-    labels = np.concatenate(
-        [raw.scan.labels, np.zeros(len(book.vertices), int), np.full(len(shelf.vertices), 3)]
-    )
+    labels = np.concatenate([raw.scan.labels, np.zeros(len(book.vertices), int), np.full(len(shelf.vertices), 3)])
     first, second = len(vertices), len(vertices) + len(book.vertices)
     vertices = np.vstack([vertices, book.vertices, shelf.vertices])
     faces = np.vstack([faces, book.faces + first, shelf.faces + second])

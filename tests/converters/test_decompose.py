@@ -55,9 +55,7 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
 def test_the_key_follows_content_and_parameters_only():
     vertices, faces = table()
     key = content_key(vertices, faces, CONFIG)
-    assert key == content_key(
-        vertices.copy(), faces.astype(np.int32), dataclasses.replace(CONFIG, timeout_s=1.0)
-    )
+    assert key == content_key(vertices.copy(), faces.astype(np.int32), dataclasses.replace(CONFIG, timeout_s=1.0))
     assert key != content_key(vertices * 1.001, faces, CONFIG)
     assert key != content_key(vertices, faces, dataclasses.replace(CONFIG, threshold=0.2))
 

@@ -1,6 +1,5 @@
 """Gates: values by hand, and each physical gate shown to fail once on purpose."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations
@@ -93,9 +92,7 @@ def test_collision_switches_between_hulls_and_boxes(tiny_scene):
     for shape in ("hull", "box"):
         model = collide_with(spec_of(folder), shape)
         for kind in ("hull", "box"):
-            on = {
-                bool(model.geom_contype[g]) for g in range(model.ngeom) if f"_{kind}_" in model.geom(g).name
-            }
+            on = {bool(model.geom_contype[g]) for g in range(model.ngeom) if f"_{kind}_" in model.geom(g).name}
             assert on == {kind == shape}
         data = mujoco.MjData(model)
         mujoco.mj_step(model, data)
@@ -152,8 +149,4 @@ def test_physical_values_of_a_ball_in_free_fall():
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
     values = physical_values(spec.compile())
     assert values["drift"] == pytest.approx(0.5 * 9.81 * 2.0**2, rel=0.01)  # g t^2 / 2
-    assert (
-        values["turn"] == pytest.approx(0.0, abs=1e-6)
-        and values["penetration"] == 0.0
-        and values["finite"] == 1.0
-    )
+    assert values["turn"] == pytest.approx(0.0, abs=1e-6) and values["penetration"] == 0.0 and values["finite"] == 1.0

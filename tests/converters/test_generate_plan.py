@@ -53,9 +53,7 @@ def test_sizes_and_counts(seed):
     inside_m2 = (o.x1 - o.x0 - 2 * t) * (o.y1 - o.y0 - 2 * t)
     assert 30.5 <= inside_m2 <= 42.5
     assert 3 <= len(b.plan.rooms) <= 4
-    counts = {
-        c: sum(i.model.category == c for i in b.items) for c in ("chair", "table", "desk", "sofa", "door")
-    }
+    counts = {c: sum(i.model.category == c for i in b.items) for c in ("chair", "table", "desk", "sofa", "door")}
     assert 6 <= len(b.items) <= 10 and sum(counts.values()) == len(b.items)
     assert counts["chair"] >= 3 and counts["table"] == counts["desk"] == counts["sofa"] == 1
     assert 1 <= counts["door"] <= 2
@@ -154,14 +152,12 @@ def test_door_hangs_at_a_jamb_and_swings_from_closed_to_the_wall(seed):
         # One end of the range closes it: the slab (first part; handles stand off) then lies in the doorway.
         slab = item.model.parts[0].vertices
         closed = [
-            outline.buffer(1e-6).contains(
-                shapely.MultiPoint(turned(item, a).to_floor(slab)[:, :2]).convex_hull
-            )
+            outline.buffer(1e-6).contains(shapely.MultiPoint(turned(item, a).to_floor(slab)[:, :2]).convex_hull)
             for a in (low, high)
         ]
         assert sum(closed) == 1
         opened = -low if closed[0] else high
-        assert math.radians(60) - 1e-9 <= opened <= math.radians(90) + 1e-9
+        assert math.radians(85) - 1e-9 <= opened <= math.radians(115) + 1e-9
         assert math.pi / 2 <= high - low <= math.radians(121)
         # Nothing static nor any other piece stands in the sweep; the slab never enters a wall.
         others = [o.footprint for o in b.items if o is not item]

@@ -178,9 +178,7 @@ def test_annotations_lead_back_to_the_furniture(raw):
     assert raw.scan["n_aligned_models"] == len(models) == len(b.items)
     to_world = trs_matrix(raw.scan["trs"])
     np.testing.assert_allclose(to_world[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-12)  # z up -> y up
-    np.testing.assert_allclose(
-        apply(to_world, raw.vertices).min(0), -apply(to_world, raw.vertices).max(0), atol=2e-4
-    )
+    np.testing.assert_allclose(apply(to_world, raw.vertices).min(0), -apply(to_world, raw.vertices).max(0), atol=2e-4)
     for item, entry in zip(b.items, models, strict=True):
         pose = trs_matrix(entry["trs"])
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

@@ -215,9 +215,7 @@ def test_fuzzed_files_never_crash_a_reader(gibson_raw, data):
     path = gibson_raw / name
     good = path.read_bytes()
     at = data.draw(st.integers(0, len(good) - 1))
-    path.write_bytes(
-        good[:at] + data.draw(st.binary(max_size=8)) + good[at + data.draw(st.integers(0, 20)) :]
-    )
+    path.write_bytes(good[:at] + data.draw(st.binary(max_size=8)) + good[at + data.draw(st.integers(0, 20)) :])
     try:
         read_gibson(gibson_raw)
     except SceneRejected as error:

@@ -1,6 +1,5 @@
 """The licensed ScanNet room end to end; skipped with a reason where the data is absent."""
 
-# pyright: reportAttributeAccessIssue=false
 # MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
 
 from __future__ import annotations

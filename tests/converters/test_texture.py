@@ -26,9 +26,7 @@ def cloud_over(mesh: trimesh.Trimesh, colour, keep=lambda p: np.ones(len(p), boo
     points, face = trimesh.sample.sample_surface(mesh, 4000, seed=0)[:2]
     chosen = keep(points)
     normals = mesh.face_normals[face][chosen]
-    return ColourCloud(
-        np.asarray(points)[chosen], normals, np.tile(np.array(colour, float), (chosen.sum(), 1))
-    )
+    return ColourCloud(np.asarray(points)[chosen], normals, np.tile(np.array(colour, float), (chosen.sum(), 1)))
 
 
 def test_texels_of_a_square_that_fills_the_image():
@@ -85,9 +83,7 @@ def test_each_material_is_in_painted_from_itself():
     colours = np.where(left[:, None], [10, 10, 10], [250, 250, 250]).astype(np.uint8)
     red = cloud_over(mesh, (200, 0, 0), lambda p: (p[:, 2] > 0.2) & (p[:, 0] < -0.1))
     blue = cloud_over(mesh, (0, 0, 200), lambda p: (p[:, 2] > 0.2) & (p[:, 0] > 0.1))
-    both = ColourCloud(
-        *(np.vstack([getattr(red, f), getattr(blue, f)]) for f in ("points", "normals", "colours"))
-    )
+    both = ColourCloud(*(np.vstack([getattr(red, f), getattr(blue, f)]) for f in ("points", "normals", "colours")))
     visual, _ = bake_object(np.asarray(mesh.vertices), np.asarray(mesh.faces), colours, both, 500, 64)
     texel, point, _ = texel_surface(visual.vertices, visual.faces, visual.uv, visual.uv_faces, 64)
     shown = visual.image.reshape(-1, 3)[texel].astype(int)

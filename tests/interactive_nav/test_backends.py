@@ -2,7 +2,6 @@
 
 import importlib.util
 
-import interactive_nav
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+import interactive_nav
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot

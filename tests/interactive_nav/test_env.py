@@ -1,11 +1,11 @@
 """The environment's contract, its task memory across episode ends, and its scores against a plain-Python oracle."""
 
-import interactive_nav
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import interactive_nav
 from interactive_nav import metrics
 from interactive_nav.env import EPISODE_METRICS
 from interactive_nav.wrappers import AutoResetEnv
@@ -167,7 +167,8 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
     reset, step = programs
     state = reset(keys(7))
     masses = np.asarray(env.tables.mass_kg)[np.asarray(state.info["nav"].scene_index)]
-    tracks, forces, done_at = [[] for _ in range(N)], [[] for _ in range(N)], [None] * N
+    tracks, forces = [[] for _ in range(N)], [[] for _ in range(N)]
+    done_at: list[dict[str, float]] = [{} for _ in range(N)]
     previous = np.zeros(N)
     for i in range(N):
         nav = state.info["nav"]
@@ -176,7 +177,7 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
         state = step(state, drive(state.obs))
         nav = state.info["nav"]
         for i in range(N):
-            if done_at[i] is None:
+            if not done_at[i]:
                 tracks[i].append(np.vstack([nav.robot_pos_w[i], nav.object_pos_w[i]]))
                 forces[i].append(float(nav.force_sum_n[i]) - previous[i])
                 if state.done[i]:

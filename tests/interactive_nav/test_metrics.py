@@ -22,7 +22,11 @@ def test_effort_efficiency_by_hand():
     # Robot 2 kg over 3 m, object 4 kg over 0.5 m, one untouched: kinematic 6 / (6 + 2) = 0.75.
     # Force 10 + 30 N over T = 4 steps, G = 2 * 10: dynamic 80 / (80 + 40) = 2/3. Mean: 17/24.
     got = metrics.effort_efficiency(
-        np.array([2.0, 4.0, 100.0]), np.array([3.0, 0.5, 0.0]), np.array([0.0, 10.0, 30.0, 0.0]), 4, gravity=10.0
+        np.array([2.0, 4.0, 100.0]),
+        np.array([3.0, 0.5, 0.0]),
+        np.array([0.0, 10.0, 30.0, 0.0]),
+        4,
+        gravity=10.0,
     )
     assert got == pytest.approx(17 / 24)
 

@@ -27,7 +27,11 @@ def test_slots_masses_and_names(world):
     # Three small objects, two free slots, one hinge; the first scene leaves a free slot and the hinge empty.
     assert world.layout.slot_kind == ("small", "small", "small", "free", "free", "hinge")
     np.testing.assert_array_equal(world.occupied, [[1, 1, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]])
-    assert world.names[0][3:] == ("chair_0", "", "") and world.names[1][3:] == ("chair_0", "table_0", "door_0")
+    assert world.names[0][3:] == ("chair_0", "", "") and world.names[1][3:] == (
+        "chair_0",
+        "table_0",
+        "door_0",
+    )
     np.testing.assert_allclose(world.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
     assert world.robot_mass_kg == pytest.approx(2.673)
     assert world.settle_m.max() < 0.01
@@ -115,3 +119,17 @@ def _rename(folder, old, new):
 def _empty(folder):
     maps = load_maps(folder)
     save_maps(type(maps)(maps.traversable & False, maps.resolution_m, maps.origin_w, 0.0), folder)
+
+
+def test_a_door_keeps_its_range_in_radians_and_swings(world):
+    # Once read as degrees: doors were locked within 1.5 degrees and barred their rooms.
+    model, layout = world.models[1], world.layout
+    assert layout.slot_kind[5] == "hinge"
+    joint = model.body_jntadr[layout.slot_body[5]]
+    np.testing.assert_allclose(model.jnt_range[joint], [-1.5, 1.5])
+    data = mujoco.MjData(model)
+    data.qpos[:] = world.rest_qpos[1]
+    for _ in range(150):
+        data.qfrc_applied[layout.slot_qvel[5]] = 4.0  # N m: 5 N at the leaf's edge
+        mujoco.mj_step(model, data)
+    assert data.qpos[layout.slot_qpos[5]] > 1.0

@@ -146,6 +146,4 @@ def test_command_line_says_one_line_and_exits_2():
     )
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
-    assert line.startswith(
-        "train: override: unknown key 'ppo.learnin_rate', did you mean 'ppo.learning_rate'?"
-    )
+    assert line.startswith("train: override: unknown key 'ppo.learnin_rate', did you mean 'ppo.learning_rate'?")

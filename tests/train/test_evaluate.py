@@ -38,9 +38,7 @@ def test_rows(evaluated):
     frame = rows.to_pydict()
     assert frame["policy"] == ["learned"] * 12 + ["random"] * 12 + ["follower"] * 12
     assert frame["episode"] == list(range(12)) * 3
-    assert (
-        set(frame["run"]) == {"toy"} and set(frame["scene"]) == {"plane"} and set(frame["split"]) == {"train"}
-    )
+    assert set(frame["run"]) == {"toy"} and set(frame["scene"]) == {"plane"} and set(frame["split"]) == {"train"}
     assert frame["algorithm"][:13] == ["ppo"] * 12 + [None]
     assert frame["checkpoint_steps"][:13] == [512] * 12 + [None]
     assert set(frame["k_int"]) == {0.1} and set(frame["evaluation_seed"]) == {4}

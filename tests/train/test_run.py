@@ -50,9 +50,7 @@ def test_folder_of_a_finished_run(finished):
     # A checkpoint every two updates and one at the end; all three are kept.
     assert [c.env_steps for c in checkpoint.list_checkpoints(folder.checkpoints)] == [512, 1024, 1280]
     assert [line["env_steps"] for line in read_metrics(folder.metrics)] == [256, 512, 768, 1024, 1280]
-    assert {"loss/total_loss", "env_steps_per_s", "episodes", "wall_s"} <= read_metrics(folder.metrics)[
-        0
-    ].keys()
+    assert {"loss/total_loss", "env_steps_per_s", "episodes", "wall_s"} <= read_metrics(folder.metrics)[0].keys()
     assert list(folder.tensorboard.glob("events.out.tfevents.*"))
     written = from_yaml(folder.config.read_text())
     assert written == config and None not in dataclasses.astuple(written.ppo)
@@ -86,8 +84,7 @@ def test_resume_through_files_equals_uninterrupted_run(finished, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, saved, result.snapshot.learner)
     clocks = ("wall_s", "env_steps_per_s", "compile_s")
     lines = [
-        [{k: v for k, v in line.items() if k not in clocks} for line in read_metrics(f.metrics)]
-        for f in (half, folder)
+        [{k: v for k, v in line.items() if k not in clocks} for line in read_metrics(f.metrics)] for f in (half, folder)
     ]
     assert lines[0] == lines[1]
     assert not list(half.checkpoints.glob(".partial*"))
@@ -105,17 +102,13 @@ def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
     meta = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)
     scores = {100: None, 200: 0.9, 300: 0.5, 400: 0.7, 500: 0.8}
     for steps, score in scores.items():
-        snapshot = type(
-            "S", (), {"learner": {"w": np.full(3, steps, np.float32)}, "env_state": {"x": np.arange(4)}}
-        )()
+        snapshot = type("S", (), {"learner": {"w": np.full(3, steps, np.float32)}, "env_state": {"x": np.arange(4)}})()
         checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps, score=score), 2, 1.0)
     assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [200, 400, 500]
     assert checkpoint.find(tmp_path, "best")[1].env_steps == 200
     assert checkpoint.find(tmp_path, "last")[1].env_steps == 500
     path, _ = checkpoint.find(tmp_path, "400")
-    np.testing.assert_array_equal(
-        checkpoint.load_learner(path, {"w": np.zeros(3, np.float32)})["w"], [400.0] * 3
-    )
+    np.testing.assert_array_equal(checkpoint.load_learner(path, {"w": np.zeros(3, np.float32)})["w"], [400.0] * 3)
     # Environments are kept with the newest only; another size of them is as good as none.
     newest, _ = checkpoint.find(tmp_path, "last")
     assert checkpoint.load_env_state(path, {"x": np.zeros(4, np.int32)}) is None
@@ -123,9 +116,7 @@ def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
     assert kept is not None
     np.testing.assert_array_equal(kept["x"], np.arange(4))
     assert checkpoint.load_env_state(newest, {"x": np.zeros(5, np.int32)}) is None
-    with pytest.raises(
-        CheckpointError, match="no checkpoint '300'; expected best, last or one of 200, 400, 500"
-    ):
+    with pytest.raises(CheckpointError, match="no checkpoint '300'; expected best, last or one of 200, 400, 500"):
         checkpoint.find(tmp_path, "300")
     with pytest.raises(CheckpointError, match=r"\['w'\] has shape \(3,\), expected \(4,\)"):
         checkpoint.load_learner(path, {"w": np.zeros(4)})
@@ -265,8 +256,6 @@ def test_sigterm_saves_and_kill_loses_one_interval_at_most(tmp_path):
     assert steps == sorted(set(steps))
     # And it goes on from there, to an end.
     total = saved[-1].env_steps + 2 * UPDATE_STEPS
-    result, _, _ = train_run(
-        toy_config(tmp_path, updates=total // UPDATE_STEPS), quiet(), build_env=build_toy
-    )
+    result, _, _ = train_run(toy_config(tmp_path, updates=total // UPDATE_STEPS), quiet(), build_env=build_toy)
     assert result.completed and result.snapshot.env_steps == total
     assert [line["env_steps"] for line in read_metrics(folder.metrics)] == list(range(256, total + 1, 256))
