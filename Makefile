@@ -1,0 +1,86 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`. `make help` lists the rest.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+
+PYTHON3 ?= python3
+PY := .venv/bin/python
+SEED ?= 4
+EPISODES ?= 200
+DEMO := demo
+say = @printf '\n\033[1m== %s\033[0m\n'
+
+.PHONY: help sync demo test lint types format check lock clean-demo
+
+help:
+	@echo "make demo    generate and convert a small building, train a TurtleBot, score it, draw it (SEED=$(SEED))"
+	@echo "make test    all tests, slow ones included"
+	@echo "make lint | types | format | check (lint, types and test) | sync (environment) | lock | clean-demo"
+
+# The environment: exact versions from requirements.lock, the project itself as an editable install.
+sync: .venv/.complete
+
+.venv/.complete: requirements.lock pyproject.toml
+	$(say) "Environment: .venv from requirements.lock (about 1 GB the first time)"
+	@$(PYTHON3) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "make: $$($(PYTHON3) --version) is too old, expected Python 3.11 or newer; set PYTHON3=python3.12, say" >&2; exit 2; }
+	@$(PYTHON3) -m venv .venv || { echo "make: cannot make .venv; on Debian: apt install python3-venv" >&2; exit 2; }
+	@$(PY) -m pip install --disable-pip-version-check --quiet --require-hashes -r requirements.lock
+	@$(PY) -m pip install --disable-pip-version-check --quiet --no-deps -e .
+	@touch $@
+	@$(PY) --version
+
+demo: $(DEMO)/figures/.complete
+	$(say) "Done: the score table again"
+	@cat $(DEMO)/scores.txt
+	@echo "Pictures: $(DEMO)/preview.png and $(DEMO)/figures/"
+
+$(DEMO)/raw: | sync
+	$(say) "1/5 Generating the scan of a small building (seed $(SEED))"
+	@mkdir -p $(DEMO)
+	@$(PY) -m converters generate $@ --seed $(SEED)
+
+$(DEMO)/apartment: | sync $(DEMO)/raw
+	$(say) "2/5 Converting it to MuJoCo"
+	@$(PY) -m converters convert $(DEMO)/raw $@
+	@$(PY) -m converters check $@
+	@$(PY) -m converters preview $@ -o $(DEMO)/preview.png
+
+$(DEMO)/runs/demo/summary.json: | sync $(DEMO)/apartment
+	$(say) "3/5 Training a TurtleBot with PPO on the CPU (a few minutes; interrupted, it continues where it was)"
+	@$(PY) -m train --config demo 'env.scenes=[$(DEMO)/apartment]' run.out_dir=$(DEMO)/runs run.name=demo
+
+$(DEMO)/scores.txt: $(DEMO)/runs/demo/summary.json
+	$(say) "4/5 Scoring it on $(EPISODES) fixed episodes, beside policies that never learned"
+	@$(PY) -m train.evaluate $(DEMO)/runs/demo --episodes $(EPISODES) | tee $@
+
+$(DEMO)/figures/.complete: $(DEMO)/scores.txt
+	$(say) "5/5 Drawing learning curves and trajectories"
+	@$(PY) -m train.figures $(DEMO)/runs/demo -o $(DEMO)/figures
+	@touch $@
+
+test: sync
+	$(say) "Tests (two workers; the slow ones compile MJX on the CPU)"
+	@$(PY) -m pytest -n 2 --dist loadfile
+
+lint: sync
+	$(say) "Lint"
+	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
+
+types: sync
+	$(say) "Types"
+	@$(PY) -m pyright
+
+format: sync
+	@$(PY) -m ruff check --fix .
+	@$(PY) -m ruff format .
+
+check: lint types test
+
+lock:
+	uv pip compile pyproject.toml --extra dev --extra warp --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-header -o requirements.lock
+
+clean-demo:
+	rm -rf $(DEMO)
