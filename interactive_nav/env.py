@@ -22,7 +22,7 @@ from interactive_nav.placement import draw_episode
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
-from interactive_nav.tables import build_tables
+from interactive_nav.tables import build_tables, furniture_map, rest_poses
 from interactive_nav.types import EpisodeStart, NavInfo
 from interactive_nav.world import build_world, parking_spot
 
@@ -102,6 +102,10 @@ class InteractiveNav(Env):
     def dt(self) -> float:
         """Control period, s."""
         return self.config.control_dt_s
+
+    def furniture_map(self, scene: int) -> np.ndarray:
+        """[rows, columns] bool on a scene's map: where furniture stands at rest, below the robot's height."""
+        return furniture_map(self.scenes[scene], rest_poses(self.world, scene), self.robot.height_m)
 
     def reset(self, rng: jax.Array) -> State:
         """Draws an episode.

@@ -67,7 +67,8 @@ def _sample(values: np.ndarray, resolution_m: float, shape: tuple[int, int], cel
     return scipy.ndimage.map_coordinates(values, np.meshgrid(r, c, indexing="ij"), order=1, cval=0.0)
 
 
-def _poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
     qpos, layout = world.rest_qpos[index], world.layout
     rest = {m.name: (m.pos_w, m.quat_w) for m in world.scenes[index].movables}
     for name, kind, at in zip(world.names[index], layout.slot_kind, layout.slot_qpos, strict=True):
@@ -87,7 +88,7 @@ def _scene_places(world: World, index: int, config: NavConfig) -> tuple[Distance
             "map; use a smaller robot or check the scan's floor"
         )
     open_m = clearance(
-        maps.traversable & ~furniture_map(scene, _poses(world, index), robot.height_m), maps.resolution_m
+        maps.traversable & ~furniture_map(scene, rest_poses(world, index), robot.height_m), maps.resolution_m
     )
     margin = _sample(open_m, maps.resolution_m, free.shape, cell)
     largest = max((o.radius_m for o in world.small_objects), default=0.0)

@@ -109,6 +109,7 @@ def write_paths(path: Path, played: dict[str, Episodes], env: Any) -> None:
     for i, scene in enumerate(env.scenes):
         arrays[f"scene/{i}/name"] = np.array(scene.name)
         arrays[f"scene/{i}/traversable"] = scene.maps.traversable
+        arrays[f"scene/{i}/furniture"] = env.furniture_map(i)
         arrays[f"scene/{i}/resolution_m"] = np.array(scene.maps.resolution_m)
         arrays[f"scene/{i}/origin_w"] = np.array(scene.maps.origin_w)
         arrays[f"scene/{i}/object_names"] = np.array(env.world.names[i], dtype=str)

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
 
 from train.errors import RunFolderError, TrainError
@@ -29,6 +30,7 @@ CURVES = (
     ("episode/sum_reward", "episode reward"),
 )
 COLOURS = {"learned": "#0072b2", "follower": "#009e73", "random": "#cc79a7"}
+FURNITURE_COLOUR = "#ecd9b8"
 MOVED_M = 0.02
 """Objects moved less than this are drawn once."""
 
@@ -78,6 +80,7 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6) -> Figure:
     handles += [
         Line2D([], [], marker="o", markerfacecolor="w", label="start", markersize=8, **grey),
         Line2D([], [], marker="*", label="goal", markersize=11, **grey),
+        Patch(color=FURNITURE_COLOUR, label="furniture at start, as far as it bars the robot"),
         Line2D([], [], marker="s", markerfacecolor="none", label="object at start", markersize=6, **grey),
         Line2D([], [], marker="s", label="object at end (coloured by who moved it)", markersize=6, **grey),
     ]
@@ -91,7 +94,9 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
     resolution_m, origin = float(paths[f"scene/{scene}/resolution_m"]), paths[f"scene/{scene}/origin_w"]
     rows, columns = free.shape
     extent = (origin[0], origin[0] + columns * resolution_m, origin[1], origin[1] + rows * resolution_m)
-    axis.imshow(free, origin="lower", extent=extent, cmap=ListedColormap(["0.75", "1.0"]), vmin=0, vmax=1)
+    kind = np.where(free, np.where(paths[f"scene/{scene}/furniture"], 1, 2), 0)
+    colours = ListedColormap(["0.72", FURNITURE_COLOUR, "1.0"])
+    axis.imshow(kind, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=2, interpolation="nearest")
     begin = paths[f"{policies[0]}/object_start_w"][i, :, :2]
     # Empty slots and objects that found no place wait far outside the map.
     inside = ((begin > [extent[0], extent[2]]) & (begin < [extent[1], extent[3]])).all(-1)

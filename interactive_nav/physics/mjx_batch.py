@@ -86,6 +86,9 @@ class MjxPhysics(Physics):
             )
             for name in self._fields
         }
+        # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model that it
+        # is given: with several scenes each environment needs its own scene's.
+        self._static_pose = _geom_poses(world.models) if impl == "warp" and len(world.models) > 1 else None
         self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
         self._slot_of_geom = _slot_of_geom(world, host)
 
@@ -101,6 +104,9 @@ class MjxPhysics(Physics):
         def one(scene, state: PhysicsState, ctrl):
             model = self._model.replace(**{k: table[scene] for k, table in self._tables.items()})
             data = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
+            if self._static_pose is not None:
+                xpos, xmat = self._static_pose
+                data = data.replace(geom_xpos=xpos[scene], geom_xmat=xmat[scene])
             if self.name == "jax":
 
                 def substep(data, _):
@@ -166,6 +172,17 @@ class MjxPhysics(Physics):
             target = jnp.where(first == _ROBOT, second, jnp.where(second == _ROBOT, first, -1))
             out = out.at[jnp.maximum(target, 0)].add(jnp.where(target[:, None] >= 0, given, 0.0))
         return out
+
+
+def _geom_poses(models: tuple[mujoco.MjModel, ...]) -> tuple[jax.Array, jax.Array]:
+    """World poses of all geoms at `qpos0`, per scene: positions [S, ngeom, 3] and matrices [S, ngeom, 3, 3]."""
+    positions, matrices = [], []
+    for model in models:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        positions.append(data.geom_xpos.copy())
+        matrices.append(data.geom_xmat.reshape(-1, 3, 3).copy())
+    return jnp.asarray(np.stack(positions), jnp.float32), jnp.asarray(np.stack(matrices), jnp.float32)
 
 
 _ROBOT = -2

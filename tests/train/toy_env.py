@@ -60,6 +60,7 @@ class ToyEnv(Env):
         maps = SceneMaps(np.ones((80, 80), bool), 0.1, (-4.0, -4.0), 0.0)
         self.scenes = (SimpleNamespace(name="plane", split="train", maps=maps),)
         self.world = SimpleNamespace(names=(("box_0",),))
+        self.furniture_map = lambda scene: np.zeros((80, 80), bool)
         self.nan_at_step = nan_at_step
 
     @property
