@@ -24,7 +24,7 @@ from interactive_nav.wrappers import AutoResetEnv
 from train import checkpoint, ppo
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
-from train.errors import CheckpointError, ConfigError
+from train.errors import CheckpointError, ConfigError, TrainError
 from train.files import write_text
 from train.learner import Snapshot, TrainResult, Update
 from train.progress import TrainingDisplay, describe
@@ -199,8 +199,15 @@ def train_run(
     """
     folder = RunFolder(Path(config.run.out_dir) / config.run.name)
     claim(folder.path)
-    env = build_env(config.env)
-    config = resolve(config, env.backend)
+    try:
+        env = build_env(config.env)
+        config = resolve(config, env.backend)
+    except TrainError:
+        # Nothing half-made stays behind: `rmdir` takes only empty folders.
+        with contextlib.suppress(OSError):
+            folder.path.rmdir()
+            folder.path.parent.rmdir()
+        raise
     exists = folder.open(config)
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "

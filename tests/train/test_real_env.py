@@ -13,6 +13,7 @@ from rich.console import Console
 from tests.toys import write_room
 from tests.train.toy_run import UPDATE_STEPS, toy_config
 from train import checkpoint, evaluate
+from train.__main__ import main
 from train.config import EnvConfig, TrainConfig
 from train.run import train_run
 from train.run_folder import read_metrics
@@ -55,3 +56,11 @@ def test_train_resume_and_evaluate(tmp_path, capsys):
     assert "observations of the checkpoint: " in capsys.readouterr().err
     assert evaluate.main([str(folder.path), "--scenes", str(tmp_path / "absent")]) == 2
     assert str(tmp_path / "absent") in capsys.readouterr().err
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder(tmp_path, capsys):
+    out = tmp_path / "runs"
+    arguments = ["--config", "demo", f"env.scenes=[{tmp_path / 'nowhere'}]", f"run.out_dir={out}"]
+    assert main(arguments) == 2
+    assert "no such file; expected a scene folder" in capsys.readouterr().err
+    assert not out.exists()
