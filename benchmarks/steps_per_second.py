@@ -14,7 +14,7 @@ import argparse
 import datetime
 import importlib.metadata
 import json
-import platform
+import os
 import statistics
 import subprocess
 import tempfile
@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from rich.console import Console
 
 import interactive_nav
+from interactive_nav.physics import resolve_backend
 from interactive_nav.wrappers import AutoResetEnv
 from train import config_io
 from train.run import train_run
@@ -146,11 +147,11 @@ def main() -> None:
         for mode in args.mode:
             row: dict[str, Any] = {
                 "mode": mode,
-                "backend": args.backend,
+                "backend": resolve_backend(args.backend),
                 "num_envs": num_envs,
                 "scenes": args.scenes,
                 "settings": settings,
-                "device": device.device_kind if device.platform != "cpu" else f"cpu {platform.processor()}".strip(),
+                "device": device.device_kind if device.platform != "cpu" else f"cpu, {os.cpu_count()} cores",
                 "versions": _versions(),
                 "commit": args.commit or _commit(),
                 "date": datetime.date.today().isoformat(),
