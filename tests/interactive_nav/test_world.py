@@ -133,3 +133,17 @@ def test_a_door_keeps_its_range_in_radians_and_swings(world):
         data.qfrc_applied[layout.slot_qvel[5]] = 4.0  # N m: 5 N at the leaf's edge
         mujoco.mj_step(model, data)
     assert data.qpos[layout.slot_qpos[5]] > 1.0
+
+
+def test_goals_and_starts_are_clear_of_furniture_and_walls(world, two_rooms):
+    tables = build_tables(world, NavConfig(num_objects=3))
+    scene = world.scenes[1]
+    cubes = np.array([[1.2, 0.0], [-1.2, 1.0]])  # 0.4 m cubes, see the fixture
+    goals = np.asarray(tables.node_xy_w[1])[np.asarray(tables.goal_node[1])[: int(tables.num_goals[1])]]
+    starts = np.asarray(tables.start_xy_w[1])[: int(tables.num_starts[1])]
+    for places in (goals, starts):
+        assert len(places) > 100
+        gap = np.maximum(np.abs(places[:, None] - cubes[None]) - 0.2, 0.0)
+        assert np.linalg.norm(gap, axis=-1).min() >= 0.18
+        assert (np.abs(places) <= np.array([2.5, 2.0]) - 0.18 + 1e-6).all()
+    assert scene.name == "two_rooms"
