@@ -3,8 +3,6 @@
 Conventions of the written MJCF (classes, groups, names) are in `scenes_mjcf/README.md`.
 """
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,7 +1,5 @@
 """A scene's model, manifest and maps in; acceptance values against one table of limits out."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,7 +1,5 @@
 """A raw folder in, a scene folder out: read, stages that are functions of arrays, write, rename."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import contextlib

@@ -1,7 +1,5 @@
 """A scene folder in, one top-down PNG out: textured scene beside its collision shapes."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import tempfile

@@ -1,7 +1,5 @@
 """Objects at their annotated poses and wall boxes in, objects at rest out."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import dataclasses

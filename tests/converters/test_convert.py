@@ -1,7 +1,5 @@
 """The whole converter on the tiny room: what it writes, that it writes it twice alike, and how it stops."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,7 +1,5 @@
 """Gates: values by hand, and each physical gate shown to fail once on purpose."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import dataclasses

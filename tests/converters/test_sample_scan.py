@@ -1,7 +1,5 @@
 """The licensed ScanNet room end to end; skipped with a reason where the data is absent."""
 
-# MuJoCo is a compiled module without type stubs: its names are unknown to the checker.
-
 from __future__ import annotations
 
 import time
