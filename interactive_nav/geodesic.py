@@ -220,7 +220,6 @@ class DistanceTable:
 def navigation_grid(
     traversable: np.ndarray,
     resolution_m: float,
-    origin_w: tuple[float, float],
     radius_m: float,
     cell_m: float,
 ) -> np.ndarray:
@@ -231,14 +230,12 @@ def navigation_grid(
     Args:
         traversable: [rows, columns] bool.
         resolution_m: the map's cell side.
-        origin_w: corner of the map (only its extent matters here).
         radius_m: body radius.
         cell_m: side of the navigation cell.
 
     Returns:
         [ceil(rows * resolution / cell), ...] bool, the largest connected component only.
     """
-    del origin_w
     margin = clearance(traversable, resolution_m)
     rows, columns = (math.ceil(n * resolution_m / cell_m - 1e-9) for n in traversable.shape)
     # Bilinear sample of the clearance at the navigation cells' centres, in map cell units.

@@ -81,7 +81,7 @@ def _scene_places(world: World, index: int, config: NavConfig) -> tuple[Distance
     """Distance table, start places [p, 2] and clutter places [q, 2] of one scene."""
     scene, robot = world.scenes[index], world.robot
     maps, cell = scene.maps, config.nav_cell_m
-    free = navigation_grid(maps.traversable, maps.resolution_m, maps.origin_w, robot.footprint_radius_m, cell)
+    free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, cell)
     if not free.any():
         raise SceneError(
             f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "

@@ -91,7 +91,7 @@ def test_a_doorway_narrower_than_the_robot_closes():
     free = np.ones((40, 40), bool)
     free[20, :] = False
     free[20, 18:22] = True  # 0.2 m at 0.05 m a cell
-    assert geodesic.navigation_grid(free, 0.05, (0, 0), 0.18, 0.1).sum() < 0.6 * 20 * 20
+    assert geodesic.navigation_grid(free, 0.05, 0.18, 0.1).sum() < 0.6 * 20 * 20
     free[20, 10:30] = True  # 1 m
-    grid = geodesic.navigation_grid(free, 0.05, (0, 0), 0.18, 0.1)
+    grid = geodesic.navigation_grid(free, 0.05, 0.18, 0.1)
     assert grid[:10].any() and grid[11:].any()
