@@ -18,6 +18,8 @@ class NavConfig:
 
     backend: str = "auto"
     """Physics: warp (MJX-Warp, NVIDIA), jax (MJX-JAX), native (C MuJoCo on CPU threads), or auto."""
+    control_mode: str = "native"
+    """What an action commands: a control mode of the robot; `native` is the original benchmark's."""
     num_objects: int = 10
     """Small objects strewn about at random each episode."""
     observations: tuple[str, ...] = OBSERVATIONS

@@ -176,9 +176,11 @@ class InteractiveNav(Env):
         """
         nav: NavInfo = state.info["nav"]
         action = jnp.where(jnp.isfinite(action), action, 0.0)
-        ctrl = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
+        command = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
         before: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        physics, signals = self.physics.step(nav.scene_index, before, ctrl)
+        physics, signals = self.physics.step(
+            nav.scene_index, before, command, nav.step_count * self.config.control_dt_s
+        )
         broken = signals.nonfinite > 0
         nav, rotation = self._advance(nav, physics, signals, broken)
 

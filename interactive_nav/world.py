@@ -35,6 +35,9 @@ class Layout:
     robot_qpos: int
     """Address of the robot's free joint in qpos (7 numbers)."""
     robot_qvel: int
+    robot_nq: int
+    """Numbers of the robot in qpos, from its free joint on."""
+    robot_nv: int
     slot_kind: tuple[str, ...]
     """Per movable slot: 'small', 'free' or 'hinge'."""
     slot_qpos: np.ndarray
@@ -253,9 +256,15 @@ def _layout(model: mujoco.MjModel, robot: RobotSpec, slots: list[tuple[str, str]
     joint = model.body_jntadr[base]
     subtree = [b for b in range(model.nbody) if b == base or model.body_rootid[b] == base]
     sensors = [model.sensor(f"force_{i}").adr[0] for i in range(len(slots))]
+    width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    own = [j for j in range(model.njnt) if model.jnt_bodyid[j] in subtree]
+    assert own == list(range(joint, joint + len(own))), "a robot's joints must follow its free joint"
+    sizes = [width.get(mujoco.mjtJoint(int(model.jnt_type[j])), (1, 1)) for j in own]
     return Layout(
         robot_qpos=int(model.jnt_qposadr[joint]),
         robot_qvel=int(model.jnt_dofadr[joint]),
+        robot_nq=sum(q for q, _ in sizes),
+        robot_nv=sum(v for _, v in sizes),
         slot_kind=tuple(kind for _, kind in slots),
         slot_qpos=np.asarray([model.jnt_qposadr[j] for j in joints], np.int32),
         slot_qvel=np.asarray([model.jnt_dofadr[j] for j in joints], np.int32),
@@ -272,6 +281,8 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
     x, y = parking_spot(layout.num_slots)
     adr = layout.robot_qpos
     data.qpos[adr : adr + 7] = [x, y, robot.spawn_height_m, 1, 0, 0, 0]
+    for name, value in robot.home_qpos:
+        data.qpos[model.joint(name).qposadr[0]] = value
     start = data.qpos.copy()
     steps = math.ceil(_SETTLE_TIME_S / model.opt.timestep)
     iterations = model.opt.iterations
@@ -283,7 +294,8 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
             data.qvel *= 0.8
     model.opt.iterations = iterations
     qpos = data.qpos.copy()
-    qpos[adr : adr + 7] = start[adr : adr + 7]
+    own = slice(adr, adr + layout.robot_nq)
+    qpos[own] = start[own]
     return qpos
 
 

@@ -6,7 +6,6 @@ with `jax.vmap` and a key for each, so that an episode does not depend on which 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +14,6 @@ import jax
 import jax.numpy as jnp
 
 from interactive_nav.robots import RobotSpec
-from interactive_nav.robots.turtlebot import HALF_TRACK_M, WHEEL_RADIUS_M
 from train.errors import TrainError
 
 PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
@@ -28,62 +26,35 @@ ALIGNED_RAD = jnp.pi / 3
 """Beyond this bearing the follower turns on the spot."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Drive:
-    """A differential drive: what turns speeds of the body into speeds of the wheels."""
-
-    wheel_radius_m: float
-    track_m: float
-    wheel_low_rad_s: float
-    """Wheel speed at action -1."""
-    wheel_high_rad_s: float
-    """Wheel speed at action +1."""
-
-
-def drive_of(robot: RobotSpec) -> Drive:
-    """The robot's drive.
-
-    Raises:
-        TrainError: not a robot on two wheels that is known here.
-    """
-    wheels = {"turtlebot": (WHEEL_RADIUS_M, 2 * HALF_TRACK_M)}
-    if robot.name not in wheels:
-        raise TrainError(
-            f"policy follower: robot is {robot.name!r}, expected one of {', '.join(wheels)}; leave it out of --policies"
-        )
-    return Drive(*wheels[robot.name], robot.action_low[0], robot.action_high[0])
-
-
 def random_policy(action_size: int, observation: jax.Array, key: jax.Array) -> jax.Array:
     """Uniform over all actions."""
     del observation
     return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
 
 
-def steer(drive: Drive, target_b: jax.Array) -> jax.Array:
-    """Wheel actions that lead to a point: turn towards it, and drive the faster the better aligned.
+def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
+    """Actions that lead to a point: turn towards it, and drive the faster the better aligned.
 
     Args:
-        drive: geometry and limits.
+        robot: in a control mode with a twist map.
         target_b: (2,) x forward, y left, m, robot frame.
 
     Returns:
-        (2,) left and right wheel in [-1, 1].
+        (A,) in [-1, 1].
     """
+    assert robot.twist is not None
     bearing = jnp.arctan2(target_b[1], target_b[0])
-    turn_rad_s = jnp.clip(TURN_GAIN_PER_S * bearing, -MAX_TURN_RAD_S, MAX_TURN_RAD_S)
-    speed_m_s = jnp.where(jnp.abs(bearing) < ALIGNED_RAD, CRUISE_M_S * jnp.cos(bearing), 0.0)
-    half_track_m = drive.track_m / 2
-    wheels_m_s = speed_m_s + turn_rad_s * jnp.array([-half_track_m, half_track_m])
-    span_rad_s = drive.wheel_high_rad_s - drive.wheel_low_rad_s
-    share = (wheels_m_s / drive.wheel_radius_m - drive.wheel_low_rad_s) / span_rad_s
-    return jnp.clip(2.0 * share - 1.0, -1.0, 1.0)
+    most = min(MAX_TURN_RAD_S, robot.twist.max_angular_rad_s)
+    cruise = min(CRUISE_M_S, robot.twist.max_linear_m_s)
+    turn_rad_s = jnp.clip(TURN_GAIN_PER_S * bearing, -most, most)
+    speed_m_s = jnp.where(jnp.abs(bearing) < ALIGNED_RAD, cruise * jnp.cos(bearing), 0.0)
+    return robot.drive(speed_m_s, turn_rad_s, jnp)
 
 
-def waypoint_follower(drive: Drive, waypoint: int, observation: jax.Array, key: jax.Array) -> jax.Array:
+def waypoint_follower(robot: RobotSpec, waypoint: int, observation: jax.Array, key: jax.Array) -> jax.Array:
     """Steers to one of the waypoints that lead the observation (numbers 2i and 2i + 1); sees no object."""
     del key
-    return steer(drive, observation[2 * waypoint : 2 * waypoint + 2])
+    return steer(robot, observation[2 * waypoint : 2 * waypoint + 2])
 
 
 def make_random(env: Any) -> PolicyFn:
@@ -95,16 +66,21 @@ def make_follower(env: Any) -> PolicyFn:
     """The yardstick that follows the shortest path.
 
     Raises:
-        TrainError: the observation has no waypoints, or the robot is not known here.
+        TrainError: the observation has no waypoints, or the robot's control mode takes no base velocity.
     """
     config = env.config
+    if env.robot.twist is None:
+        raise TrainError(
+            f"policy follower: robot '{env.robot.name}' takes no base velocity in control mode "
+            f"'{env.robot.control_mode}', expected one of its modes that does; leave it out of --policies"
+        )
     if "waypoints" not in config.observations:
         raise TrainError(
             f"policy follower: observations are {', '.join(config.observations)}, "
             "expected waypoints among them; leave it out of --policies"
         )
     waypoint = min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 1
-    return functools.partial(waypoint_follower, drive_of(env.robot), waypoint)
+    return functools.partial(waypoint_follower, env.robot, waypoint)
 
 
 def make_learned(act: Any) -> PolicyFn:

@@ -54,21 +54,26 @@ class Physics(abc.ABC):
     nv: int
 
     @abc.abstractmethod
-    def step_batch(self, scene: jax.Array, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, StepSignals]:
+    def step_batch(
+        self, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array
+    ) -> tuple[PhysicsState, StepSignals]:
         """Steps a batch by one control period.
 
         Args:
             scene: [N] i32 index of each environment's scene.
             state: leaves [N, ...].
-            ctrl: [N, nu] f32 actuator commands, held over the period.
+            command: [N, A] f32, held over the period; the robot's control law makes actuator controls of it.
+            time_s: [N] f32 since the start of the episode.
 
         Returns:
             The new state and the signals, leaves [N, ...].
         """
 
-    def step(self, scene: jax.Array, state: PhysicsState, ctrl: jax.Array) -> tuple[PhysicsState, StepSignals]:
+    def step(
+        self, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array | float = 0.0
+    ) -> tuple[PhysicsState, StepSignals]:
         """One environment's `step_batch`; under any number of `vmap`s all environments step in one call."""
-        return _step_single(self, scene, state, ctrl)
+        return _step_single(self, scene, state, command, jnp.asarray(time_s, jnp.float32))
 
 
 def _flatten(tree, outer: int, inner: int):
@@ -79,38 +84,36 @@ def _broadcast(tree, batched, size: int):
     return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
 
 
-def _step_many(physics: Physics, scene, state, ctrl):
+def _step_many(physics: Physics, *args):
     """`step_batch`, which a further vmap flattens into a larger batch."""
 
     @custom_batching.custom_vmap
-    def many(scene, state, ctrl):
-        return physics.step_batch(scene, state, ctrl)
+    def many(*args):
+        return physics.step_batch(*args)
 
     @many.def_vmap
-    def rule(axis_size, in_batched, scene, state, ctrl):
-        scene, state, ctrl = _broadcast((scene, state, ctrl), tuple(in_batched), axis_size)
-        inner = scene.shape[1]
-        flat = _flatten((scene, state, ctrl), axis_size, inner)
-        out = _step_many(physics, *flat)
+    def rule(axis_size, in_batched, *args):
+        args = _broadcast(args, tuple(in_batched), axis_size)
+        inner = args[0].shape[1]
+        out = _step_many(physics, *_flatten(args, axis_size, inner))
         out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
         return out, jax.tree.map(lambda _: True, out)
 
-    return many(scene, state, ctrl)
+    return many(*args)
 
 
-def _step_single(physics: Physics, scene, state, ctrl):
+def _step_single(physics: Physics, *args):
     @custom_batching.custom_vmap
-    def single(scene, state, ctrl):
-        out = _step_many(physics, *jax.tree.map(lambda x: x[None], (scene, state, ctrl)))
+    def single(*args):
+        out = _step_many(physics, *jax.tree.map(lambda x: x[None], args))
         return jax.tree.map(lambda x: x[0], out)
 
     @single.def_vmap
-    def rule(axis_size, in_batched, scene, state, ctrl):
-        args = _broadcast((scene, state, ctrl), tuple(in_batched), axis_size)
-        out = _step_many(physics, *args)
+    def rule(axis_size, in_batched, *args):
+        out = _step_many(physics, *_broadcast(args, tuple(in_batched), axis_size))
         return out, jax.tree.map(lambda _: True, out)
 
-    return single(scene, state, ctrl)
+    return single(*args)
 
 
 def summarise_forces(force_w: Any, xp: Any = jnp) -> tuple[Any, Any, Any]:

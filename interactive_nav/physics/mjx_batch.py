@@ -14,6 +14,7 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import World
 
 # Fields that only C MuJoCo reads, or that MJX derives again.
@@ -92,7 +93,7 @@ class MjxPhysics(Physics):
         self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
         self._slot_of_geom = _slot_of_geom(world, host)
 
-    def step_batch(self, scene, state, ctrl):
+    def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]
         if self.name == "warp":
             template = mjx.make_data(
@@ -101,32 +102,50 @@ class MjxPhysics(Physics):
         else:
             template = mjx.make_data(self._host, impl="jax")
 
-        def one(scene, state: PhysicsState, ctrl):
+        def control(data, command, time_s):
+            layout = self._world.layout
+            robot = RobotState(
+                data.qpos[layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
+                data.qvel[layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
+                time_s,
+            )
+            ctrl = self._world.robot.controls(command, robot, jnp)
+            return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
+
+        every = self._world.robot.control_every_substep
+        dt = self._host.opt.timestep
+
+        def one(scene, state: PhysicsState, command, time_s):
             model = self._model.replace(**{k: table[scene] for k, table in self._tables.items()})
-            data = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
+            data = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
+            data = control(data, command, time_s)
             if self._static_pose is not None:
                 xpos, xmat = self._static_pose
                 data = data.replace(geom_xpos=xpos[scene], geom_xmat=xmat[scene])
             if self.name == "jax":
 
-                def substep(data, _):
+                def substep(data, k):
+                    if every:
+                        data = control(data, command, time_s + k * dt)
                     data = mjx.step(model, data)
                     return data, self._forces_from_contacts(data)
 
-                data, forces = jax.lax.scan(substep, data, None, length=self._substeps)
+                data, forces = jax.lax.scan(substep, data, jnp.arange(self._substeps))
                 overflow = jnp.asarray(0, jnp.int32)
             else:
                 # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's
                 # carry cannot.
                 collected, overflow = [], jnp.asarray(0, jnp.int32)
-                for _ in range(self._substeps):
+                for k in range(self._substeps):
+                    if every and k:
+                        data = control(data, command, time_s + k * dt)
                     data = mjx.step(model, data)
                     collected.append(data.sensordata[self._sensors])
                     overflow |= self._overflowed(data)
                 forces = jnp.stack(collected)
             return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), forces, overflow
 
-        new, forces, overflow = jax.vmap(one)(scene, state, ctrl)
+        new, forces, overflow = jax.vmap(one)(scene, state, command, time_s)
         force_n, slot_n, structure_n = summarise_forces(forces)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
         return new, StepSignals(

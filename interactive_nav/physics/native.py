@@ -16,6 +16,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import World
 
 _ENGINE_FAILURES = (
@@ -49,6 +50,7 @@ class NativePhysics(Physics):
         self._substeps = substeps
         self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
         self._slots = world.layout.num_slots
+        self._robot, self._layout = world.robot, world.layout
         self._threads, self._sleep = threads, sleep
         self._models = tuple(copy.copy(m) for m in world.models)
         for model in self._models:
@@ -58,7 +60,7 @@ class NativePhysics(Physics):
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         self._pools: dict[int, _Pool] = {}
 
-    def step_batch(self, scene, state, ctrl):
+    def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]
         f32, i32 = jnp.float32, jnp.int32
         shapes = (
@@ -75,10 +77,10 @@ class NativePhysics(Physics):
                 nonfinite=jax.ShapeDtypeStruct((n,), i32),
             ),
         )
-        return jax.pure_callback(self._step_host, shapes, scene, state, ctrl, vmap_method="sequential")
+        return jax.pure_callback(self._step_host, shapes, scene, state, command, time_s, vmap_method="sequential")
 
-    def _step_host(self, scene, state: PhysicsState, ctrl):
-        scene, ctrl = np.asarray(scene), np.asarray(ctrl)
+    def _step_host(self, scene, state: PhysicsState, command, time_s):
+        scene, command, time_s = np.asarray(scene), np.nan_to_num(np.asarray(command)), np.asarray(time_s)
         qpos, qvel = np.asarray(state.qpos), np.asarray(state.qvel)
         size = len(scene)
         pool = self._pools.get(size)
@@ -97,9 +99,8 @@ class NativePhysics(Physics):
             good = fresh[finite[fresh]]
             pool.state_qpos[good], pool.state_qvel[good] = qpos[good], qvel[good]
             pool.state_warm[good] = np.asarray(state.qacc_warmstart)[good]
-        pool.state_ctrl[:] = np.nan_to_num(ctrl)
         batch.warning[:] = 0
-        sensed = batch.rollout(self._substeps, record=("sensordata",))["sensordata"]
+        sensed = self._advance(pool, command, time_s)
         raised = batch.warning[:, :, 1] > 0
         new_qpos, new_qvel = pool.state_qpos.astype(np.float32), pool.state_qvel.astype(np.float32)
         finite &= np.isfinite(new_qpos).all(1) & np.isfinite(new_qvel).all(1)
@@ -117,3 +118,19 @@ class NativePhysics(Physics):
                 nonfinite=nonfinite.astype(np.int32),
             ),
         )
+
+    def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        """Runs the substeps; [N, substeps, sensors] readings."""
+        rounds = self._substeps if self._robot.control_every_substep else 1
+        sensed = []
+        for k in range(rounds):
+            layout = self._layout
+            robot = RobotState(
+                pool.state_qpos[:, layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
+                pool.state_qvel[:, layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
+                time_s + k * self._models[0].opt.timestep,
+            )
+            pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
+            record = pool.batch.rollout(self._substeps // rounds, record=("sensordata",))
+            sensed.append(record["sensordata"])
+        return np.concatenate(sensed, 1)

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.robots.turtlebot import turtlebot
 
-_FACTORIES: dict[str, Callable[[], RobotSpec]] = {"turtlebot": turtlebot}
+_FACTORIES: dict[str, Callable[[str], RobotSpec]] = {"turtlebot": turtlebot}
+"""Name -> control mode -> spec."""
 
 
 def robot_names() -> tuple[str, ...]:
@@ -16,17 +17,21 @@ def robot_names() -> tuple[str, ...]:
     return tuple(sorted(_FACTORIES))
 
 
-def get_robot(name: str) -> RobotSpec:
+def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
     """The robot's spec.
 
+    Args:
+        name: one of `robot_names()`.
+        control_mode: one of the robot's `control_modes`; `native` is the original benchmark's action.
+
     Raises:
-        ValueError: unknown name; the message lists the known ones.
+        ValueError: unknown name or mode; the message lists the known ones.
     """
     if name not in _FACTORIES:
         near = difflib.get_close_matches(str(name), _FACTORIES, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise ValueError(f"unknown robot '{name}'; {hint}known robots: {', '.join(robot_names())}")
-    return _FACTORIES[name]()
+    return _FACTORIES[name](control_mode)
 
 
 __all__ = ["RobotSpec", "get_robot", "robot_names"]

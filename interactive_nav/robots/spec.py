@@ -4,14 +4,58 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 
+class RobotState(NamedTuple):
+    """The robot's part of the physics state that a control law may read; leading batch axes as the caller has them."""
+
+    qpos: Any
+    """[..., robot nq]: free joint (position, quaternion w x y z), then the robot's other joints in order."""
+    qvel: Any
+    """[..., robot nv]: linear velocity (world), angular velocity (body), then the joints'."""
+    time_s: Any
+    """[...] since the start of the episode."""
+
+
+ControlLaw = Callable[[Any, RobotState, Any], Any]
+"""(command [..., A], state, numpy or jax.numpy) -> actuator controls [..., nu]; pure, batched by its leading axes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """The camera that images are rendered from; it looks along the body's x axis, world z kept up."""
+
+    body: str
+    pos_m: tuple[float, float, float]
+    """In the body's frame."""
+    pitch_rad: float = 0.0
+    """Positive looks down."""
+    fov_deg: float = 120.0
+    """Vertical field of view of the interactive task (reference benchmark, section 1.3)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TwistMap:
+    """How commands make the base move: what scripted drivers and planners need."""
+
+    matrix: tuple[tuple[float, float], ...]
+    """[A, 2]: command = matrix @ (linear m/s, angular rad/s); commands that are no part of driving have zero rows."""
+    max_linear_m_s: float
+    max_angular_rad_s: float
+
+
+def wheel_twist(wheel_radius_m: float, track_m: float, sides: tuple[int, ...]) -> tuple[tuple[float, float], ...]:
+    """Rows of a `TwistMap.matrix` for wheels on the left (-1) and right (+1) of a differential or skid-steer drive."""
+    return tuple((1.0 / wheel_radius_m, side * track_m / (2.0 * wheel_radius_m)) for side in sides)
+
+
 @dataclasses.dataclass(frozen=True)
 class RobotSpec:
-    """A robot: its MJCF and the figures that the task needs. Frame: x forward, y left, z up."""
+    """A robot under one control mode: its MJCF and the figures that the task needs. Frame: x forward, y left, z up."""
 
     name: str
     add_to: Callable[[mujoco.MjSpec], None]
@@ -20,9 +64,9 @@ class RobotSpec:
     """Body whose free joint is the robot's pose; its subtree is 'the robot' for contact forces."""
     base_joint: str
     actuators: tuple[str, ...]
-    """One per action, in order."""
+    """The model's actuators, in order."""
     action_low: tuple[float, ...]
-    """Command at action -1, per actuator, in the actuator's unit."""
+    """Command at action -1, one per action, in the command's unit."""
     action_high: tuple[float, ...]
     """Command at action +1."""
     body_width_m: float
@@ -33,13 +77,51 @@ class RobotSpec:
     """Top of the body above the floor."""
     spawn_height_m: float
     """Height of the base frame above the floor when the robot stands."""
+    camera: Camera
+    action_names: tuple[str, ...] = ()
+    """What each action commands, with its unit; by default the actuators."""
+    home_qpos: tuple[tuple[str, float], ...] = ()
+    """Joint -> position at the start of an episode; joints that are not named start at their model's zero."""
+    rolling_bodies: tuple[str, ...] = ()
+    """Wheels and casters: bodies whose contacts the original's code did not count."""
+    control_mode: str = "native"
+    control_modes: tuple[str, ...] = ("native",)
+    """Modes that `get_robot(name, mode)` answers."""
+    control: ControlLaw | None = None
+    """Command to actuator controls; none: the command is the controls."""
+    control_every_substep: bool = False
+    """The control law runs at every physics step, not once a control period."""
+    twist: TwistMap | None = None
+    """None: scripted drivers cannot drive this mode."""
 
     @property
     def action_size(self) -> int:
         """Number of actions."""
-        return len(self.actuators)
+        return len(self.action_low)
 
     def command(self, action, xp=np):
-        """Maps actions [..., A] in [-1, 1] (clipped) affinely to actuator commands [..., A]."""
+        """Maps actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
         low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
         return low + 0.5 * (xp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
+
+    def action(self, command, xp=np):
+        """The inverse of `command`: actions [..., A], clipped to [-1, 1]."""
+        low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
+        return xp.clip(2.0 * (xp.asarray(command) - low) / (high - low) - 1.0, -1.0, 1.0)
+
+    def controls(self, command, state: RobotState, xp=np):
+        """Actuator controls [..., nu] for commands [..., A]."""
+        return command if self.control is None else self.control(command, state, xp)
+
+    def drive(self, linear_m_s, angular_rad_s, xp=np):
+        """Actions [..., A] that ask the base for a velocity.
+
+        Raises:
+            ValueError: this control mode has no twist map.
+        """
+        if self.twist is None:
+            raise ValueError(
+                f"robot '{self.name}' in control mode '{self.control_mode}' takes no base velocity; "
+                f"choose another of its modes: {', '.join(self.control_modes)}"
+            )
+        return self.action(xp.stack([linear_m_s, angular_rad_s], -1) @ xp.asarray(self.twist.matrix).T, xp)

@@ -12,13 +12,14 @@ import math
 
 import mujoco
 
-from interactive_nav.robots.spec import RobotSpec
+from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap, wheel_twist
 
 WHEEL_RADIUS_M = 0.0352
 HALF_TRACK_M = 0.115
 WHEEL_TORQUE_NM = 1.0
 BODY_RADIUS_M = 0.176
 WHEEL_SPEED_RAD_S = (-12.5, 25.0)
+CAMERA_POS_M = (-0.087, -0.0125, 0.272)
 _VELOCITY_GAIN = 0.15
 """N m s/rad, ours: the torque limit is reached at a speed error of 6.7 rad/s."""
 
@@ -31,7 +32,7 @@ def _add_to(spec: mujoco.MjSpec) -> None:
     base.mass = 2.473
     base.ipos = [0.01, 0.0, 0.0697]
     base.inertia = [0.0200, 0.0200, 0.0368]
-    base.add_site(name="turtlebot_eyes", pos=[-0.087, -0.0125, 0.272], size=[0.005] * 3)
+    base.add_site(name="turtlebot_eyes", pos=list(CAMERA_POS_M), size=[0.005] * 3)
 
     def collide(name: str, **kwargs) -> None:
         base.add_geom(name=name, group=3, mass=0.0, friction=[0.3, 0.005, 0.0001], condim=3, **kwargs)
@@ -105,18 +106,47 @@ def _add_to(spec: mujoco.MjSpec) -> None:
         )
 
 
-def turtlebot() -> RobotSpec:
-    """TurtleBot v2's spec: two wheel velocities, left then right."""
+_MODES = ("native", "twist")
+
+
+def turtlebot(control_mode: str = "native") -> RobotSpec:
+    """TurtleBot v2's spec.
+
+    Args:
+        control_mode: `native`, two wheel velocities, left then right; or `twist`, linear and angular
+            velocity of the base.
+
+    Raises:
+        ValueError: unknown mode.
+    """
+    if control_mode not in _MODES:
+        raise ValueError(f"robot 'turtlebot' has no control mode '{control_mode}'; it has {', '.join(_MODES)}")
+    wheels = wheel_twist(WHEEL_RADIUS_M, 2 * HALF_TRACK_M, (-1, 1))
+    low, high = (v * WHEEL_RADIUS_M for v in WHEEL_SPEED_RAD_S)
+    turn = -low / HALF_TRACK_M
+    native = control_mode == "native"
+
+    def mix(command, state, xp):
+        del state
+        return command @ xp.asarray(wheels).T
+
     return RobotSpec(
         name="turtlebot",
         add_to=_add_to,
         base_body="turtlebot",
         base_joint="turtlebot_free",
         actuators=("turtlebot_wheel_left", "turtlebot_wheel_right"),
-        action_low=(WHEEL_SPEED_RAD_S[0],) * 2,
-        action_high=(WHEEL_SPEED_RAD_S[1],) * 2,
+        action_low=(WHEEL_SPEED_RAD_S[0],) * 2 if native else (low, -turn),
+        action_high=(WHEEL_SPEED_RAD_S[1],) * 2 if native else (high, turn),
+        action_names=("left wheel rad/s", "right wheel rad/s") if native else ("forward m/s", "turn rad/s"),
         body_width_m=0.333,
         footprint_radius_m=0.18,
         height_m=0.41,
         spawn_height_m=0.0,
+        camera=Camera("turtlebot", CAMERA_POS_M),
+        rolling_bodies=("turtlebot_wheel_left", "turtlebot_wheel_right"),
+        control_mode=control_mode,
+        control_modes=_MODES,
+        control=None if native else mix,
+        twist=TwistMap(wheels if native else ((1.0, 0.0), (0.0, 1.0)), high, turn),
     )

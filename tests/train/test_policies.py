@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from interactive_nav.robots import get_robot
+from interactive_nav.robots.spec import TwistMap, wheel_twist
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.errors import TrainError
-from train.policies import Drive, drive_of, make_follower, make_random, steer
+from train.policies import make_follower, make_random, steer
 from train.rollout import episode_keys, run_episodes
 
 # Wheel radius 0.05 m, track 0.2 m, action -1 .. 1 is -10 .. 30 rad/s: action = (w - 10) / 20.
-DRIVE = Drive(0.05, 0.2, -10.0, 30.0)
+ROBOT = dataclasses.replace(
+    get_robot("turtlebot"),
+    action_low=(-10.0, -10.0),
+    action_high=(30.0, 30.0),
+    twist=TwistMap(wheel_twist(0.05, 0.2, (-1, 1)), 1.5, 5.0),
+)
 
 
 @pytest.mark.parametrize(
@@ -32,13 +40,21 @@ DRIVE = Drive(0.05, 0.2, -10.0, 30.0)
 )
 def test_steering_by_hand(target_b, wheels_rad_s):
     expected = (np.array(wheels_rad_s) - 10.0) / 20.0
-    np.testing.assert_allclose(steer(DRIVE, jnp.asarray(target_b)), expected, atol=1e-5)
+    np.testing.assert_allclose(steer(ROBOT, jnp.asarray(target_b)), expected, atol=1e-5)
 
 
-def test_drive_of_turtlebot():
-    drive = drive_of(get_robot("turtlebot"))
-    assert drive.track_m == pytest.approx(0.23) and drive.wheel_radius_m == pytest.approx(0.0352)
-    assert (drive.wheel_low_rad_s, drive.wheel_high_rad_s) == (-12.5, 25.0)
+def test_a_slow_robot_is_not_asked_for_more_than_it_can():
+    slow = dataclasses.replace(ROBOT, twist=TwistMap(wheel_twist(0.05, 0.2, (-1, 1)), 0.25, 1.0))
+    # Straight ahead at 0.25 m/s: 5 rad/s; on the spot at 1 rad/s: -+0.1 / 0.05 = -+2 rad/s.
+    np.testing.assert_allclose(steer(slow, jnp.array([1.0, 0.0])), [-0.25, -0.25], atol=1e-6)
+    np.testing.assert_allclose(steer(slow, jnp.array([0.0, 1.0])), [-0.6, -0.4], atol=1e-6)
+
+
+def test_follower_of_a_robot_without_a_base_velocity_is_refused():
+    env = ToyEnv()
+    env.robot = dataclasses.replace(env.robot, twist=None)
+    with pytest.raises(TrainError, match="takes no base velocity"):
+        make_follower(env)
 
 
 def test_follower_looks_at_the_waypoint_0_4_m_ahead():
