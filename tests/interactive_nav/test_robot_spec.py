@@ -10,6 +10,7 @@ import pytest
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
+from interactive_nav.robots.spec import RobotState
 from interactive_nav.scene import load_scene
 from interactive_nav.world import build_world
 from tests.toys import write_room
@@ -32,7 +33,7 @@ def test_turtlebot_drives_by_hand():
 def test_twist_mode_makes_the_same_wheel_speeds():
     native, twist = get_robot("turtlebot"), get_robot("turtlebot", "twist")
     v, w = np.array([0.3, -0.2, 0.0]), np.array([0.5, -1.0, 2.0])
-    wheels = twist.controls(twist.command(twist.drive(v, w)), None)
+    wheels = twist.controls(twist.command(twist.drive(v, w)), RobotState(None, None, None))
     np.testing.assert_allclose(wheels, native.command(native.drive(v, w)), atol=1e-9)
 
 
