@@ -56,6 +56,14 @@ class NavConfig:
     """MJX-Warp contact slots per env; 0: measured when the environment is built, with head room."""
     constraints_per_env: int = 0
     """MJX-Warp constraint rows per env; 0: measured likewise."""
+    active_furniture: int = 8
+    """MJX backends: pieces of furniture simulated at a time, the nearest to the robot; 0: all."""
+    active_small: int = 6
+    """MJX backends: small objects simulated at a time; 0: all."""
+    active_doors: int = 3
+    """MJX backends: doors simulated at a time; 0: all."""
+    active_walls: int = 40
+    """MJX backends: wall boxes that can be met at a time; 0: all."""
     sleep: bool = True
     """Native backend: objects at rest sleep until touched."""
     threads: int = 0
@@ -76,7 +84,17 @@ class NavConfig:
         for field in ("episode_steps", "num_waypoints", "max_goals", "solver_iterations"):
             if getattr(self, field) < 1:
                 refuse(field, "at least 1")
-        for field in ("num_objects", "contacts_per_env", "constraints_per_env", "threads", "k_int"):
+        for field in (
+            "num_objects",
+            "contacts_per_env",
+            "constraints_per_env",
+            "threads",
+            "k_int",
+            "active_furniture",
+            "active_small",
+            "active_doors",
+            "active_walls",
+        ):
             if not getattr(self, field) >= 0:
                 refuse(field, "0 or more")
         for field in ("control_dt_s", "sim_dt_s", "waypoint_spacing_m", "nav_cell_m", "max_goal_distance_m"):

@@ -23,6 +23,7 @@ PARKING_W = (200.0, 200.0)
 """World x, y of the first parking spot; far outside any building."""
 _PARKING_STEP_M = 3.0
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
+_TILTED = np.array([0.8, 0.36, 0.48, 0.0])
 _SETTLE_TIME_S = 3.0
 FLOOR_FRICTION = 0.05
 """Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
@@ -123,11 +124,15 @@ def _add_movable(
     x, y = parking_spot(park)
     if movable is None:
         body = spec.worldbody.add_body(name=name, pos=[x, y, 2.0])
-        mass, inertia, com, iquat = 1.0, np.full(3, 0.01), np.zeros(3), np.array([1.0, 0, 0, 0])
+        # Off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the
+        # models' structure must be equal.
+        mass, inertia, com, iquat = 1.0, np.array([0.01, 0.012, 0.014]), np.full(3, 1e-3), _TILTED
         boxes, friction = np.zeros((0, 10)), 0.5
     else:
         body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w)
         mass, inertia, com, iquat = movable.mass_kg, movable.inertia, movable.com_m, movable.inertia_quat
+        if np.abs(com).max() < 1e-6:
+            com = com + 1e-6
         boxes, friction = movable.boxes, movable.friction
     if padded:
         # An empty slot floats in place. The tiny value keeps the models' structure equal.
@@ -142,7 +147,8 @@ def _add_movable(
         joint.limited = True
         joint.range = hinge.range_rad if hinge and hinge.range_rad else (-math.pi, math.pi)
         joint.damping = [hinge.damping if hinge else 0.1, 0, 0]
-        joint.frictionloss = hinge.frictionloss if hinge else 0.0
+        # Not 0: MJX-JAX makes a row of constraints only for joints whose model has friction.
+        joint.frictionloss = hinge.frictionloss if hinge else 1e-6
     else:
         body.add_freejoint(name=f"{name}_joint")
     if collision == "hulls" and movable is not None and movable.hulls:
@@ -181,14 +187,8 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> N
         )
 
 
-def _build_spec(
-    robot: RobotSpec,
-    scene_index: int,
-    scenes: tuple[Scene, ...],
-    small: tuple[SmallObject, ...],
-    config: NavConfig,
-) -> tuple[mujoco.MjSpec, list[tuple[str, str]]]:
-    """The padded spec of one scene, and the movable slots as (body name, kind)."""
+def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
+    """Physics options, the floor and the robot."""
     spec = mujoco.MjSpec()
     spec.modelname = "interactive_nav"
     spec.compiler.degree = False
@@ -207,6 +207,42 @@ def _build_spec(
         friction=[FLOOR_FRICTION, 0.005, 0.0001],
     )
     robot.add_to(spec)
+    return spec
+
+
+def build_empty_spec(
+    robot: RobotSpec, slots: tuple[tuple[str, int], ...], n_walls: int, config: NavConfig
+) -> tuple[mujoco.MjSpec, mujoco.MjModel, Layout]:
+    """A model whose movable slots and walls are all empty: its numbers are filled in per environment.
+
+    Args:
+        robot: the robot's spec.
+        slots: (kind, number of boxes) of each movable slot.
+        n_walls: wall boxes.
+        config: the environment's settings.
+
+    Returns:
+        Spec, compiled model and its layout, with sensors as `build_world`'s models have them.
+    """
+    spec = _empty_spec(robot, config)
+    named = [(f"{kind}_{i}", kind) for i, (kind, _) in enumerate(slots)]
+    for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
+        _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
+    _add_structure(spec, np.zeros((0, 10)), n_walls)
+    _add_sensors(spec, robot, named)
+    model = spec.compile()
+    return spec, model, _layout(model, robot, named)
+
+
+def _build_spec(
+    robot: RobotSpec,
+    scene_index: int,
+    scenes: tuple[Scene, ...],
+    small: tuple[SmallObject, ...],
+    config: NavConfig,
+) -> tuple[mujoco.MjSpec, list[tuple[str, str]]]:
+    """The padded spec of one scene, and the movable slots as (body name, kind)."""
+    spec = _empty_spec(robot, config)
     slots: list[tuple[str, str]] = []
     for i, obj in enumerate(small):
         name = f"{obj.category}_small_{i}"
@@ -220,18 +256,25 @@ def _build_spec(
             name = f"{kind}_{i}"
             _add_movable(spec, name, column[scene_index], n_boxes, kind, len(slots), config.collision, None in column)
             slots.append((name, kind))
+    _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
+    _add_sensors(spec, robot, slots)
+    return spec, slots
+
+
+def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
     structure = spec.worldbody.add_body(name="structure")
-    walls = scenes[scene_index].walls
-    for i in range(max(len(s.walls) for s in scenes)):
+    for i in range(count):
         row = walls[i] if i < len(walls) else _EMPTY_BOX + np.array([0, 0, -5.0 - 0.01 * i, 0, 0, 0, 0, 0, 0, 0])
         _add_box(structure, row, f"wall_{i}", 0.5)
+
+
+def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]]) -> None:
     for i, (name, kind) in enumerate(slots):
         _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
         if kind == "hinge":
             # A door leaf hangs in its frame: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
     _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
-    return spec, slots
 
 
 def _add_force_sensor(spec: mujoco.MjSpec, robot_body: str, other: str, name: str) -> None:

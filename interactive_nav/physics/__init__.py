@@ -44,13 +44,9 @@ def make_physics(world: World, config: NavConfig) -> Physics:
         from interactive_nav.physics.native import NativePhysics
 
         return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads)
-    from interactive_nav.physics.mjx_batch import MjxPhysics, measure_buffers
+    from interactive_nav.physics.mjx_batch import MjxPhysics
 
-    contacts, constraints = config.contacts_per_env, config.constraints_per_env
-    if backend == "warp" and not (contacts and constraints):
-        measured = measure_buffers(world)
-        contacts, constraints = contacts or measured[0], constraints or measured[1]
-    return MjxPhysics(world, config.substeps, backend, contacts, constraints)
+    return MjxPhysics(world, config, backend)
 
 
 __all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

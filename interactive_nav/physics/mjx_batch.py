@@ -1,8 +1,8 @@
 """MuJoCo MJX, both of its implementations: `warp` (NVIDIA) and `jax` (any XLA device).
 
-Scenes differ only in model fields, which are stacked once as [scene, ...] tables; each environment takes
-its scene's rows. The engine's data is rebuilt from a template at every control step, so only
-`PhysicsState` is carried.
+Environments differ only in model fields: each fills the slots of one small model from its scene's tables
+(`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState`
+is carried.
 """
 
 from __future__ import annotations
@@ -13,85 +13,38 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.world import World
-
-# Fields that only C MuJoCo reads, or that MJX derives again.
-_UNUSED_BY_MJX = {
-    "bvh_aabb",
-    "dof_M0",
-    "dof_length",
-    "body_sameframe",
-    "geom_sameframe",
-    "body_simple",
-    "dof_simplenum",
-    "bvh_nodeid",
-    "bvh_child",
-    "bvh_depth",
-}
-BATCHABLE = frozenset(
-    {
-        *("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb", "geom_friction"),
-        *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
-        *("body_subtreemass", "body_invweight0", "body_gravcomp"),
-        *("dof_invweight0", "dof_damping", "dof_frictionloss"),
-        *("jnt_axis", "jnt_pos", "jnt_range", "qpos0", "qpos_spring"),
-    }
-)
-"""Model fields that may differ between scenes under one compiled program."""
-
-
-def differing_fields(models: tuple[mujoco.MjModel, ...]) -> tuple[str, ...]:
-    """Names of model arrays that differ between models of equal structure.
-
-    Raises:
-        ValueError: two models differ in shape, or in a field that cannot be batched.
-    """
-    first, names = models[0], []
-    for name in dir(first):
-        value = None if name.startswith("_") else getattr(first, name, None)
-        if not isinstance(value, np.ndarray) or name in _UNUSED_BY_MJX:
-            continue
-        others = [getattr(m, name) for m in models[1:]]
-        if any(o.shape != value.shape for o in others):
-            raise ValueError(f"model field {name} has shapes {[value.shape, *[o.shape for o in others]]}, expected one")
-        if any(not np.array_equal(o, value) for o in others):
-            if name not in BATCHABLE:
-                raise ValueError(f"model field {name} differs between scenes, but MJX cannot batch it")
-            names.append(name)
-    return tuple(names)
+from interactive_nav.world import Layout, World
 
 
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap."""
 
-    def __init__(self, world: World, substeps: int, impl: str, contacts_per_env: int, constraints_per_env: int):
+    def __init__(self, world: World, config: NavConfig, impl: str):
         self.name = impl
-        self._world, self._substeps = world, substeps
-        self.contacts_per_env, self.constraints_per_env = contacts_per_env, constraints_per_env
-        host = world.models[0]
-        self.nq, self.nv = host.nq, host.nv
+        self.window = Window(world, config)
+        self._world, self._substeps = world, config.substeps
+        self.nq, self.nv = world.models[0].nq, world.models[0].nv
+        self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
+        if impl == "warp" and not (self.contacts_per_env and self.constraints_per_env):
+            measured = measure_buffers(world, self.window)
+            self.contacts_per_env = self.contacts_per_env or measured[0]
+            self.constraints_per_env = self.constraints_per_env or measured[1]
+        host = self.window.model
         if impl == "jax":
             # MJX-JAX has no contact sensors between bodies: forces are summed from its contacts instead.
-            host = _without_sensors(world.specs[0])
+            host = _without_sensors(self.window.spec)
         self._host = host
         self._model = mjx.put_model(host, impl=impl)
         if impl == "warp":
             # Warp prints a line per overflow or unconverged solve: ours are counted instead.
             self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
-        self._fields = differing_fields(world.models)
-        self._tables = {
-            name: jnp.asarray(np.stack([np.asarray(getattr(m, name), np.float32) for m in world.models])).reshape(
-                (len(world.models), *getattr(self._model, name).shape)
-            )
-            for name in self._fields
-        }
-        # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model that it
-        # is given: with several scenes each environment needs its own scene's.
-        self._static_pose = _geom_poses(world.models) if impl == "warp" and len(world.models) > 1 else None
-        self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
-        self._slot_of_geom = _slot_of_geom(world, host)
+        layout = self.window.layout
+        self._sensors = layout.force_sensors[:, None] + np.arange(3)
+        self._slot_of_geom = _slot_of_geom(layout, host)
 
     def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]
@@ -103,7 +56,7 @@ class MjxPhysics(Physics):
             template = mjx.make_data(self._host, impl="jax")
 
         def control(data, command, time_s):
-            layout = self._world.layout
+            layout = self.window.layout
             robot = RobotState(
                 data.qpos[layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
                 data.qvel[layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
@@ -112,16 +65,24 @@ class MjxPhysics(Physics):
             ctrl = self._world.robot.controls(command, robot, jnp)
             return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
 
+        window = self.window
         every = self._world.robot.control_every_substep
         dt = self._host.opt.timestep
 
         def one(scene, state: PhysicsState, command, time_s):
-            model = self._model.replace(**{k: table[scene] for k, table in self._tables.items()})
-            data = template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
+            chosen, walls, missed = window.select(scene, state)
+            fields = window.fields(scene, chosen, walls)
+            model = self._model.replace(
+                **{name: value.reshape(getattr(self._model, name).shape) for name, value in fields.items()}
+            )
+            inner = window.enter(state, chosen)
+            data = template.replace(qpos=inner.qpos, qvel=inner.qvel, qacc_warmstart=inner.qacc_warmstart)
+            if self.name == "warp":
+                # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model
+                # that it is given: each environment needs its own.
+                xpos, xmat = window.static_poses(scene, walls)
+                data = data.replace(geom_xpos=xpos, geom_xmat=xmat)
             data = control(data, command, time_s)
-            if self._static_pose is not None:
-                xpos, xmat = self._static_pose
-                data = data.replace(geom_xpos=xpos[scene], geom_xmat=xmat[scene])
             if self.name == "jax":
 
                 def substep(data, k):
@@ -143,7 +104,8 @@ class MjxPhysics(Physics):
                     collected.append(data.sensordata[self._sensors])
                     overflow |= self._overflowed(data)
                 forces = jnp.stack(collected)
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), forces, overflow
+            out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
+            return out, window.spread_forces(forces, chosen), overflow | missed
 
         new, forces, overflow = jax.vmap(one)(scene, state, command, time_s)
         force_n, slot_n, structure_n = summarise_forces(forces)
@@ -193,23 +155,11 @@ class MjxPhysics(Physics):
         return out
 
 
-def _geom_poses(models: tuple[mujoco.MjModel, ...]) -> tuple[jax.Array, jax.Array]:
-    """World poses of all geoms at `qpos0`, per scene: positions [S, ngeom, 3] and matrices [S, ngeom, 3, 3]."""
-    positions, matrices = [], []
-    for model in models:
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        positions.append(data.geom_xpos.copy())
-        matrices.append(data.geom_xmat.reshape(-1, 3, 3).copy())
-    return jnp.asarray(np.stack(positions), jnp.float32), jnp.asarray(np.stack(matrices), jnp.float32)
-
-
 _ROBOT = -2
 
 
-def _slot_of_geom(world: World, model: mujoco.MjModel) -> np.ndarray:
+def _slot_of_geom(layout: Layout, model: mujoco.MjModel) -> np.ndarray:
     """[ngeom] movable slot of each geom; M for the structure, `_ROBOT` for the robot, -1 for the floor."""
-    layout = world.layout
     slot_of_body = np.full(model.nbody, -1)
     slot_of_body[layout.slot_body] = np.arange(layout.num_slots)
     slot_of_body[layout.structure_body] = layout.num_slots
@@ -224,11 +174,12 @@ def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return spec.compile()
 
 
-def measure_buffers(world: World, head_room: float = 1.6) -> tuple[int, int]:
-    """Contact slots and constraint rows per environment that the scenes need, measured at rest.
+def measure_buffers(world: World, window: Window, head_room: float = 1.6) -> tuple[int, int]:
+    """Contact slots and constraint rows per environment that the window needs, measured at rest.
 
-    The small objects are laid out on the floor, everything else rests; `head_room` leaves place for a
-    robot that pushes objects into each other. What overflows all the same is counted in the metrics.
+    Everything rests, the small objects laid out on the floor; the window holds the bodies with the most
+    contacts. `head_room` leaves place for a robot that pushes objects into each other. What overflows
+    all the same is counted in the metrics.
 
     Returns:
         (contacts, constraint rows) per environment.
@@ -238,7 +189,20 @@ def measure_buffers(world: World, head_room: float = 1.6) -> tuple[int, int]:
         data = mujoco.MjData(model)
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
-        contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+        per_body = np.bincount(model.geom_bodyid[data.contact.geom].ravel(), minlength=model.nbody)
+        dims = int(data.contact.dim.max(initial=3))
+        slots = [np.sort(per_body[world.layout.slot_body[g.slots]])[::-1][: g.width].sum() for g in window.groups]
+        own = int(sum(slots)) + int(per_body[world.layout.robot_bodies].sum())
+        contacts = max(contacts, own)
+        rows = max(rows, own * max(2 * (dims - 1), 1) + (data.nefc - data.ne - _contact_rows(data)))
     extra = 24
     contacts, rows = int(contacts * head_room) + extra, int(rows * head_room) + 4 * extra
     return contacts, -(-rows // 16) * 16
+
+
+def _contact_rows(data: mujoco.MjData) -> int:
+    kinds = [
+        int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS),
+        int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
+    ]
+    return int(np.isin(data.efc_type, kinds).sum())

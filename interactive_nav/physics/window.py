@@ -1,0 +1,291 @@
+"""A `World` in, the part of it that can move near a robot out: what MJX steps instead of the whole building.
+
+Objects at rest far from the robot stay where they are, so only the nearest ones need to be simulated. C
+MuJoCo leaves the others out by letting them sleep; MJX steps every body of its model, and its cost grows
+with the number of bodies, contacts and pairs of boxes. Here the model has a few empty slots and walls, and at
+every control step each environment fills them with what is nearest to its robot. All slots at once give the
+whole building.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from interactive_nav.config import NavConfig
+from interactive_nav.physics.base import PhysicsState
+from interactive_nav.world import World, build_empty_spec
+
+REACH_M = 0.6
+"""An object left out of the window although it is this near to the robot's footprint counts as missed."""
+_MOVING_M_S = 0.02
+_MOVING_BONUS_M = 2.0
+"""Moving objects rank as if they were this much nearer."""
+_FAR_M = 1e6
+
+_BODY = (
+    *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
+    *("body_subtreemass", "body_invweight0", "body_gravcomp"),
+)
+_GEOM = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb", "geom_friction")
+_JOINT = ("jnt_axis", "jnt_pos", "jnt_range")
+_DOF = ("dof_invweight0", "dof_damping", "dof_frictionloss")
+_QPOS = ("qpos0", "qpos_spring")
+FIELDS = (*_BODY, *_GEOM, *_JOINT, *_DOF, *_QPOS)
+"""Model fields that differ between environments under one compiled program."""
+_WALL = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Group:
+    """Slots of one kind: `width` of them are in the window at a time."""
+
+    slots: np.ndarray
+    """[m] slots of the world."""
+    width: int
+    first: int
+    """Of the window's slots."""
+    tables: dict[str, jax.Array]
+    """Field -> [scenes, m, ...] values of the slot's body, boxes, joint or degrees of freedom."""
+    rows: dict[str, np.ndarray]
+    """Field -> [width, ...] rows of the window's model that they fill."""
+
+
+class Window:
+    """A small model, and the way between the world's state and it."""
+
+    def __init__(self, world: World, config: NavConfig):
+        self.world = world
+        layout = world.layout
+        kinds = np.asarray(layout.slot_kind)
+        limits = {"small": config.active_small, "free": config.active_furniture, "hinge": config.active_doors}
+        model = world.models[0]
+        slots: list[tuple[str, int]] = []
+        picked = []
+        for kind, limit in limits.items():
+            own = np.flatnonzero(kinds == kind)
+            width = min(limit or len(own), len(own))
+            boxes = max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=0)
+            if width:
+                picked.append((own, width, len(slots), boxes))
+                slots += [(kind, boxes)] * width
+        n_walls = int(model.body_geomnum[layout.structure_body])
+        self.n_walls = min(config.active_walls or n_walls, n_walls)
+        self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
+        self.groups = tuple(self._group(*p) for p in picked)
+        self._wall_tables, self._wall_rows = self._walls()
+        self._radius_m = jnp.asarray(_radii(world), jnp.float32)
+        self._centre_m = jnp.asarray(_hinge_anchors(world), jnp.float32)
+        self._occupied = jnp.asarray(world.occupied)
+        self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
+        xpos, xmat = _static_poses(self.model)
+        self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything is in the window."""
+        return sum(g.width for g in self.groups) == self.world.layout.num_slots
+
+    def _group(self, own: np.ndarray, width: int, first: int, boxes: int) -> _Group:
+        world, layout = self.world, self.world.layout
+        bodies = layout.slot_body[own]
+        joints = world.models[0].body_jntadr[bodies]
+        n_v = 1 if layout.slot_kind[own[0]] == "hinge" else 6
+        n_q = 1 if n_v == 1 else 7
+        tables: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
+        for model in world.models:
+            for name in _BODY:
+                tables[name].append(getattr(model, name)[bodies])
+            for name in _JOINT:
+                tables[name].append(getattr(model, name)[joints])
+            for name in _DOF:
+                tables[name].append(getattr(model, name)[layout.slot_qvel[own][:, None] + np.arange(n_v)])
+            for name in _QPOS:
+                tables[name].append(getattr(model, name)[layout.slot_qpos[own][:, None] + np.arange(n_q)])
+            filled = [_boxes_of(model, body, boxes) for body in bodies]
+            for name in _GEOM:
+                tables[name].append(np.stack([f[name] for f in filled]))
+        mine = slice(first, first + width)
+        inner = self.layout
+        body = inner.slot_body[mine]
+        rows = {name: body for name in _BODY}
+        rows |= {name: self.model.body_geomadr[body][:, None] + np.arange(boxes) for name in _GEOM}
+        rows |= {name: self.model.body_jntadr[body] for name in _JOINT}
+        rows |= {name: inner.slot_qvel[mine][:, None] + np.arange(n_v) for name in _DOF}
+        rows |= {name: inner.slot_qpos[mine][:, None] + np.arange(n_q) for name in _QPOS}
+        stacked = {name: jnp.asarray(np.stack(values), jnp.float32) for name, values in tables.items()}
+        return _Group(own, width, first, stacked, rows)
+
+    def _walls(self) -> tuple[dict[str, jax.Array], np.ndarray]:
+        world, body = self.world, self.world.layout.structure_body
+        start, count = world.models[0].body_geomadr[body], world.models[0].body_geomnum[body]
+        own = np.arange(start, start + count)
+        tables = {name: np.stack([getattr(m, name)[own] for m in world.models]) for name in _WALL}
+        poses = [_static_poses(m) for m in world.models]
+        tables["xpos"] = np.stack([xpos[own] for xpos, _ in poses])
+        tables["xmat"] = np.stack([xmat[own] for _, xmat in poses])
+        # Padding lies below the floor; it never counts as near.
+        tables["used"] = (tables["xpos"][..., 2] > -4.0).astype(float)
+        rows = self.model.body_geomadr[self.layout.structure_body] + np.arange(self.n_walls)
+        return {k: jnp.asarray(v, jnp.float32) for k, v in tables.items()}, rows
+
+    def select(self, scene: jax.Array, state: PhysicsState) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array]:
+        """What goes into the window of one environment.
+
+        Args:
+            scene: [] i32.
+            state: of the whole world.
+
+        Returns:
+            Per group [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something
+            within reach had to be left out.
+        """
+        layout = self.world.layout
+        robot = state.qpos[layout.robot_qpos : layout.robot_qpos + 2]
+        reach = self.world.robot.footprint_radius_m + REACH_M
+        chosen, missed = [], jnp.zeros((), bool)
+        for group in self.groups:
+            if group.width == len(group.slots):
+                chosen.append(jnp.arange(group.width))
+                continue
+            if layout.slot_kind[group.slots[0]] == "hinge":
+                centre = self._centre_m[scene, group.slots]
+                speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots]])
+            else:
+                centre = state.qpos[layout.slot_qpos[group.slots][:, None] + np.arange(2)]
+                speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots][:, None] + np.arange(6)]).max(-1)
+            gap = jnp.linalg.norm(centre - robot, axis=-1) - self._radius_m[scene, group.slots]
+            gap = jnp.where(self._occupied[scene, group.slots], gap, _FAR_M)
+            _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * (speed > _MOVING_M_S)), group.width)
+            left_out = jnp.ones(len(group.slots), bool).at[index].set(False)
+            missed |= jnp.any(left_out & (gap < reach))
+            chosen.append(index)
+        walls = self._wall_tables
+        count = walls["used"].shape[1]
+        if self.n_walls == count:
+            return tuple(chosen), jnp.arange(count), missed.astype(jnp.int32)
+        # Planar distance from the robot to each wall box.
+        offset = jnp.einsum("wi,wij->wj", robot - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
+        outside = jnp.maximum(jnp.abs(offset) - walls["geom_size"][scene, :, :2], 0.0)
+        gap = jnp.where(walls["used"][scene] > 0, jnp.linalg.norm(outside, axis=-1), _FAR_M)
+        _, index = jax.lax.top_k(-gap, self.n_walls)
+        missed |= jnp.any(jnp.ones(count, bool).at[index].set(False) & (gap < reach))
+        return tuple(chosen), index, missed.astype(jnp.int32)
+
+    def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
+        """Values of all `FIELDS` of the window's model, in MuJoCo's shapes."""
+        out = {name: jnp.asarray(value) for name, value in self._base.items()}
+        for group, index in zip(self.groups, chosen, strict=True):
+            for name, rows in group.rows.items():
+                out[name] = out[name].at[rows].set(group.tables[name][scene, index])
+        for name in _WALL:
+            out[name] = out[name].at[self._wall_rows].set(self._wall_tables[name][scene, walls])
+        return out
+
+    def static_poses(self, scene: jax.Array, walls: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """World positions [ngeom, 3] and matrices [ngeom, 3, 3] of the geoms; right for those that never move."""
+        xpos = self._xpos.at[self._wall_rows].set(self._wall_tables["xpos"][scene, walls])
+        return xpos, self._xmat.at[self._wall_rows].set(self._wall_tables["xmat"][scene, walls])
+
+    def _addresses(self, chosen: tuple[jax.Array, ...]) -> list[tuple[Any, Any, Any, Any]]:
+        """(window's qpos, world's qpos, window's qvel, world's qvel) addresses of the robot and each group."""
+        inner, outer = self.layout, self.world.layout
+        q, v = np.arange(inner.robot_nq), np.arange(inner.robot_nv)
+        found: list[tuple[Any, Any, Any, Any]] = [
+            (inner.robot_qpos + q, outer.robot_qpos + q, inner.robot_qvel + v, outer.robot_qvel + v)
+        ]
+        for group, index in zip(self.groups, chosen, strict=True):
+            hinge = outer.slot_kind[group.slots[0]] == "hinge"
+            q, v = np.arange(1 if hinge else 7), np.arange(1 if hinge else 6)
+            mine = slice(group.first, group.first + group.width)
+            found.append(
+                (
+                    inner.slot_qpos[mine][:, None] + q,
+                    jnp.asarray(outer.slot_qpos[group.slots])[index][:, None] + q,
+                    inner.slot_qvel[mine][:, None] + v,
+                    jnp.asarray(outer.slot_qvel[group.slots])[index][:, None] + v,
+                )
+            )
+        return found
+
+    def enter(self, state: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
+        """The window's state out of the world's."""
+        qpos = jnp.zeros(self.model.nq, jnp.float32)
+        qvel = warm = jnp.zeros(self.model.nv, jnp.float32)
+        for q_in, q_out, v_in, v_out in self._addresses(chosen):
+            qpos = qpos.at[q_in].set(state.qpos[q_out])
+            qvel = qvel.at[v_in].set(state.qvel[v_out])
+            warm = warm.at[v_in].set(state.qacc_warmstart[v_out])
+        return PhysicsState(qpos, qvel, warm)
+
+    def leave(self, state: PhysicsState, inner: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
+        """The world's new state: what is outside of the window stays, at rest."""
+        qpos, qvel, warm = state.qpos, jnp.zeros_like(state.qvel), jnp.zeros_like(state.qacc_warmstart)
+        for q_in, q_out, v_in, v_out in self._addresses(chosen):
+            qpos = qpos.at[q_out].set(inner.qpos[q_in])
+            qvel = qvel.at[v_out].set(inner.qvel[v_in])
+            warm = warm.at[v_out].set(inner.qacc_warmstart[v_in])
+        return PhysicsState(qpos, qvel, warm)
+
+    def spread_forces(self, forces: jax.Array, chosen: tuple[jax.Array, ...]) -> jax.Array:
+        """[..., window slots + 1, 3] forces to [..., world slots + 1, 3], the structure last; 0 outside the window."""
+        slots = self.world.layout.num_slots
+        out = jnp.zeros((*forces.shape[:-2], slots + 1, 3), forces.dtype)
+        for group, index in zip(self.groups, chosen, strict=True):
+            mine = forces[..., group.first : group.first + group.width, :]
+            out = out.at[..., jnp.asarray(group.slots)[index], :].set(mine)
+        return out.at[..., slots, :].set(forces[..., -1, :])
+
+
+def _boxes_of(model: mujoco.MjModel, body: int, count: int) -> dict[str, np.ndarray]:
+    """Fields of a body's boxes, padded to `count` with ones too small to be met, at its centre of mass."""
+    start, own = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+    out = {name: getattr(model, name)[start : start + own] for name in _GEOM}
+    tiny = np.full(3, 1e-3)
+    hidden = {
+        "geom_size": tiny,
+        "geom_pos": model.body_ipos[body],
+        "geom_quat": np.array([1.0, 0, 0, 0]),
+        "geom_rbound": np.linalg.norm(tiny),
+        "geom_aabb": np.concatenate([np.zeros(3), tiny]),
+        "geom_friction": out["geom_friction"][0],
+    }
+    return {name: np.concatenate([out[name], np.stack([hidden[name]] * (count - own))]) if count > own else out[name]
+            for name in _GEOM}  # fmt: skip
+
+
+def _static_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
+
+
+def _radii(world: World) -> np.ndarray:
+    """[S, M] how far each slot's boxes reach from its frame; a door's, from its hinge."""
+    layout = world.layout
+    out = np.zeros((len(world.models), layout.num_slots))
+    for s, model in enumerate(world.models):
+        for k, body in enumerate(layout.slot_body):
+            geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+            anchor = model.jnt_pos[model.body_jntadr[body]] if layout.slot_kind[k] == "hinge" else np.zeros(3)
+            reach = np.linalg.norm(model.geom_pos[geoms] - anchor, axis=1) + model.geom_rbound[geoms]
+            out[s, k] = reach.max(initial=0.0)
+    return out
+
+
+def _hinge_anchors(world: World) -> np.ndarray:
+    """[S, M, 2] world positions of the doors' hinges; 0 for other slots."""
+    layout = world.layout
+    out = np.zeros((len(world.models), layout.num_slots, 2))
+    for s, model in enumerate(world.models):
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        for k, body in enumerate(layout.slot_body):
+            if layout.slot_kind[k] == "hinge":
+                out[s, k] = data.xanchor[model.body_jntadr[body], :2]
+    return out
