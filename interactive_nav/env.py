@@ -45,6 +45,8 @@ EPISODE_METRICS = (
     "interaction_steps",
     "structure_steps",
     "overflow_steps",
+    "left_out_steps",
+    "unconverged_steps",
     "objects_dropped",
 )
 REWARD_TERMS = ("reward/success", "reward/potential", "reward/interaction")
@@ -56,7 +58,8 @@ class InteractiveNav(Env):
     Observation: f32 (29,) by default, see `interactive_nav.observation`.
     Action: f32 (A,) in [-1, 1], one per actuator (wheels: left, right).
     Reward: success + potential + interaction, see `interactive_nav.reward`.
-    Done: success, time limit (then `info["truncation"]` is 1) or a non-finite state.
+    Done: success, time limit, a non-finite state, or dropped contacts; `info["truncation"]` is 1 where the
+    episode was cut by the time limit or by dropped contacts, `info["time_out"]` for the former alone.
     Metrics: `EPISODE_METRICS` are the episode's scores on its last step and 0 before, so that their sum
     over an episode is the score; `REWARD_TERMS` are each step's reward terms.
     """
@@ -159,6 +162,8 @@ class InteractiveNav(Env):
             interaction_steps=count,
             structure_steps=count,
             overflow_steps=count,
+            left_out_steps=count,
+            unconverged_steps=count,
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
             step_count=count,
         )
@@ -184,7 +189,10 @@ class InteractiveNav(Env):
         broken = signals.nonfinite > 0
         nav, rotation = self._advance(nav, physics, signals, broken)
 
-        success = ~broken & (jnp.linalg.norm(nav.goal_xy_w - nav.robot_pos_w[:2]) < self.success_distance_m)
+        # Contacts were dropped: what the robot did is no longer known, and the episode ends here.
+        lost = ~broken & (signals.overflow > 0)
+
+        success = ~broken & ~lost & (jnp.linalg.norm(nav.goal_xy_w - nav.robot_pos_w[:2]) < self.success_distance_m)
         interacts = self._touches(nav.scene_index, signals)
         reward, terms = interactive_navigation_reward(
             success.astype(jnp.float32),
@@ -194,20 +202,25 @@ class InteractiveNav(Env):
             self.config.k_int,
             self.config.success_reward,
         )
-        timed_out = ~success & ~broken & (nav.step_count >= self.config.episode_steps)
-        done = (success | timed_out | broken).astype(jnp.float32)
+        timed_out = ~success & ~broken & ~lost & (nav.step_count >= self.config.episode_steps)
+        done = (success | timed_out | broken | lost).astype(jnp.float32)
         values = self._scores(nav, success, broken)
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
         obs = jnp.where(broken, 0.0, self._observe(physics, nav, rotation))
-        truncation = timed_out.astype(jnp.float32)
+        truncation = (timed_out | lost).astype(jnp.float32)
         return state.replace(
             pipeline_state=physics,
             obs=obs,
             reward=reward,
             done=done,
             metrics={**state.metrics, **values},
-            info={**state.info, "nav": nav, "truncation": truncation, "time_out": truncation},
+            info={
+                **state.info,
+                "nav": nav,
+                "truncation": truncation,
+                "time_out": timed_out.astype(jnp.float32),
+            },
         )
 
     def _initial_physics(self, start: EpisodeStart) -> PhysicsState:
@@ -283,7 +296,9 @@ class InteractiveNav(Env):
             force_sum_n=nav.force_sum_n + jnp.where(broken, 0.0, signals.force_n),
             interaction_steps=nav.interaction_steps + ok * self._touches(scene, signals).astype(jnp.int32),
             structure_steps=nav.structure_steps + ok * (signals.structure_force_n > TOUCH_FORCE_N).astype(jnp.int32),
-            overflow_steps=nav.overflow_steps + (signals.overflow > 0).astype(jnp.int32),
+            overflow_steps=nav.overflow_steps + signals.overflow,
+            left_out_steps=nav.left_out_steps + signals.left_out,
+            unconverged_steps=nav.unconverged_steps + signals.unconverged,
             step_count=nav.step_count + 1,
         )
         return new, rotation
@@ -311,6 +326,8 @@ class InteractiveNav(Env):
             "interaction_steps": nav.interaction_steps,
             "structure_steps": nav.structure_steps,
             "overflow_steps": nav.overflow_steps,
+            "left_out_steps": nav.left_out_steps,
+            "unconverged_steps": nav.unconverged_steps,
             "objects_dropped": nav.objects_dropped,
         }
         return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}

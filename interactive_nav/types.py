@@ -88,6 +88,10 @@ class NavInfo:
     """[] i32 control steps with a touched wall."""
     overflow_steps: jax.Array
     """[] i32 control steps in which a contact or constraint buffer overflowed."""
+    left_out_steps: jax.Array
+    """[] i32 control steps in which an object within reach was not simulated (MJX's window was full)."""
+    unconverged_steps: jax.Array
+    """[] i32 control steps in which the solver met its iteration limit."""
     objects_dropped: jax.Array
     """[] i32 small objects for which no free place was found: parked outside."""
     step_count: jax.Array

@@ -25,6 +25,11 @@ _PARKING_STEP_M = 3.0
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
 _TILTED = np.array([0.8, 0.36, 0.48, 0.0])
 _SETTLE_TIME_S = 3.0
+FEET = 12
+"""Points of each movable object that can touch the floor."""
+_FOOT_RADIUS_M = 2e-3
+_SOLID, _FLOOR = 1, 2
+"""Collision bits: bodies against each other, and what can touch the floor."""
 FLOOR_FRICTION = 0.05
 """Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
 
@@ -88,6 +93,37 @@ def parking_spot(index: int) -> tuple[float, float]:
     return PARKING_W[0] + _PARKING_STEP_M * (index % 16), PARKING_W[1] + _PARKING_STEP_M * (index // 16)
 
 
+def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
+    """Points at which a body of boxes can rest on a plane: the outermost corners of its bottom, then of its top.
+
+    A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
+    contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them.
+
+    Args:
+        boxes: [n, 10] centre, quaternion, half sizes; body frame, z up.
+        count: points wanted.
+
+    Returns:
+        [at most count, 3] m, body frame.
+    """
+    corners = []
+    for row in boxes:
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, row[3:7])
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        corners.append(row[:3] + (signs * row[7:10]) @ rotation.reshape(3, 3).T)
+    points = np.concatenate(corners)
+    azimuth = np.arange(8) * math.pi / 4 + math.pi / 4
+    # Slightly more than level: of corners at (nearly) one height the outermost wins.
+    level = np.stack([0.05 * np.cos(azimuth), 0.05 * np.sin(azimuth), np.ones(8)], -1)
+    kept: list[np.ndarray] = []
+    for direction in [*(level * [1, 1, -1])[::2], *(level * [1, 1, -1])[1::2], *level[::2], *level[1::2]]:
+        point = points[np.argmax(points @ direction)]
+        if len(kept) < count and all(np.linalg.norm(point - k) > 0.02 for k in kept):
+            kept.append(point)
+    return np.stack(kept)
+
+
 def _sorted_movables(scene: Scene) -> tuple[list[Movable], list[Movable]]:
     free = sorted((m for m in scene.movables if m.hinge is None), key=lambda m: -len(m.boxes))
     hinged = sorted((m for m in scene.movables if m.hinge is not None), key=lambda m: -len(m.boxes))
@@ -109,6 +145,26 @@ def _add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float) 
         friction=[friction, 0.005, 0.0001],
         group=3,
     )
+
+
+def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.ndarray, friction: float) -> None:
+    """`FEET` small spheres that alone touch the floor; those not needed hide inside the body."""
+    points = foot_points(boxes) if len(boxes) else np.zeros((0, 3))
+    if len(points):
+        centre = 0.5 * (points.min(0) + points.max(0))
+        points = points - _FOOT_RADIUS_M * np.sign(points - centre)
+    for i in range(FEET):
+        body.add_geom(
+            name=f"{name}_foot_{i}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=points[i] if i < len(points) else hidden_m,
+            size=[_FOOT_RADIUS_M, 0, 0],
+            mass=0.0,
+            friction=[friction, 0.005, 0.0001],
+            group=4,
+            contype=_FLOOR,
+            conaffinity=0,
+        )
 
 
 def _add_movable(
@@ -161,6 +217,7 @@ def _add_movable(
                 mass=0.0,
                 friction=[friction, 0.005, 0.0001],
                 group=3,
+                contype=_SOLID | _FLOOR,
             )
         return
     # A padding box hides at the centre of mass, inside the body, and is too small to be met first.
@@ -168,6 +225,7 @@ def _add_movable(
     hidden[:3] = com
     for i in range(n_boxes):
         _add_box(body, boxes[i] if i < len(boxes) else hidden, f"{name}_box_{i}", friction)
+    _add_feet(body, name, boxes, com, friction)
 
 
 def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> None:
@@ -185,6 +243,8 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> N
             friction=[obj.friction, 0.005, 0.0001],
             group=3,
         )
+    rows = np.array([[*b.centre_m, 1, 0, 0, 0, *b.half_m] for b in obj.boxes], float)
+    _add_feet(body, name, rows, rows[:, :3].mean(0), obj.friction)
 
 
 def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
@@ -205,8 +265,13 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 0.1],
         friction=[FLOOR_FRICTION, 0.005, 0.0001],
+        contype=0,
+        conaffinity=_FLOOR,
     )
     robot.add_to(spec)
+    for geom in spec.geoms:
+        if geom.name != "floor" and (geom.contype or geom.conaffinity):
+            geom.contype |= _FLOOR
     return spec
 
 

@@ -41,7 +41,11 @@ class StepSignals:
     structure_force_n: Any
     """[] f32: the same for walls and other fixed structure, N."""
     overflow: Any
-    """[] i32: 1 if a contact or constraint buffer overflowed in any substep."""
+    """[] i32: 1 if a contact, constraint or broadphase buffer overflowed in any substep: contacts were dropped."""
+    left_out: Any
+    """[] i32: 1 if an object within the robot's reach was not simulated, because MJX's window was full."""
+    unconverged: Any
+    """[] i32: 1 if the solver met its iteration limit in any substep."""
     nonfinite: Any
     """[] i32: 1 if the new state is not finite or the engine gave up on it."""
 

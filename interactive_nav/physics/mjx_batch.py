@@ -19,6 +19,13 @@ from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import Layout, World
 
+# Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,
+# contact matches; and the solver's iteration limit. A test compares them with the engine's.
+_DROPPED = 0b1011111
+_UNCONVERGED = 1 << 9
+CCD_PER_ENV = 32
+"""Pairs of boxes per environment that Warp's convex collider has room for at once; more are counted as overflow."""
+
 
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap."""
@@ -50,7 +57,11 @@ class MjxPhysics(Physics):
         n = scene.shape[0]
         if self.name == "warp":
             template = mjx.make_data(
-                self._host, impl="warp", naconmax=n * self.contacts_per_env, njmax=self.constraints_per_env
+                self._host,
+                impl="warp",
+                naconmax=n * self.contacts_per_env,
+                naccdmax=n * min(self.contacts_per_env, CCD_PER_ENV),
+                njmax=self.constraints_per_env,
             )
         else:
             template = mjx.make_data(self._host, impl="jax")
@@ -92,44 +103,34 @@ class MjxPhysics(Physics):
                     return data, self._forces_from_contacts(data)
 
                 data, forces = jax.lax.scan(substep, data, jnp.arange(self._substeps))
-                overflow = jnp.asarray(0, jnp.int32)
+                # Its buffers are static, and it does not report its solver's iterations.
+                failures = jnp.asarray(0, jnp.int32)
             else:
                 # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's
                 # carry cannot.
-                collected, overflow = [], jnp.asarray(0, jnp.int32)
+                collected, failures = [], jnp.asarray(0, jnp.int32)
                 for k in range(self._substeps):
                     if every and k:
                         data = control(data, command, time_s + k * dt)
                     data = mjx.step(model, data)
                     collected.append(data.sensordata[self._sensors])
-                    overflow |= self._overflowed(data)
+                    failures |= data._impl.overflow
                 forces = jnp.stack(collected)
             out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
-            return out, window.spread_forces(forces, chosen), overflow | missed
+            return out, window.spread_forces(forces, chosen), failures, missed
 
-        new, forces, overflow = jax.vmap(one)(scene, state, command, time_s)
+        new, forces, failures, missed = jax.vmap(one)(scene, state, command, time_s)
         force_n, slot_n, structure_n = summarise_forces(forces)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
         return new, StepSignals(
             force_n=force_n,
             slot_force_n=slot_n,
             structure_force_n=structure_n,
-            overflow=overflow,
+            overflow=((failures & _DROPPED) != 0).astype(jnp.int32),
+            left_out=missed,
+            unconverged=((failures & _UNCONVERGED) != 0).astype(jnp.int32),
             nonfinite=(~finite).astype(jnp.int32),
         )
-
-    def _overflowed(self, data) -> jax.Array:
-        from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType
-
-        dropped = int(
-            OverflowType.NEFC
-            | OverflowType.NJMAX_NNZ
-            | OverflowType.BROADPHASE
-            | OverflowType.NARROWPHASE
-            | OverflowType.CCD
-            | OverflowType.CONTACT_MATCH
-        )
-        return ((data._impl.overflow & dropped) != 0).astype(jnp.int32)
 
     def _forces_from_contacts(self, data) -> jax.Array:
         """[M + 1, 3] net force of the robot on each slot and the structure, world frame, from MJX-JAX's contacts."""

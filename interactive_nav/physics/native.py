@@ -74,6 +74,8 @@ class NativePhysics(Physics):
                 slot_force_n=jax.ShapeDtypeStruct((n, self._slots), f32),
                 structure_force_n=jax.ShapeDtypeStruct((n,), f32),
                 overflow=jax.ShapeDtypeStruct((n,), i32),
+                left_out=jax.ShapeDtypeStruct((n,), i32),
+                unconverged=jax.ShapeDtypeStruct((n,), i32),
                 nonfinite=jax.ShapeDtypeStruct((n,), i32),
             ),
         )
@@ -100,7 +102,7 @@ class NativePhysics(Physics):
             pool.state_qpos[good], pool.state_qvel[good] = qpos[good], qvel[good]
             pool.state_warm[good] = np.asarray(state.qacc_warmstart)[good]
         batch.warning[:] = 0
-        sensed = self._advance(pool, command, time_s)
+        sensed, iterations = self._advance(pool, command, time_s)
         raised = batch.warning[:, :, 1] > 0
         new_qpos, new_qvel = pool.state_qpos.astype(np.float32), pool.state_qvel.astype(np.float32)
         finite &= np.isfinite(new_qpos).all(1) & np.isfinite(new_qvel).all(1)
@@ -115,22 +117,28 @@ class NativePhysics(Physics):
                 slot_force_n=slot_n.astype(np.float32),
                 structure_force_n=structure_n.astype(np.float32),
                 overflow=raised[:, [int(w) for w in _OVERFLOWS]].any(1).astype(np.int32),
+                left_out=np.zeros(size, np.int32),
+                unconverged=(iterations >= self._models[0].opt.iterations).astype(np.int32),
                 nonfinite=nonfinite.astype(np.int32),
             ),
         )
 
-    def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        """Runs the substeps; [N, substeps, sensors] readings."""
+    def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Runs the substeps; sensor readings [N, substeps, ...] and the most solver iterations [N]."""
         rounds = self._substeps if self._robot.control_every_substep else 1
-        sensed = []
+        sensed, layout = [], self._layout
+        iterations = np.zeros(len(command), np.int64)
         for k in range(rounds):
-            layout = self._layout
             robot = RobotState(
                 pool.state_qpos[:, layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
                 pool.state_qvel[:, layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
                 time_s + k * self._models[0].opt.timestep,
             )
             pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
-            record = pool.batch.rollout(self._substeps // rounds, record=("sensordata",))
+            record = pool.batch.rollout(self._substeps // rounds, record=("sensordata", "solver_niter", "nisland"))
             sensed.append(record["sensordata"])
-        return np.concatenate(sensed, 1)
+            niter = record["solver_niter"]
+            # Without islands the engine reports one solve; what lies beyond the last island is stale.
+            islands = np.maximum(record["nisland"].reshape(niter.shape[0], niter.shape[1], 1), 1)
+            iterations = np.maximum(iterations, np.where(np.arange(niter.shape[-1]) < islands, niter, 0).max((1, 2)))
+        return np.concatenate(sensed, 1), iterations

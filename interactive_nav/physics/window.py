@@ -19,7 +19,7 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.world import World, build_empty_spec
+from interactive_nav.world import FEET, World, build_empty_spec
 
 REACH_M = 0.6
 """An object left out of the window although it is this near to the robot's footprint counts as missed."""
@@ -70,7 +70,7 @@ class Window:
         for kind, limit in limits.items():
             own = np.flatnonzero(kinds == kind)
             width = min(limit or len(own), len(own))
-            boxes = max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=0)
+            boxes = max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=FEET) - FEET
             if width:
                 picked.append((own, width, len(slots), boxes))
                 slots += [(kind, boxes)] * width
@@ -114,7 +114,7 @@ class Window:
         inner = self.layout
         body = inner.slot_body[mine]
         rows = {name: body for name in _BODY}
-        rows |= {name: self.model.body_geomadr[body][:, None] + np.arange(boxes) for name in _GEOM}
+        rows |= {name: self.model.body_geomadr[body][:, None] + np.arange(boxes + FEET) for name in _GEOM}
         rows |= {name: self.model.body_jntadr[body] for name in _JOINT}
         rows |= {name: inner.slot_qvel[mine][:, None] + np.arange(n_v) for name in _DOF}
         rows |= {name: inner.slot_qpos[mine][:, None] + np.arange(n_q) for name in _QPOS}
@@ -243,9 +243,8 @@ class Window:
 
 
 def _boxes_of(model: mujoco.MjModel, body: int, count: int) -> dict[str, np.ndarray]:
-    """Fields of a body's boxes, padded to `count` with ones too small to be met, at its centre of mass."""
-    start, own = int(model.body_geomadr[body]), int(model.body_geomnum[body])
-    out = {name: getattr(model, name)[start : start + own] for name in _GEOM}
+    """Fields of a body's boxes, padded to `count` with ones too small to be met at its centre of mass, and feet."""
+    start, own = int(model.body_geomadr[body]), int(model.body_geomnum[body]) - FEET
     tiny = np.full(3, 1e-3)
     hidden = {
         "geom_size": tiny,
@@ -253,10 +252,14 @@ def _boxes_of(model: mujoco.MjModel, body: int, count: int) -> dict[str, np.ndar
         "geom_quat": np.array([1.0, 0, 0, 0]),
         "geom_rbound": np.linalg.norm(tiny),
         "geom_aabb": np.concatenate([np.zeros(3), tiny]),
-        "geom_friction": out["geom_friction"][0],
+        "geom_friction": model.geom_friction[start],
     }
-    return {name: np.concatenate([out[name], np.stack([hidden[name]] * (count - own))]) if count > own else out[name]
-            for name in _GEOM}  # fmt: skip
+    out = {}
+    for name in _GEOM:
+        values = getattr(model, name)[start : start + own + FEET]
+        padding = np.broadcast_to(hidden[name], (count - own, *values.shape[1:]))
+        out[name] = np.concatenate([values[:own], padding, values[own:]])
+    return out
 
 
 def _static_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -9,11 +9,10 @@ import pytest
 
 from interactive_nav import objects
 from interactive_nav.config import NavConfig
-from interactive_nav.physics.mjx_batch import differing_fields
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from interactive_nav.tables import build_tables, furniture_map
-from interactive_nav.world import build_world
+from interactive_nav.world import FEET, build_world, foot_points
 from scenes_mjcf.schema import SceneError, load_maps, save_maps
 from tests.toys import write_room
 
@@ -37,11 +36,41 @@ def test_slots_masses_and_names(world):
     assert world.settle_m.max() < 0.01
 
 
-def test_models_differ_only_in_fields_that_mjx_can_batch(world):
-    names = differing_fields(world.models)
-    assert {"geom_size", "body_mass", "qpos0"} <= set(names)
+def test_models_of_different_scenes_have_one_structure(world):
     a, b = world.models
-    assert (a.nq, a.nv, a.ngeom, a.nsensordata) == (b.nq, b.nv, b.ngeom, b.nsensordata)
+    for name in ("nq", "nv", "ngeom", "nsensordata", "nM", "nC"):
+        assert getattr(a, name) == getattr(b, name), name
+
+
+def test_feet_are_the_outer_corners_of_a_chair():
+    # Four legs at (+-0.2, +-0.2), 4 cm thick, a seat of 0.44 m, a back at x = 0.2 m.
+    legs = [[x, y, 0.2, 1, 0, 0, 0, 0.02, 0.02, 0.2] for x in (-0.2, 0.2) for y in (-0.2, 0.2)]
+    seat = [[0, 0, 0.42, 1, 0, 0, 0, 0.22, 0.22, 0.02], [0.2, 0, 0.7, 1, 0, 0, 0, 0.02, 0.22, 0.25]]
+    points = foot_points(np.array(legs + seat))
+    bottom = points[points[:, 2] < 0.01]
+    np.testing.assert_allclose(
+        sorted(map(tuple, bottom.round(6))), [(x, y, 0.0) for x in (-0.22, 0.22) for y in (-0.22, 0.22)]
+    )
+    assert points[:, 2].max() == pytest.approx(0.95) and len(points) <= FEET
+
+
+def test_a_chair_rests_on_its_feet_and_weighs_on_the_floor(world):
+    model, layout = world.models[1], world.layout
+    data = mujoco.MjData(model)
+    data.qpos[:] = world.rest_qpos[1]
+    mujoco.mj_forward(model, data)
+    body = layout.slot_body[3]
+    floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    force, up = np.zeros(6), 0.0
+    kinds = set()
+    for i in range(data.ncon):
+        geoms = data.contact.geom[i]
+        if floor in geoms and body in model.geom_bodyid[geoms]:
+            mujoco.mj_contactForce(model, data, i, force)
+            up += force[0]
+            kinds |= {int(model.geom_type[g]) for g in geoms if g != floor}
+    assert kinds == {int(mujoco.mjtGeom.mjGEOM_SPHERE)}
+    assert up == pytest.approx(9.81 * world.mass_kg[1, 3], rel=0.02)
 
 
 def test_an_empty_slot_floats_in_place(world):
