@@ -10,6 +10,7 @@ from typing import Any
 BACKENDS = ("auto", "warp", "jax", "native")
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 COLLISIONS = ("boxes", "hulls")
+CONES = ("pyramidal", "elliptic")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,17 +53,19 @@ class NavConfig:
     """Goal cells per scene: a uniform draw of the free cells, so that tables stay small."""
     solver_iterations: int = 10
     """Newton iterations of the constraint solver per physics step."""
+    cone: str = "pyramidal"
+    """Friction cones: pyramidal, or elliptic (native only: MJX-Warp's Newton solver fails on them)."""
     contacts_per_env: int = 0
     """MJX-Warp contact slots per env; 0: measured when the environment is built, with head room."""
     constraints_per_env: int = 0
     """MJX-Warp constraint rows per env; 0: measured likewise."""
-    active_furniture: int = 8
+    active_furniture: int = 5
     """MJX backends: pieces of furniture simulated at a time, the nearest to the robot; 0: all."""
-    active_small: int = 6
+    active_small: int = 4
     """MJX backends: small objects simulated at a time; 0: all."""
-    active_doors: int = 3
+    active_doors: int = 2
     """MJX backends: doors simulated at a time; 0: all."""
-    active_walls: int = 40
+    active_walls: int = 32
     """MJX backends: wall boxes that can be met at a time; 0: all."""
     sleep: bool = True
     """Native backend: objects at rest sleep until touched."""
@@ -78,6 +81,8 @@ class NavConfig:
             refuse("backend", f"one of {', '.join(BACKENDS)}")
         if self.collision not in COLLISIONS:
             refuse("collision", f"one of {', '.join(COLLISIONS)}")
+        if self.cone not in CONES:
+            refuse("cone", f"one of {', '.join(CONES)}")
         unknown = [o for o in self.observations if o not in OBSERVATIONS]
         if unknown or not self.observations or len(set(self.observations)) != len(self.observations):
             refuse("observations", f"a choice from {', '.join(OBSERVATIONS)}")

@@ -256,7 +256,9 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
     option.timestep = config.sim_dt_s
     option.gravity = [0, 0, -9.81]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[
+        config.cone
+    ]
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations = config.solver_iterations
     option.ls_iterations = 20

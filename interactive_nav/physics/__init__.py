@@ -40,6 +40,8 @@ def make_physics(world: World, config: NavConfig) -> Physics:
     backend = resolve_backend(config.backend)
     if config.collision == "hulls" and backend != "native":
         raise ValueError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
+    if config.cone == "elliptic" and backend != "native":
+        raise ValueError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics
 

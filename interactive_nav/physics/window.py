@@ -80,7 +80,7 @@ class Window:
         self.groups = tuple(self._group(*p) for p in picked)
         self._wall_tables, self._wall_rows = self._walls()
         self._radius_m = jnp.asarray(_radii(world), jnp.float32)
-        self._centre_m = jnp.asarray(_hinge_anchors(world), jnp.float32)
+        self._anchor_m, self._leaf_m = (jnp.asarray(x, jnp.float32) for x in _doors(world))
         self._occupied = jnp.asarray(world.occupied)
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
@@ -154,7 +154,10 @@ class Window:
                 chosen.append(jnp.arange(group.width))
                 continue
             if layout.slot_kind[group.slots[0]] == "hinge":
-                centre = self._centre_m[scene, group.slots]
+                angle = state.qpos[layout.slot_qpos[group.slots]] * self._leaf_m[scene, group.slots, 2]
+                c, s = jnp.cos(angle), jnp.sin(angle)
+                x, y = self._leaf_m[scene, group.slots, 0], self._leaf_m[scene, group.slots, 1]
+                centre = self._anchor_m[scene, group.slots] + jnp.stack([c * x - s * y, s * x + c * y], -1)
                 speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots]])
             else:
                 centre = state.qpos[layout.slot_qpos[group.slots][:, None] + np.arange(2)]
@@ -269,26 +272,37 @@ def _static_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _radii(world: World) -> np.ndarray:
-    """[S, M] how far each slot's boxes reach from its frame; a door's, from its hinge."""
+    """[S, M] how far each slot's boxes reach from its frame; a door's, from its centre of mass."""
     layout = world.layout
     out = np.zeros((len(world.models), layout.num_slots))
     for s, model in enumerate(world.models):
         for k, body in enumerate(layout.slot_body):
-            geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
-            anchor = model.jnt_pos[model.body_jntadr[body]] if layout.slot_kind[k] == "hinge" else np.zeros(3)
-            reach = np.linalg.norm(model.geom_pos[geoms] - anchor, axis=1) + model.geom_rbound[geoms]
+            geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body] - FEET)
+            centre = model.body_ipos[body] if layout.slot_kind[k] == "hinge" else np.zeros(3)
+            reach = np.linalg.norm((model.geom_pos[geoms] - centre)[:, :2], axis=1) + np.linalg.norm(
+                model.geom_size[geoms, :2], axis=1
+            )
+            if layout.slot_kind[k] != "hinge":
+                # It may tip over.
+                reach = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
             out[s, k] = reach.max(initial=0.0)
     return out
 
 
-def _hinge_anchors(world: World) -> np.ndarray:
-    """[S, M, 2] world positions of the doors' hinges; 0 for other slots."""
+def _doors(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Hinges [S, M, 2] in the world, and leaves [S, M, 3]: planar way from hinge to centre of mass when the joint
+    is at 0, and the joint's sense about the world's z; zeros for other slots."""
     layout = world.layout
-    out = np.zeros((len(world.models), layout.num_slots, 2))
+    anchor = np.zeros((len(world.models), layout.num_slots, 2))
+    leaf = np.zeros((len(world.models), layout.num_slots, 3))
     for s, model in enumerate(world.models):
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
         for k, body in enumerate(layout.slot_body):
             if layout.slot_kind[k] == "hinge":
-                out[s, k] = data.xanchor[model.body_jntadr[body], :2]
-    return out
+                joint = model.body_jntadr[body]
+                anchor[s, k] = data.xanchor[joint, :2]
+                leaf[s, k, :2] = data.xipos[body, :2] - anchor[s, k]
+                leaf[s, k, 2] = np.sign(data.xaxis[joint, 2])
+    return anchor, leaf
