@@ -297,6 +297,7 @@ def build_empty_spec(
         _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
     _add_structure(spec, np.zeros((0, 10)), n_walls)
     _add_sensors(spec, robot, named)
+    _soften(spec, config)
     model = spec.compile()
     return spec, model, _layout(model, robot, named)
 
@@ -325,7 +326,13 @@ def _build_spec(
             slots.append((name, kind))
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
     _add_sensors(spec, robot, slots)
+    _soften(spec, config)
     return spec, slots
+
+
+def _soften(spec: mujoco.MjSpec, config: NavConfig) -> None:
+    for geom in spec.geoms:
+        geom.solref = [config.contact_time_constant_s, 1.0]
 
 
 def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:

@@ -1,0 +1,103 @@
+"""A natively batched environment in, the same spread over several devices out: one program, equal shares.
+
+    env = ShardedEnv(AutoResetEnv(interactive_nav.make(...)))       # all devices, of all processes
+    state = jax.jit(env.reset)(jax.random.split(key, num_envs))     # leaves are sharded along their first axis
+
+Environments are independent, so nothing is exchanged between devices in `reset` and `step`; what a learner
+computes from the sharded arrays (means, gradients) XLA reduces over the devices by itself.
+
+Several machines or processes: call `start_distributed` first in each of them, before anything else uses JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from brax.envs.base import Env, State
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+AXIS = "i"
+"""Name of the mesh's axis; Brax's own."""
+
+
+class ShardedEnv(Env):
+    """Steps equal shares of a batch on each device."""
+
+    def __init__(self, env: Env, devices: Sequence[jax.Device] | None = None):
+        """Wraps an environment.
+
+        Args:
+            env: natively batched, such as `AutoResetEnv`.
+            devices: default: all devices of all processes.
+        """
+        self.env = env
+        self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
+        self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
+        spec = PartitionSpec(AXIS)
+        self._reset = jax.shard_map(env.reset, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)
+        self._step = jax.shard_map(env.step, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
+
+    @property
+    def num_devices(self) -> int:
+        """Devices that share the batch."""
+        return self.mesh.size
+
+    @property
+    def observation_size(self):
+        """As the wrapped environment's."""
+        return self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions."""
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """Physics backend in use."""
+        return self.env.backend
+
+    @property
+    def unwrapped(self) -> Env:
+        """The single environment."""
+        return self.env.unwrapped
+
+    def reset(self, rng: jax.Array) -> State:
+        """[N, 2] keys to N states.
+
+        Raises:
+            ValueError: N is no multiple of the number of devices.
+        """
+        if rng.shape[0] % self.num_devices:
+            raise ValueError(
+                f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
+                f"take {self.num_devices * max(1, rng.shape[0] // self.num_devices)}"
+            )
+        return self._reset(jax.lax.with_sharding_constraint(rng, self.sharding))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """N states and [N, A] actions to N states."""
+        return self._step(state, jax.lax.with_sharding_constraint(action, self.sharding))
+
+
+def start_distributed(coordinator: str, num_processes: int, process_id: int) -> None:
+    """Joins processes, on one machine or several, into one JAX program.
+
+    Every process runs the same script with its own `process_id`; afterwards `jax.devices()` are the devices
+    of all of them and `ShardedEnv` spreads over all.
+
+    Args:
+        coordinator: host:port of process 0, reachable from all.
+        num_processes: how many join.
+        process_id: 0 to num_processes - 1.
+
+    Raises:
+        ValueError: an impossible process id, or a coordinator without a port.
+    """
+    if not 0 <= process_id < num_processes:
+        raise ValueError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")
+    if not coordinator.rpartition(":")[2].isdigit():
+        raise ValueError(f"coordinator is {coordinator!r}, expected host:port such as 10.0.0.1:1234")
+    jax.distributed.initialize(coordinator, num_processes, process_id)
