@@ -12,6 +12,7 @@ Several machines or processes: call `start_distributed` first in each of them, b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,7 +26,7 @@ AXIS = "i"
 class ShardedEnv(Env):
     """Steps equal shares of a batch on each device."""
 
-    def __init__(self, env: Env, devices: Sequence[jax.Device] | None = None):
+    def __init__(self, env: Env, devices: Sequence[Any] | None = None):
         """Wraps an environment.
 
         Args:
