@@ -28,6 +28,7 @@ import interactive_nav
 from interactive_nav.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
 from interactive_nav.robots import robot_names
 from interactive_nav.torch_bridge import to_jax, to_torch
+from interactive_nav.views import ThirdPerson
 
 ARRAYS = ("numpy", "jax", "torch")
 VERSION = 0
@@ -126,7 +127,7 @@ class InteractiveNavEnv(gymnasium.Env):
         super().reset(seed=seed)
         given = _check_options(options, ("start",))
         fresh = seed is not None or self._state is None
-        key = jnp.asarray(_key(self.np_random)) if fresh else self._state.info["rng"]
+        key = jnp.asarray(_key(self.np_random)) if fresh else self._state.info["rng"]  # pyright: ignore[reportOptionalMemberAccess]
         self._state = self._reset_to(given["start"], key) if "start" in given else self._reset(key)
         return _to_numpy(self._state.obs), {}
 
@@ -145,14 +146,13 @@ class InteractiveNavEnv(gymnasium.Env):
         """(rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
         if self.render_mode is None or self._state is None:
             return None
-        nav = self._state.info["nav"]
-        return self._camera.frame(int(nav.scene_index), np.asarray(self._state.pipeline_state.qpos))
+        state: Any = self._state
+        nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
+        return self._camera.frame(int(nav.scene_index), qpos, np.asarray(nav.goal_xy_w))
 
     @functools.cached_property
-    def _camera(self) -> Any:
-        from interactive_nav.views import third_person
-
-        return third_person(self.env)
+    def _camera(self) -> ThirdPerson:
+        return ThirdPerson(self.env)
 
 
 class InteractiveNavVectorEnv(VectorEnv):
@@ -267,14 +267,13 @@ class InteractiveNavVectorEnv(VectorEnv):
         """A third-person view of each environment; None without a render mode."""
         if self.render_mode is None or self._state is None:
             return None
-        scene, qpos = np.asarray(self._state.info["nav"].scene_index), np.asarray(self._state.pipeline_state.qpos)
-        return tuple(self._camera.frame(int(s), q) for s, q in zip(scene, qpos, strict=True))
+        nav, qpos = self._state.info["nav"], np.asarray(self._state.pipeline_state.qpos)
+        each = zip(np.asarray(nav.scene_index), qpos, np.asarray(nav.goal_xy_w), strict=True)
+        return tuple(self._camera.frame(int(scene), row, goal) for scene, row, goal in each)
 
     @functools.cached_property
-    def _camera(self) -> Any:
-        from interactive_nav.views import third_person
-
-        return third_person(self.env)
+    def _camera(self) -> ThirdPerson:
+        return ThirdPerson(self.env)
 
     def _keys(self, seed: int | Sequence[int | None] | None) -> jax.Array:
         n = self.num_envs

@@ -1,8 +1,8 @@
 """A batch of environments as Stable-Baselines3 wants it: `VecEnv` in place of Gymnasium's vector environment.
 
-    from stable_baselines3 import PPO
-    from interactive_nav.sb3_env import SB3VecEnv
-    PPO("MlpPolicy", SB3VecEnv("turtlebot", ["scenes_mjcf/apartment_0"], num_envs=16)).learn(1_000_000)
+from stable_baselines3 import PPO
+from interactive_nav.sb3_env import SB3VecEnv
+PPO("MlpPolicy", SB3VecEnv("turtlebot", ["scenes_mjcf/apartment_0"], num_envs=16)).learn(1_000_000)
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from interactive_nav.env import EPISODE_METRICS
 from interactive_nav.gym_env import InteractiveNavVectorEnv
 
 try:
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.monitor import Monitor  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise ImportError("stable_baselines3 is not installed: pip install stable-baselines3") from error
 
@@ -91,8 +92,4 @@ class SB3VecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No environment has a wrapper of its own, save that the `Monitor`'s numbers are there."""
-        from stable_baselines3.common.monitor import Monitor
-
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
-
-

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 def _torch() -> Any:
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("PyTorch is not installed; follow https://pytorch.org/get-started") from error
     return torch
@@ -58,7 +58,9 @@ def to_jax(tree: Any) -> Any:
         if not isinstance(x, torch.Tensor):
             return x
         if x.requires_grad:
-            raise ValueError(f"tensor of shape {tuple(x.shape)} requires a gradient, expected a detached one: .detach()")
+            raise ValueError(
+                f"tensor of shape {tuple(x.shape)} requires a gradient, expected a detached one: .detach()"
+            )
         return jnp.from_dlpack(x.contiguous())
 
     return jax.tree.map(convert, tree)

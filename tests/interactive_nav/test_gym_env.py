@@ -29,7 +29,7 @@ def single(settings):
     return gymnasium.make(ID, **settings)
 
 
-def vector(settings, mode=AutoresetMode.SAME_STEP, **more):
+def vector(settings, mode: AutoresetMode | str = AutoresetMode.SAME_STEP, **more):
     return gymnasium.make_vec(
         ID, num_envs=N, vectorization_mode="vector_entry_point", autoreset_mode=mode, **settings, **more
     )
