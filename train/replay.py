@@ -1,4 +1,4 @@
-"""`python -m train.replay RUN_DIR --episodes 0 1 --policies learned,follower`: episodes played once more, step by step.
+"""`python -m train.replay RUN_DIR --episodes 0,1 --policies learned,follower`: episodes played once more, step by step.
 
 Episode K starts as row K of `python -m train.evaluate` with the same seed: same place, goal and objects. The
 numbers that a network computes may differ in their last bits with the size of the batch, so a close call may
@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m train.replay", description="Records episodes step by step.")
     made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
     made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
-    made.add_argument("--episodes", type=int, nargs="+", default=[0], metavar="K", help="which (default 0)")
+    made.add_argument("--episodes", default="0", metavar="K,K,...", help="which of the fixed episodes (default 0)")
     made.add_argument("--seed", type=int, default=1_000_000, help="of the fixed episodes (default 1000000)")
     names = ",".join((LEARNED, *YARDSTICKS))
     made.add_argument("--policies", default=LEARNED, help=f"comma-separated choice from {names} (default {LEARNED})")
@@ -58,8 +58,9 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     arguments = parser().parse_intermixed_args(argv)
     console = Console()
     try:
-        if min(arguments.episodes) < 0:
-            raise ConfigError(f"--episodes has {min(arguments.episodes)}, expected 0 or more")
+        if not all(word.isdecimal() for word in arguments.episodes.split(",")):
+            raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
+        episodes = [int(word) for word in arguments.episodes.split(",")]
         folder = RunFolder(Path(arguments.run))
         config = folder.read_config()
         config = config_io.apply_overrides(config, arguments.overrides)
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             config = dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
         claim(folder.path / "replays")
         env = build_env(config.env)
-        keys = episode_keys(arguments.seed, max(arguments.episodes) + 1)
+        keys = episode_keys(arguments.seed, max(episodes) + 1)
         for name in dict.fromkeys(arguments.policies.split(",")):
             if name == LEARNED:
                 policy, meta = load_policy(folder, config, env, arguments.checkpoint, not arguments.stochastic)
@@ -78,7 +79,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                 known = ", ".join((LEARNED, *YARDSTICKS))
                 raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
             player = replay.Player(env, policy, name, label)
-            for episode in arguments.episodes:
+            for episode in episodes:
                 with console.status(f"{name}, episode {episode}: compiling") as status:
                     played = player.play(
                         keys[episode],
