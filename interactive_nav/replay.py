@@ -94,9 +94,10 @@ class Player:
     def __init__(
         self,
         env: InteractiveNav,
-        policy: Callable[[jax.Array, jax.Array], jax.Array],
+        policy: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
         name: str = "policy",
         label: str = "",
+        planner: Callable[[Any, int, int], Any] | None = None,
     ):
         """Wires it.
 
@@ -105,10 +106,19 @@ class Player:
             policy: pure (observation, key) -> action (A,) in [-1, 1].
             name: of the policy, for captions.
             label: where the policy comes from, for captions.
+            planner: in place of a policy, (state with leaves [1, ...], episode, step) -> actions [1, A], on the
+                host: something that looks at the whole state or keeps a plan.
+
+        Raises:
+            ValueError: both a policy and a planner, or neither.
         """
+        if (policy is None) == (planner is None):
+            raise ValueError("Player got policy and planner, expected exactly one of them")
         self.env, self.name, self.label = env, name, label
         self._reset = jax.jit(jax.vmap(env.reset))
-        self._chunk = jax.jit(functools.partial(_play_chunk, env, policy))
+        self._planner = planner
+        self._chunk = jax.jit(functools.partial(_play_chunk, env, policy)) if policy else None
+        self._step = jax.jit(functools.partial(_play_step, env))
 
     def play(self, key: jax.Array, episode: int = 0, on_progress: Callable[[int], None] = lambda step: None) -> Replay:
         """Plays one episode to its end.
@@ -124,11 +134,16 @@ class Player:
         parts, qpos = [], [np.asarray(state.pipeline_state.qpos)]
         ended, step = False, 0
         while not ended:
-            state, steps = self._chunk(state, policy_key, step)
+            if self._chunk is not None:
+                state, steps = self._chunk(state, policy_key, step)
+            else:
+                assert self._planner is not None
+                state, steps = self._step(state, jnp.asarray(self._planner(state, episode, step), jnp.float32))
+                steps = jax.tree.map(lambda x: x[None], steps)
             steps = jax.tree.map(np.asarray, steps)
             done = np.flatnonzero(steps["done"])
             ended = len(done) > 0
-            last = int(done[0]) + 1 if ended else _CHUNK_STEPS
+            last = int(done[0]) + 1 if ended else len(steps["done"])
             parts.append({name: values[:last] for name, values in steps.items()})
             qpos.append(parts[-1]["qpos"])
             step += last
@@ -167,23 +182,29 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
 
 
 def _play_chunk(env: InteractiveNav, policy: Any, state: Any, key: jax.Array, step: jax.Array) -> Any:
+    """`_CHUNK_STEPS` steps; what `_play_step` tells, stacked."""
+
     def one_step(state: Any, t: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         obs = jax.tree.map(lambda x: x[0], state.obs)
         action = jnp.asarray(policy(obs, jax.random.fold_in(key, step + t)), jnp.float32)
-        state = jax.vmap(env.step)(state, action[None])
-        nav = state.info["nav"]
-        out = {
-            "qpos": state.pipeline_state.qpos[0],
-            "action": action,
-            "reward": state.reward[0],
-            "done": state.done[0],
-            "force_sum_n": nav.force_sum_n[0],
-            "interaction_steps": nav.interaction_steps[0],
-            "structure_steps": nav.structure_steps[0],
-        }
-        return state, out | {f"metrics/{name}": state.metrics[name][0] for name in EPISODE_METRICS}
+        return _play_step(env, state, action[None])
 
     return jax.lax.scan(one_step, state, jnp.arange(_CHUNK_STEPS))
+
+
+def _play_step(env: InteractiveNav, state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+    state = jax.vmap(env.step)(state, action)
+    nav = state.info["nav"]
+    out = {
+        "qpos": state.pipeline_state.qpos[0],
+        "action": action[0],
+        "reward": state.reward[0],
+        "done": state.done[0],
+        "force_sum_n": nav.force_sum_n[0],
+        "interaction_steps": nav.interaction_steps[0],
+        "structure_steps": nav.structure_steps[0],
+    }
+    return state, out | {f"metrics/{name}": state.metrics[name][0] for name in EPISODE_METRICS}
 
 
 def world_poses(env: InteractiveNav, scene: int, qpos: np.ndarray) -> tuple[Any, ...]:

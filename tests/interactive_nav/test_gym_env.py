@@ -169,12 +169,12 @@ def test_without_autoreset_only_the_masked_environments_begin_anew(settings):
     assert not envs.step(actions()[0])[3].any()
 
 
-def test_a_given_start_is_played(same_step):
-    from interactive_nav.placement import draw_episode
-
-    env = same_step.env
-    key = jax.random.PRNGKey(3)
-    start = draw_episode(key, env.tables, env._small_radius_m, env.robot.footprint_radius_m, 1.0, np.inf, 0.0)
+def test_a_given_start_is_played(same_step, monkeypatch):
+    drawn, env = [], same_step.env
+    with monkeypatch.context() as patch:
+        patch.setattr(env, "reset_to", lambda start, rng: drawn.append(start))
+        env.reset(jax.random.PRNGKey(3))
+    [start] = drawn
     batch = jax.tree.map(lambda x: jnp.stack([x] * N), start)
     obs, _ = same_step.reset(seed=0, options={"start": batch})
     np.testing.assert_array_equal(obs[0], obs[2])
