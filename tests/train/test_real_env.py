@@ -10,13 +10,19 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
+from interactive_nav import replay
 from tests.toys import write_room
 from tests.train.toy_run import UPDATE_STEPS, toy_config
 from train import checkpoint, evaluate
+from train import replay as replay_program
 from train.__main__ import main
 from train.config import EnvConfig, TrainConfig
 from train.run import train_run
 from train.run_folder import read_metrics
+
+
+def best_steps(folder):
+    return checkpoint.find(folder.checkpoints, "best")[1].env_steps
 
 
 @pytest.mark.slow
@@ -48,6 +54,13 @@ def test_train_resume_and_evaluate(tmp_path, capsys):
         travelled = np.linalg.norm(np.diff(track, axis=0), axis=-1).sum()
         assert travelled == pytest.approx(rows["robot_path_m"][12], rel=0.02)  # scored in 3-D
         assert paths["scene/0/object_names"].tolist()[-1] == "chair_0"
+
+    # An episode played once more starts as the row that was scored.
+    assert replay_program.main([str(folder.path), "--episodes", "3", "env.episode_steps=30"]) == 0
+    again = replay.load(replay_program.replay_path(folder.path, "learned", 3))
+    assert again.label == f"toy, {best_steps(folder)} steps"
+    assert again.metrics["shortest_path_m"] == pytest.approx(rows["shortest_path_m"][3])
+    assert again.metrics["robot_path_m"] == pytest.approx(rows["robot_path_m"][3], rel=0.05)
 
     capsys.readouterr()
     assert evaluate.main([str(folder.path), "env.robot=turtlebott"]) == 2

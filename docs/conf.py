@@ -1,0 +1,22 @@
+"""Sphinx's settings: `make docs` builds this folder into docs/_build/html."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+project = "interactive-nav"
+author = "The interactive-nav authors"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "interactive-nav"
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_mock_imports = ["stable_baselines3", "torch"]
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+suppress_warnings = ["ref.python"]
+"""Fields of the same name in two records are told apart by where they stand."""

@@ -1,0 +1,274 @@
+"""`python -m interactive_nav.record RUN --episode K -o out.mp4`: a run or a replay in, a video out.
+
+The picture: the robot from behind, its goal and path painted on the floor; beside it what the robot's camera
+sees, as colour, depth and class mask; below, the step and its reward, force and touches.
+
+Playing a policy is for `train` to do: for a run, its program is asked for a replay, as a user would.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from scipy.ndimage import gaussian_filter1d
+
+from interactive_nav.replay import Replay, ReplayError, load
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import Scene, load_scene
+from interactive_nav.views import (
+    INSIDE,
+    OUTSIDE,
+    FloorPaint,
+    SceneView,
+    chase_camera,
+    depth_picture,
+    mask_picture,
+    robot_camera,
+    yaw_of,
+)
+
+FORMATS = (".mp4", ".gif")
+CAMERA_PIXELS = 68
+"""Depth and mask are rendered at the resolution of the paper's policies (section V)."""
+_CAMERA_LAG_S = 1.0
+"""The camera behind the robot turns smoothly: a Gaussian of this width over its heading."""
+_HOLD_S = 1.5
+"""The last picture stays so long."""
+
+
+class Compositor:
+    """Frames of one replay."""
+
+    def __init__(self, replay: Replay, scene: Scene, height: int = 360):
+        """Compiles the scene.
+
+        Args:
+            replay: the episode.
+            scene: the folder that it was played in.
+            height: rows of the view from behind; a multiple of 12, so that every part has whole, even pixels.
+
+        Raises:
+            ReplayError: the scene is not the one that the replay was recorded in.
+            ValueError: a height that does not divide.
+        """
+        if height < 120 or height % 12:
+            raise ValueError(f"height is {height}, expected a multiple of 12 from 120 on")
+        check_scene(replay, scene)
+        self.replay, self.height = replay, height
+        robot = get_robot(replay.robot)
+        self._goal_radius_m = robot.body_width_m
+        self._view = SceneView(robot, scene, replay.num_objects)
+        yaw = np.unwrap(yaw_of(replay.body_quat_w[:, 0]))
+        self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
+        self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
+        self._font = ImageFont.load_default(size=height / 24)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows of a frame."""
+        return self.height * 4 // 3 + self.height // 3, self.height + self._strip
+
+    @property
+    def _strip(self) -> int:
+        return self.height // 6
+
+    def frame(self, step: int) -> np.ndarray:
+        """[rows, columns, 3] u8: the state after `step` control steps."""
+        replay, height = self.replay, self.height
+        self._view.place(replay.bodies, replay.body_pos_w[step], replay.body_quat_w[step])
+        camera = chase_camera(self._target[step], float(self._yaw[step]), height, height * 4 // 3)
+        paint = FloorPaint(replay.goal_xy_w, self._goal_radius_m, _dense(replay.robot_xy_w[: step + 1]))
+        behind = self._view.look(camera, OUTSIDE, paint).colour
+        side = height // 3
+        colour = self._view.look(robot_camera(self._view, side, side), INSIDE).colour
+        seen = self._view.look(robot_camera(self._view, CAMERA_PIXELS, CAMERA_PIXELS), INSIDE)
+        small = [depth_picture(seen.depth_m), mask_picture(seen.classes)]
+        column = [
+            colour,
+            *(np.asarray(Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST)) for x in small),
+        ]
+        picture = np.concatenate([behind, np.concatenate(column, 0)], 1)
+        return np.concatenate([picture, self._caption(step)], 0)
+
+    def _caption(self, step: int) -> np.ndarray:
+        replay, (columns, _) = self.replay, self.size
+        strip = Image.new("RGB", (columns, self._strip), (24, 28, 36))
+        draw = ImageDraw.Draw(strip)
+        scores = replay.metrics
+        at = max(step - 1, 0)
+        touch = "touches " + (
+            "an object" if replay.touches_movable[at] else "a wall" if replay.touches_structure[at] else "nothing"
+        )
+        lines = [
+            f"{replay.policy}  episode {replay.episode}  {Path(replay.scene).name}  {replay.label}",
+            f"{step * replay.control_dt_s:5.1f} s   reward {replay.reward[:step].sum():6.2f}   "
+            f"force {replay.force_n[at] if step else 0.0:5.1f} N   {touch if step else ''}",
+        ]
+        if step == replay.num_steps:
+            end = "reached the goal" if scores["success"] else "did not reach the goal"
+            lines[1] = (
+                f"{step * replay.control_dt_s:5.1f} s   {end}   P_eff {scores['path_efficiency']:.2f}   "
+                f"E_eff {scores['effort_efficiency']:.2f}   INS_0.5 {scores['ins_0.5']:.2f}"
+            )
+        for i, line in enumerate(lines):
+            draw.text((self._strip // 5, self._strip * (1 + 4 * i) // 9), line, font=self._font, fill=(235, 238, 242))
+        return np.asarray(strip)
+
+
+def check_scene(replay: Replay, scene: Scene) -> None:
+    """Raises `ReplayError` unless the scene's files are those that the replay was recorded in."""
+    if scene.digest != replay.scene_digest:
+        raise ReplayError(
+            f"{scene.path}: scene.xml or maps.npz has changed since the replay was recorded; record the episode again"
+        )
+
+
+def _dense(path: np.ndarray, step_m: float = 0.03) -> np.ndarray:
+    """[n, 2] path with points at most `step_m` apart."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = np.arange(0.0, length[-1] + step_m, step_m)
+    return np.stack([np.interp(at, length, path[:, i]) for i in range(2)], -1)
+
+
+def write_video(
+    compositor: Compositor,
+    path: Path,
+    every: int = 1,
+    on_progress: Callable[[int], None] = lambda frames: None,
+) -> int:
+    """Writes a video in real time, whole or not at all.
+
+    Args:
+        compositor: the frames.
+        path: ends in .mp4 (H.264) or .gif.
+        every: control steps from one frame to the next.
+        on_progress: told the number of frames written.
+
+    Returns:
+        The number of different frames.
+
+    Raises:
+        ReplayError: another ending.
+    """
+    if path.suffix not in FORMATS:
+        raise ReplayError(f"{path}: ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
+    steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
+    rate = 1.0 / (compositor.replay.control_dt_s * every)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{path.name}")
+    try:
+        write = _write_gif if path.suffix == ".gif" else _write_mp4
+        write(_counted(compositor, steps, on_progress), partial, rate, compositor.size)
+        os.replace(partial, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise
+    return len(steps)
+
+
+def _counted(compositor: Compositor, steps: list[int], on_progress: Callable[[int], None]) -> Iterator[np.ndarray]:
+    for i, step in enumerate(steps):
+        yield compositor.frame(step)
+        on_progress(i + 1)
+
+
+def _write_mp4(frames: Iterator[np.ndarray], path: Path, rate: float, size: tuple[int, int]) -> None:
+    output = ["-movflags", "+faststart", "-preset", "medium"]
+    rate_and_quality: dict[str, Any] = {"fps": rate, "quality": 7}
+    writer = imageio_ffmpeg.write_frames(
+        str(path), size, codec="libx264", macro_block_size=2, output_params=output, **rate_and_quality
+    )
+    writer.send(None)
+    try:
+        frame = np.zeros((size[1], size[0], 3), np.uint8)
+        for frame in frames:
+            writer.send(np.ascontiguousarray(frame))
+        for _ in range(round(_HOLD_S * rate)):
+            writer.send(np.ascontiguousarray(frame))
+    finally:
+        writer.close()
+
+
+def _write_gif(frames: Iterator[np.ndarray], path: Path, rate: float, size: tuple[int, int]) -> None:
+    pictures = [Image.fromarray(f).quantize(128, dither=Image.Dither.NONE) for f in frames]
+    shown_ms = [round(1000 / rate)] * (len(pictures) - 1) + [round(1000 * _HOLD_S)]
+    pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0)
+
+
+def replay_of(run: Path, episode: int, policy: str, extra: Sequence[str] = ()) -> Path:
+    """Has `train.replay` play an episode of a run.
+
+    Returns:
+        The replay's file, RUN/replays/<policy>-episode<K>.npz.
+
+    Raises:
+        ReplayError: the program refused; it has said why on stderr.
+    """
+    words = ["--episodes", str(episode), "--policies", policy, *extra]
+    done = subprocess.run([sys.executable, "-m", "train.replay", str(run), *words])
+    if done.returncode:
+        raise ReplayError(
+            f"{run}: no replay of episode {episode} (python -m train.replay ended with {done.returncode})"
+        )
+    return run / "replays" / f"{policy}-episode{episode}.npz"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(prog="python -m interactive_nav.record", description="Makes a video of an episode.")
+    made.add_argument("run", metavar="RUN", help="folder that `python -m train` wrote, or a replay (.npz)")
+    made.add_argument("--episode", type=int, default=0, metavar="K", help="which of the fixed episodes (default 0)")
+    made.add_argument("--policy", default="learned", help="learned (default), or a policy of `train.evaluate`")
+    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
+    made.add_argument("-o", "--out", default="episode.mp4", metavar="PATH", help=".mp4 or .gif (default episode.mp4)")
+    made.add_argument("--height", type=int, default=360, help="rows of the view from behind (default 360)")
+    made.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N control steps (default 1)")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Records; 0 when done, 2 on a user's error, 130 when interrupted."""
+    arguments = parser().parse_args(argv)
+    out, source = Path(arguments.out), Path(arguments.run)
+    console = Console()
+    try:
+        if out.suffix not in FORMATS:
+            raise ReplayError(f"{out}: ends in '{out.suffix}', expected one of {', '.join(FORMATS)}")
+        if arguments.every < 1 or arguments.episode < 0:
+            raise ReplayError(f"--every {arguments.every} --episode {arguments.episode}: expected 1 and 0 or more")
+        if source.suffix != ".npz":
+            source = replay_of(source, arguments.episode, arguments.policy, ["--checkpoint", arguments.checkpoint])
+        replay = load(source)
+        compositor = Compositor(replay, load_scene(replay.scene), arguments.height)
+        columns = (
+            *(SpinnerColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} frames")),
+            *(TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()),
+        )
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+            task = bar.add_task("", total=-(-replay.num_steps // arguments.every) + 1)
+            frames = write_video(compositor, out, arguments.every, lambda n: bar.update(task, completed=n))
+    except (ValueError, OSError) as error:  # ReplayError, SceneError and an unknown robot are ValueErrors
+        print(f"interactive_nav.record: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interactive_nav.record: stopped; no video was written", file=sys.stderr)
+        return 130
+    console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

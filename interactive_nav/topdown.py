@@ -1,0 +1,256 @@
+"""`python -m interactive_nav.topdown REPLAY... -o out.png`: replays in, maps of who went where and moved what out.
+
+One panel a replay, as in figures 7 and 8 of Interactive Gibson: furniture and small objects in outline where
+they stood at the start and filled where they stand at the end, an arrow from the one to the other, and the
+robot's path coloured by time or by what it touched.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, PathPatch
+from matplotlib.path import Path as Outline
+
+from interactive_nav.objects import pick
+from interactive_nav.record import check_scene
+from interactive_nav.replay import Replay, ReplayError, load
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import Scene, load_scene
+from interactive_nav.views import COLOURS, yaw_of
+
+COLOUR_BY = ("time", "contact")
+TOUCH_COLOURS = {"nothing": "#0072b2", "an object": "#d55e00", "a wall": "#555555"}
+MOVED_M = 0.02
+"""Objects whose outline moved less than this count as not moved."""
+
+
+def outlines(replay: Replay, scene: Scene) -> dict[str, tuple[str, np.ndarray]]:
+    """Boxes of everything movable: body name -> (category, [n, 10] centre, quaternion, half sizes, body frame)."""
+    found = {m.name: (m.category, m.boxes) for m in scene.movables}
+    for i, obj in enumerate(pick(replay.num_objects)):
+        rows = [[*box.centre_m, 1.0, 0.0, 0.0, 0.0, *box.half_m] for box in obj.boxes]
+        found[f"{obj.category}_small_{i}"] = (obj.category, np.asarray(rows))
+    return found
+
+
+def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
+    """What boxes of a body cover of the floor: a shapely geometry, m, world.
+
+    Args:
+        boxes: [n, 10] centre, quaternion w x y z, half sizes, in the body's frame.
+        pos_w: (3,) of the body, m.
+        quat_w: (4,) of the body.
+    """
+    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    body = _rotation(quat_w)
+    hulls = []
+    for row in boxes:
+        points = row[:3] + (corners * row[7:10]) @ _rotation(row[3:7]).T
+        hulls.append(shapely.MultiPoint((points @ body.T + pos_w)[:, :2]).convex_hull)
+    return shapely.union_all(hulls)
+
+
+def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
+    """Draws one replay.
+
+    Args:
+        axis: to draw into.
+        replay: the episode.
+        scene: the folder that it was played in.
+        colour_by: "time" (first step dark, last bright) or "contact".
+
+    Raises:
+        ReplayError: the scene is not the one that the replay was recorded in.
+        ValueError: another `colour_by`.
+    """
+    if colour_by not in COLOUR_BY:
+        raise ValueError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
+    check_scene(replay, scene)
+    maps = scene.maps
+    rows, columns = maps.traversable.shape
+    x0, y0 = maps.origin_w
+    extent = (x0, x0 + columns * maps.resolution_m, y0, y0 + rows * maps.resolution_m)
+    axis.imshow(
+        maps.traversable, origin="lower", extent=extent, cmap=ListedColormap(["0.75", "1.0"]), interpolation="nearest"
+    )
+    for name, (category, boxes) in outlines(replay, scene).items():
+        if name in replay.bodies:
+            b = replay.bodies.index(name)
+            _draw_object(axis, category, boxes, replay.body_pos_w[:, b], replay.body_quat_w[:, b], extent)
+    _draw_path(axis, replay, colour_by)
+    robot = get_robot(replay.robot)
+    for step, style in ((0, "--"), (-1, "-")):
+        place, yaw = replay.robot_xy_w[step], yaw_of(replay.body_quat_w[step, 0])
+        axis.add_patch(
+            Circle((float(place[0]), float(place[1])), robot.footprint_radius_m, fill=False, linestyle=style, zorder=6)
+        )
+        nose = place + robot.footprint_radius_m * np.array([np.cos(yaw), np.sin(yaw)])
+        axis.plot(*np.stack([place, nose]).T, color="k", linewidth=1, linestyle=style, zorder=6)
+    goal = Circle(
+        (float(replay.goal_xy_w[0]), float(replay.goal_xy_w[1])),
+        robot.body_width_m,
+        color="#009e73",
+        alpha=0.35,
+        linewidth=0,
+        zorder=2,
+    )
+    axis.add_patch(goal)
+    axis.plot(*replay.goal_xy_w, marker="*", color="#009e73", markeredgecolor="k", markersize=11, zorder=7)
+    s = replay.metrics
+    axis.set_title(
+        f"{replay.policy}, {scene.name}, episode {replay.episode}: {'reached' if s['success'] else 'not reached'}\n"
+        f"P_eff {s['path_efficiency']:.2f}  E_eff {s['effort_efficiency']:.2f}  INS_0.5 {s['ins_0.5']:.2f}",
+        fontsize=8,
+    )
+    axis.set_xlim(extent[:2])
+    axis.set_ylim(extent[2:])
+    axis.set_aspect("equal")
+    axis.tick_params(labelsize=6)
+    axis.set_xlabel("x [m]", fontsize=7)
+    axis.set_ylabel("y [m]", fontsize=7)
+
+
+def panels(replays: Sequence[Replay], scenes: dict[str, Scene], colour_by: str = "time", columns: int = 3) -> Figure:
+    """A figure with one panel a replay.
+
+    Args:
+        replays: at least one.
+        scenes: by the path that the replays name.
+        colour_by: see `draw`.
+        columns: panels in a row, at most.
+    """
+    columns = min(columns, len(replays))
+    rows = -(-len(replays) // columns)
+    shapes = [scenes[r.scene].maps.traversable.shape for r in replays]
+    aspect = float(np.clip(max(n / m for n, m in shapes), 0.4, 1.6))
+    size = (3.9 * columns + (0.6 if colour_by == "time" else 0.0), (3.5 * aspect + 0.75) * rows + 0.5)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis in grid.flat[len(replays) :]:
+        axis.set_axis_off()
+    for axis, replay in zip(grid.flat, replays, strict=False):
+        draw(axis, replay, scenes[replay.scene], colour_by)
+    handles: list[Any] = []
+    if colour_by == "time":
+        longest = max(r.num_steps * r.control_dt_s for r in replays)
+        shades = plt.cm.ScalarMappable(Normalize(0, longest), "viridis")
+        figure.colorbar(shades, ax=grid, label="time [s]", shrink=0.7, pad=0.01)
+        for axis in grid.flat:
+            for line in axis.collections:
+                if isinstance(line, LineCollection):
+                    line.set_clim(0, longest)
+    else:
+        handles += [Line2D([], [], color=c, linewidth=2, label=f"touches {what}") for what, c in TOUCH_COLOURS.items()]
+    handles += [
+        Patch(facecolor="none", edgecolor="0.4", linestyle=":", label="moved object, at start"),
+        Patch(facecolor="0.8", edgecolor="0.3", label="object, at end"),
+        Line2D([], [], marker="o", color="k", markerfacecolor="none", linestyle="", label="robot (start dashed)"),
+        Line2D([], [], marker="*", color="#009e73", markeredgecolor="k", linestyle="", markersize=9, label="goal"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4 if columns > 1 else 2, fontsize=7, frameon=False)
+    return figure
+
+
+def _draw_object(axis: Axes, category: str, boxes: np.ndarray, pos: np.ndarray, quat: np.ndarray, extent: Any) -> None:
+    before, after = (shadow(boxes, pos[i], quat[i]) for i in (0, -1))
+    centre = np.array(before.centroid.coords[0])
+    if not (extent[0] <= centre[0] <= extent[1] and extent[2] <= centre[1] <= extent[3]):
+        return  # an object that found no place waits outside
+    colour = COLOURS[category]
+    axis.add_patch(_patch(after, facecolor=(*colour, 0.75), edgecolor=(*(0.6 * np.array(colour)), 1.0), linewidth=0.6))
+    if before.hausdorff_distance(after) <= MOVED_M:
+        return
+    dark = 0.55 * np.array(colour)
+    axis.add_patch(_patch(before, facecolor="none", edgecolor=dark, linewidth=0.9, linestyle=":"))
+    there = np.array(after.centroid.coords[0])
+    if np.linalg.norm(there - centre) > MOVED_M:
+        arrow = {"arrowstyle": "-|>", "color": dark, "lw": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
+        tip, tail = (float(there[0]), float(there[1])), (float(centre[0]), float(centre[1]))
+        axis.annotate("", tip, tail, arrowprops=arrow, zorder=5)
+
+
+def _draw_path(axis: Axes, replay: Replay, colour_by: str) -> None:
+    path = replay.robot_xy_w
+    segments = np.stack([path[:-1], path[1:]], 1)
+    lines = LineCollection(list(segments), linewidths=2.0, zorder=4, capstyle="round")
+    if colour_by == "time":
+        lines.set_array(np.arange(1, len(path)) * replay.control_dt_s)
+        lines.set_cmap("viridis")
+    else:
+        names = np.where(replay.touches_movable, "an object", np.where(replay.touches_structure, "a wall", "nothing"))
+        lines.set_color([TOUCH_COLOURS[name] for name in names])
+    axis.add_collection(lines)
+
+
+def _patch(shape: Any, **style: Any) -> PathPatch:
+    polygons = shape.geoms if hasattr(shape, "geoms") else [shape]
+    rings = [np.asarray(ring.coords) for p in polygons for ring in (p.exterior, *p.interiors)]
+    return PathPatch(Outline.make_compound_path(*(Outline(r, closed=True) for r in rings)), zorder=3, **style)
+
+
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _files(sources: Sequence[str]) -> list[Path]:
+    """Replay files of a list of files, folders of replays and run folders."""
+    files: list[Path] = []
+    for source in map(Path, sources):
+        if source.is_dir():
+            folder = source / "replays" if (source / "replays").is_dir() else source
+            inside = sorted(folder.glob("*.npz"), key=lambda p: (p.stem.rpartition("-episode")[2].zfill(9), p.stem))
+            if not inside:
+                raise ReplayError(f"{source}: holds no replays; record some: python -m train.replay {source}")
+            files += inside
+        else:
+            files.append(source)
+    return files
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draws; 0 when done, 2 on a user's error."""
+    made = argparse.ArgumentParser(prog="python -m interactive_nav.topdown", description="Draws episodes from above.")
+    made.add_argument("replays", nargs="+", metavar="REPLAY", help="replay files, or run folders that hold replays")
+    made.add_argument("-o", "--out", default="topdown.png", metavar="PATH", help="picture (default topdown.png)")
+    made.add_argument("--colour-by", choices=COLOUR_BY, default="time", help="colour of the path (default time)")
+    made.add_argument("--columns", type=int, default=3, help="panels in a row (default 3)")
+    arguments = made.parse_args(argv)
+    try:
+        if arguments.columns < 1:
+            raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")
+        replays = [load(path) for path in _files(arguments.replays)]
+        scenes = {path: load_scene(path) for path in dict.fromkeys(r.scene for r in replays)}
+        figure = panels(replays, scenes, arguments.colour_by, arguments.columns)
+        Path(arguments.out).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(arguments.out, dpi=160)
+    except (ValueError, OSError) as error:
+        print(f"interactive_nav.topdown: {error}", file=sys.stderr)
+        return 2
+    print(f"{arguments.out}: {len(replays)} episodes")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

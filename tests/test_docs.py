@@ -1,0 +1,164 @@
+"""The documentation says what is so: its Python runs, its commands parse, its options exist, its links lead somewhere.
+
+Python blocks of one page run in order in one namespace, in a folder that holds the checked-in scenes. A block is left
+out only where an HTML comment right before it says why: `<!-- not run: reason -->`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import re
+import shlex
+import traceback
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import pytest
+from markdown_it import MarkdownIt
+
+from interactive_nav.config import make_config
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+NOT_RUN = re.compile(r"<!--\s*not run:\s*(.+?)\s*-->", re.DOTALL)
+HOUSE = ("interactive_nav", "train", "converters", "benchmarks")
+
+
+class Block(NamedTuple):
+    language: str
+    code: str
+    line: int
+    reason: str
+    """Why it is not run; empty: it is."""
+
+
+def blocks(text: str) -> list[Block]:
+    """Fenced blocks of a Markdown text."""
+    found, reason = [], ""
+    for token in MarkdownIt().parse(text):
+        if token.type == "fence":
+            assert token.map is not None
+            found.append(Block(token.info.strip(), token.content, token.map[0] + 1, reason))
+        match = NOT_RUN.search(token.content) if token.type == "html_block" else None
+        reason = match.group(1) if match else ""
+    return found
+
+
+def run_page(path: Path, text: str) -> int:
+    """Runs a page's Python blocks; returns how many."""
+    namespace: dict = {"__name__": "__docs__"}
+    ran = 0
+    for block in blocks(text):
+        if block.language == "python" and not block.reason:
+            lines = "\n" * block.line + block.code  # so that a traceback names the page's own line
+            exec(compile(lines, str(path), "exec"), namespace)
+            ran += 1
+    return ran
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """Our programs in a page's shell blocks: (module, words)."""
+    found = []
+    for block in blocks(text):
+        if block.language in ("sh", "bash", "shell", "console", ""):
+            for line in block.code.replace("\\\n", " ").splitlines():
+                if match := re.match(r"\s*(?:\$ )?(?:\w+=\S+ )*\S*python3? -m ([\w.]+)(.*)", line):
+                    module, rest = match.groups()
+                    if module.split(".")[0] in HOUSE:
+                        found.append((module, shlex.split(rest, comments=True)))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A folder to run in: the scenes, and nothing else of the checkout."""
+    (tmp_path / "scenes_mjcf").symlink_to(ROOT / "scenes_mjcf")
+    monkeypatch.chdir(tmp_path)
+
+
+with_python = [p for p in PAGES if any(b.language == "python" for b in blocks(p.read_text(encoding="utf-8")))]
+
+
+@pytest.fixture
+def quick_compilation():
+    """Pages run a few steps only: compiling well would take longer than running badly."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize("page", with_python, ids=lambda p: p.name)
+def test_python_of_a_page_runs(page, quick_compilation):
+    assert run_page(page, page.read_text(encoding="utf-8")) > 0
+
+
+def test_a_page_with_a_wrong_line_fails():
+    text = "# A\n\n```python\nx = 1\n```\n\nand\n\n```python\nassert x == 2\n```\n"
+    with pytest.raises(AssertionError) as failure:
+        run_page(Path("a.md"), text)
+    assert traceback.extract_tb(failure.tb)[-1].lineno == 10
+    assert run_page(Path("a.md"), text.replace("== 2", "== 1")) == 2
+    left_out = text.replace("and\n", "<!-- not run: needs two machines -->")
+    assert [b.reason for b in blocks(left_out)] == ["", "needs two machines"]
+    assert run_page(Path("a.md"), left_out) == 1
+
+
+def help_of(module: str, words: list[str]) -> str:
+    """The help of a program, or of the subcommand that the words name."""
+    name = (
+        f"{module}.__main__"
+        if getattr(importlib.util.find_spec(module), "submodule_search_locations", None)
+        else module
+    )
+    main = importlib.import_module(name).main
+    sub = [words[0]] if words and re.fullmatch(r"[a-z]+", words[0]) else []
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        main([*sub, "--help"])
+    return out.getvalue()
+
+
+def unknown_flags(text: str) -> list[str]:
+    """'module --flag' for every flag in a page's commands that the program's help does not name."""
+    wrong, helps = [], {}
+    for module, words in commands(text):
+        key = (module, words[0] if words else "")
+        if key not in helps:
+            helps[key] = help_of(module, words)
+        flags = [w.partition("=")[0] for w in words if re.match(r"--?[a-z]", w)]
+        wrong += [f"{module} {flag}" for flag in flags if not re.search(rf"(?<![\w-]){flag}(?![\w-])", helps[key])]
+    return wrong
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_commands_of_a_page_exist(page):
+    assert unknown_flags(page.read_text(encoding="utf-8")) == []
+
+
+def test_an_unknown_flag_is_found():
+    text = "```sh\npython -m train.evaluate RUN --episodes 3 --episode 3\n```\n"
+    assert unknown_flags(text) == ["train.evaluate --episode"]
+
+
+def options(text: str) -> list[tuple[str, str]]:
+    """Settings that a text names as `option=value`, in backticks on their own."""
+    return re.findall(r"`(\w+)=([^`\s]+)`", text)
+
+
+def test_options_that_the_benchmarks_page_names_exist():
+    named = options((ROOT / "docs" / "benchmark.md").read_text(encoding="utf-8"))
+    assert len(named) > 15
+    for name, value in named:
+        config = make_config(**{name: eval(value)})
+        assert getattr(config, name) != getattr(make_config(), name), f"{name}={value} is the default"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_lead_to_files(page):
+    links = re.findall(r"\]\((?!https?://|#)([^)#\s]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []

@@ -1,0 +1,100 @@
+"""`python -m train.replay RUN_DIR --episodes 0,1 --policies learned,follower`: episodes played once more, step by step.
+
+Episode K starts as row K of `python -m train.evaluate` with the same seed: same place, goal and objects. The
+numbers that a network computes may differ in their last bits with the size of the batch, so a close call may
+end otherwise; a replay carries its own scores. Videos and maps are drawn from its files:
+`python -m interactive_nav.record`, `python -m interactive_nav.topdown`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from interactive_nav import replay
+from train import config_io
+from train.config import EnvConfig
+from train.errors import ConfigError, TrainError
+from train.evaluate import LEARNED, load_policy
+from train.policies import YARDSTICKS
+from train.rollout import episode_keys
+from train.run import make_env
+from train.run_folder import RunFolder, claim
+
+
+def replay_path(run: Path, policy: str, episode: int) -> Path:
+    """Where a run keeps a replay."""
+    return run / "replays" / f"{policy}-episode{episode}.npz"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(prog="python -m train.replay", description="Records episodes step by step.")
+    made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
+    made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
+    made.add_argument("--episodes", default="0", metavar="K,K,...", help="which of the fixed episodes (default 0)")
+    made.add_argument("--seed", type=int, default=1_000_000, help="of the fixed episodes (default 1000000)")
+    names = ",".join((LEARNED, *YARDSTICKS))
+    made.add_argument("--policies", default=LEARNED, help=f"comma-separated choice from {names} (default {LEARNED})")
+    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
+    made.add_argument(
+        "--stochastic",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="sample the learned policy's actions, as `train.evaluate` does (default), or take their mode",
+    )
+    made.add_argument("overrides", nargs="*", metavar="env.key=value", help="environment settings to change")
+    return made
+
+
+def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
+    """Records; 0 when done, 2 on a user's error."""
+    arguments = parser().parse_intermixed_args(argv)
+    console = Console()
+    try:
+        if not all(word.isdecimal() for word in arguments.episodes.split(",")):
+            raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
+        episodes = [int(word) for word in arguments.episodes.split(",")]
+        folder = RunFolder(Path(arguments.run))
+        config = folder.read_config()
+        config = config_io.apply_overrides(config, arguments.overrides)
+        if arguments.scenes:
+            config = dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
+        claim(folder.path / "replays")
+        env = build_env(config.env)
+        keys = episode_keys(arguments.seed, max(episodes) + 1)
+        for name in dict.fromkeys(arguments.policies.split(",")):
+            if name == LEARNED:
+                policy, meta = load_policy(folder, config, env, arguments.checkpoint, not arguments.stochastic)
+                label = f"{config.run.name}, {meta.env_steps:,} steps"
+            elif name in YARDSTICKS:
+                policy, label = YARDSTICKS[name](env), ""
+            else:
+                known = ", ".join((LEARNED, *YARDSTICKS))
+                raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
+            player = replay.Player(env, policy, name, label)
+            for episode in episodes:
+                with console.status(f"{name}, episode {episode}: compiling") as status:
+                    played = player.play(
+                        keys[episode],
+                        episode,
+                        lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
+                    )
+                path = replay_path(folder.path, name, episode)
+                replay.save(played, path)
+                score = played.metrics["ins_0.5"]
+                console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)
+    except TrainError as error:
+        print(f"train.replay: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
