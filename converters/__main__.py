@@ -118,7 +118,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
     with _progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report)
     for result in results:
-        if result.manifest.alignment:
+        if any(row.get("n_keypoints") for row in result.manifest.alignment):
             console.print(_alignment_table(result.manifest.alignment))
         console.print(_gate_table(result.gates))
         for warning in result.manifest.warnings:

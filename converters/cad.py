@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from converters.errors import SceneRejected
 from converters.files import SourceFolder, check_mesh
@@ -16,12 +18,18 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Turns a y-up vector into a z-up one: x stays, y becomes z, z becomes -y."""
 
 
+def material_image(material: Any) -> Image.Image | None:
+    """Texture of a trimesh material: of an OBJ's, or the base colour of a glTF's."""
+    image = getattr(material, "image", None)
+    return getattr(material, "baseColorTexture", None) if image is None else image
+
+
 def face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
     """(m, 3) uint8 colour of every face: its texture at the face's middle, else the material's."""
     count = len(mesh.faces)
     material = getattr(mesh.visual, "material", None)
     uv = getattr(mesh.visual, "uv", None)
-    image = getattr(material, "image", None)
+    image = material_image(material)
     if image is not None and uv is not None and len(uv) == len(mesh.vertices):
         pixels = np.asarray(image.convert("RGB"))
         middle = np.asarray(uv)[mesh.faces].mean(axis=1)
@@ -30,6 +38,7 @@ def face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
         row = np.minimum(((1.0 - middle[:, 1]) * pixels.shape[0]).astype(int), pixels.shape[0] - 1)
         return pixels[row, column]
     diffuse = getattr(material, "diffuse", None)
+    diffuse = getattr(material, "main_color", None) if diffuse is None else diffuse
     if diffuse is not None:
         return np.tile(np.asarray(diffuse, np.uint8)[:3], (count, 1))
     return np.full((count, 3), 160, np.uint8)
@@ -101,9 +110,11 @@ def clean_surface(
         faces, colours = faces[good], colours[good]
     open_edges, busy_edges = edge_defects(faces)
     if busy_edges:
-        source.note(f"{where}: is not manifold ({busy_edges} edges with three faces or more); its hulls are rebuilt")
+        source.note(
+            f"{where}: is not manifold ({busy_edges} edges with three faces or more); collision uses closed hulls"
+        )
     elif open_edges:
-        source.note(f"{where}: is not watertight ({open_edges} open edges); its hulls are rebuilt from voxels")
+        source.note(f"{where}: is not watertight ({open_edges} open edges); collision uses closed hulls")
     return vertices, faces, colours
 
 

@@ -23,7 +23,7 @@ from converters.gibson import building, read_floors, read_traversable
 from converters.maps import sample_faces
 from converters.obj import TexturedMesh, join_meshes, read_scan_obj
 from converters.objects import upright_box
-from converters.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, RawScene
+from converters.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, Hinge, RawScene
 from converters.storeys import label_storeys
 from converters.surfaces import check_upright
 from converters.urdf import colours_of_faces, read_urdf
@@ -32,6 +32,11 @@ MESH = "mesh_z_up_cleaned.obj"
 PREFIX = "alignment_centered"
 CLASSES = SYNSETS | {"00000001": "door"}
 """Synset ids of the release; doors had none."""
+DOOR_BAND_M = (0.3, 1.8)
+"""Heights above the door's foot at which walls stop a leaf."""
+DOOR_MOST_RAD = math.radians(120)
+NEAR_HINGE_M = 0.15
+"""A wall this close to the hinge carries the leaf and does not stop it."""
 PLANE_CELL_M = 0.1
 SAME_SHARE = 0.5
 """Two objects of one class that share this much of the smaller one's bounding box are one object."""
@@ -46,7 +51,8 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     """Reads cleaned mesh, floor planes, furniture, floor heights and maps.
 
     The furniture keeps its own mass, friction and collision meshes. A door's yaw is taken out of its mesh and
-    goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed.
+    goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed at the edge that stands
+    at a wall, and turns as far as walls let it.
 
     Args:
         root: the folder.
@@ -62,7 +68,12 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     labels = label_storeys(mesh.vertices, mesh.faces, heights)
     for k, height in enumerate(heights):
         mesh, labels = _with_plane(source, k, height, mesh, labels)
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
     pairs = [_furniture(source, path) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
+    pairs = [
+        (dataclasses.replace(a, hinge=assume_hinge(c.vertices, a.pose, middle)) if a.category == "door" else a, c)
+        for a, c in pairs
+    ]
     cads = {a.cad_id: c for a, c in pairs}
     annotations = _without_doubles(source, tuple(a for a, _ in pairs), cads)
     if annotations:
@@ -99,6 +110,43 @@ def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
     cad = CadModel(category, name, vertices, faces, colours, pieces, item.mass_kg, item.friction)
     none = np.zeros((0, 3))
     return Annotation(category, name, pose, "__SYM_NONE", none, none), cad
+
+
+def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> Hinge:
+    """The upright hinge of a door that came without one.
+
+    Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
+    stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
+    scanned leaf itself.
+
+    Args:
+        leaf: (n, 3) vertices, CAD frame, the leaf along x.
+        pose: (4, 4) CAD frame -> scan frame, upright and unscaled.
+        structure: (m, 3) points of the scan, m.
+    """
+    low, high = leaf.min(axis=0), leaf.max(axis=0)
+    local = (structure - pose[:3, 3]) @ pose[:3, :3]
+    height = local[:, 2] - low[2]
+    local = local[(height > DOOR_BAND_M[0]) & (height < DOOR_BAND_M[1]), :2]
+    across = (low[1] + high[1]) / 2
+    half, length = (high[1] - low[1]) / 2 + 0.02, high[0] - low[0]
+    choices = []
+    for end, inward in ((low[0], 1.0), (high[0], -1.0)):
+        # Distance from the hinge along the leaf as it stands, and across it.
+        point = (local - [end, across]) * [inward, 1.0]
+        radius, angle = np.hypot(*point.T), np.arctan2(point[:, 1], point[:, 0])
+        reach = (radius > NEAR_HINGE_M) & (radius < length + 0.02)
+        own = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
+        turns = np.arctan2(half, np.maximum(radius, half))  # a point stops the leaf this much before its middle line
+        stops = (angle - np.sign(angle) * turns)[reach & ~own]
+        ahead, behind = np.sort(stops[stops > 0]), np.sort(-stops[stops < 0])
+        # Three points make an obstacle; one or two are noise of the scan.
+        left = min(ahead[2] if len(ahead) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
+        right = min(behind[2] if len(behind) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
+        span = (-right, left) if inward > 0 else (-left, right)
+        choices.append((int((radius < NEAR_HINGE_M + half).sum()), left + right, (end, span)))
+    end, span = max(choices, key=lambda c: c[:2])[2]
+    return Hinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
 
 
 def _position(source: SourceFolder, urdf: str) -> np.ndarray:

@@ -116,10 +116,14 @@ def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFo
 
 
 def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
-    """Convex hull of (n, 3) points, body frame, with the lowest ones brought down to the base z = 0."""
+    """Convex hull of (n, 3) points, body frame, with the lowest ones brought down to the base z = 0.
+
+    A plate that is thickened (`convex_hull`) grows to both sides; what then stands below the base is lifted.
+    """
     level = points.copy()
     level[level[:, 2] < foot_m, 2] = 0.0
-    return convex_hull(np.vstack([points, level]))
+    hull = convex_hull(np.vstack([points, level]))
+    return dataclasses.replace(hull, vertices=hull.vertices - [0.0, 0.0, min(float(hull.vertices[:, 2].min()), 0.0)])
 
 
 def _properties(hulls: tuple[Hull, ...], mass_kg: float, friction: float, volume_m3: float) -> Physical:

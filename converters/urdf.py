@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from converters.cad import face_colours
+from converters.cad import face_colours, material_image
 from converters.errors import SceneRejected
 from converters.files import SourceFolder, check_mesh, read_obj
 from converters.obj import TexturedMesh, find_file, join_meshes, read_scan_obj
@@ -60,7 +60,7 @@ def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMe
         raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
     vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
     check_mesh(path, vertices, faces)
-    image = getattr(getattr(loaded.visual, "material", None), "image", None)
+    image = material_image(getattr(loaded.visual, "material", None))
     uv = getattr(loaded.visual, "uv", None)
     if image is not None and uv is not None and len(uv) == len(vertices):
         return TexturedMesh(vertices, faces, np.asarray(uv, float)[faces], np.asarray(image.convert("RGB")))
