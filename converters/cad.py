@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from converters.errors import SceneRejected
-from converters.files import SourceFolder, check_mesh
+from converters.files import SourceFolder, check_mesh, read_obj
 from converters.obj import parse_mtl
 from converters.raw import SYNSETS, CadModel
 
@@ -65,6 +65,7 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
         assert isinstance(loaded, trimesh.Scene)
         parts = [m for m in loaded.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     except Exception as error:  # trimesh's loaders raise anything on a broken file
+        read_obj(path)  # says more about what is wrong
         raise SceneRejected(
             f"{path}: not readable as a mesh ({type(error).__name__}: {error}); fetch the model again"
         ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 import trimesh
@@ -18,8 +19,10 @@ from converters.urdf import read_urdf
 from tests.converters import tiny_raw
 from tests.converters.released import write_released
 
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "5"))
+"""For each file; more by hand."""
 FUZZ = settings(
-    max_examples=25,
+    max_examples=EXAMPLES,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
@@ -152,7 +155,7 @@ def test_annotations_with_any_value_anywhere(gibson_raw):
     }  # fmt: skip
     places = [p for p in leaves(good) if p and "position" not in p[:-1]]
 
-    @settings(FUZZ, max_examples=150)
+    @settings(FUZZ, max_examples=6 * EXAMPLES)
     @given(place=st.sampled_from(places), value=VALUES)
     @example(place=(0, "trs", "rotation"), value=[0, 0, 0, 0])
     @example(place=(0, "trs", "scale"), value=[1e300, 1e300, 1e300])
@@ -189,7 +192,7 @@ def test_urdf_attributes(tmp_path):
     good = ["1", "2", "0 0 0", "0 0 0", "box.obj", "1 1 1", "0.1", "0.2"]
     text = st.text(st.characters(blacklist_characters="<&'\"", blacklist_categories=("Cs", "Cc")), max_size=8)
 
-    @settings(FUZZ, max_examples=60)
+    @settings(FUZZ, max_examples=3 * EXAMPLES)
     @given(where=st.integers(0, 7), value=text | st.sampled_from(["nan", "0", "-1", "1e9", "1 2", "0 0 0", "..", "/"]))
     def run(where, value):
         words = list(good)

@@ -75,10 +75,8 @@ def two_materials(tmp_path, red: str = "red.png"):
     Image.fromarray(np.full((8, 4, 3), (255, 0, 0), np.uint8)).save(tmp_path / "red.png")
     (tmp_path / "m.mtl").write_text(f"newmtl red\nmap_Kd {red}\nnewmtl plain\nKd 0 0 1\n")
     uv = "vt 5.2 -3.9\nvt 5.9 -3.9\nvt 5.9 -3.1\n"  # a repeat: [0.2, 0.9] x [0.1, 0.9] of the image
-    obj(
-        tmp_path,
-        f"mtllib m.mtl\n{SQUARE}{uv}usemtl red\nf 1/1 2/2 3/3\nusemtl plain\nf 1/1 3/3 4/3\nusemtl none\nf 1/1 2/2 4/3\n",
-    )
+    faces = "usemtl red\nf 1/1 2/2 3/3\nusemtl plain\nf 1/1 3/3 4/3\nusemtl none\nf 1/1 2/2 4/3\n"
+    obj(tmp_path, f"mtllib m.mtl\n{SQUARE}{uv}{faces}")
     return SourceFolder(tmp_path)
 
 

@@ -20,7 +20,8 @@ from converters.urdf import convex_pieces, merge_pieces, read_urdf
 BOX = (0.3, 0.2, 0.1)
 URDF = """<robot name="{name}"><link name="base">
   <contact><lateral_friction value="0.8"/></contact>
-  <inertial><origin xyz="0 0 9"/><mass value="2.5"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  <inertial><origin xyz="0 0 9"/><mass value="2.5"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
   <visual><origin xyz="0 0 0.05"/><geometry><mesh filename="{mesh}" scale="{scale}"/></geometry></visual>
   <collision><origin xyz="0 0 0.05"/><geometry><mesh filename="{mesh}" scale="{scale}"/></geometry></collision>
 </link>{more}</robot>
@@ -79,7 +80,7 @@ def test_meshes_are_found_beside_the_urdf_and_scaled(tmp_path, mesh):
         ("<robot/>", "has no <link>"),
         ("nothing", "not readable as URDF"),
         ("<robot><link name='a'/></robot>", "names no mesh"),
-        ("<robot><link name='a'><visual><geometry><mesh filename='b.obj'/></geometry></visual></link></robot>", "b.obj"),
+        ("<robot><link name='a'><visual><geometry><mesh filename='b'/></geometry></visual></link></robot>", "mesh 'b'"),
         ("<robot><link name='a'><visual><geometry><capsule/></geometry></visual></link></robot>", "<capsule>"),
         ("<robot><link name='a'><inertial><mass value='x'/></inertial></link></robot>", "not readable as URDF"),
         ("<robot><link name='a'><inertial><mass value='nan'/></inertial></link></robot>", "usable numbers"),
