@@ -102,6 +102,9 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=150_000, help="of the raw scan, about")
     parser.add_argument("--objects", type=int, default=25, help="movable objects, doors included")
     parser.add_argument("--seed", type=int, default=0, help="of the building")
+    parser.add_argument(
+        "--raw", type=Path, default=None, help="convert this raw Gibson folder instead of generating one"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="decompositions side by side")
     parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
     parser.add_argument("--out", default="benchmarks/results/convert.jsonl")
@@ -109,12 +112,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="convert-") as folder:
         base = Path(folder)
         clock = time.perf_counter()
-        generate_building(base / "raw", args.seed, config=building_config(args.faces, args.objects))
+        if args.raw is None:
+            generate_building(base / "raw", args.seed, config=building_config(args.faces, args.objects))
+        raw = args.raw or base / "raw"
         generate_s = round(time.perf_counter() - clock, 1)
         for kind in ("cold", "warm"):
             load = os.getloadavg()[0]
-            row: dict[str, Any] = {"cache": kind, "faces": count_faces(base / "raw"), "seed": args.seed}
-            row |= measure(base / "raw", base / kind, base / "cache", args.jobs)
+            row: dict[str, Any] = {"cache": kind, "faces": count_faces(raw), "seed": args.seed}
+            row |= measure(raw, base / kind, base / "cache", args.jobs)
             row |= {
                 "memory_bound_mib": row["peak_mib"] + args.jobs * row["peak_child_mib"],
                 "generate_s": generate_s,

@@ -94,7 +94,7 @@ class StageCache:
                 digest.update(repr(key).encode())
                 self._feed(digest, value[key])
             digest.update(b")")
-        elif value is None or isinstance(value, (bool, int, float, str, np.generic)):
+        elif value is None or isinstance(value, (bool, int, float, str, Path, np.generic)):
             digest.update(f"s{type(value).__name__}{value!r};".encode())
         else:
             raise TypeError(f"a {type(value).__name__} cannot be hashed by content")

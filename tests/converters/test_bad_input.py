@@ -49,7 +49,7 @@ def write_cad(root: Path, mesh: trimesh.Trimesh) -> None:
 def test_an_open_non_manifold_model_with_dead_faces_converts(gibson_raw, tmp_path):
     """Half of the table's top is missing, a fin hangs on an edge, and some faces have no area."""
     table = tiny_raw.table_cad()
-    faces = np.vstack([table.faces[2:], [[0, 1, 20], [0, 1, 21], [5, 5, 6]]])
+    faces = np.vstack([table.faces[2:], [[0, 1, 20], [0, 1, 21], [0, 1, 22], [5, 5, 6]]])
     write_cad(gibson_raw, trimesh.Trimesh(table.vertices, faces, process=False))
     converted = convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
     manifest = load_manifest(tmp_path / "out")
