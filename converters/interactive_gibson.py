@@ -138,8 +138,8 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> H
         reach = (radius > NEAR_HINGE_M) & (radius < length + 0.02)
         own = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
         turns = np.arctan2(half, np.maximum(radius, half))  # a point stops the leaf this much before its middle line
-        stops = (angle - np.sign(angle) * turns)[reach & ~own]
-        ahead, behind = np.sort(stops[stops > 0]), np.sort(-stops[stops < 0])
+        stops = np.asarray(angle - np.sign(angle) * turns)[reach & ~own]
+        ahead, behind = np.sort(stops[stops > 0]), np.sort(np.negative(stops[stops < 0]))
         # Three points make an obstacle; one or two are noise of the scan.
         left = min(ahead[2] if len(ahead) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
         right = min(behind[2] if len(behind) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)

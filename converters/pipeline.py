@@ -7,6 +7,7 @@ import dataclasses
 import os
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -316,7 +317,31 @@ def publish(folders: dict[Path, Path]) -> None:
 
     Signals wait until it is done: a few renames take no time, and half of them would be worse.
     """
-    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    with _signals_wait():
+        _publish(folders)
+
+
+@contextlib.contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Holds back SIGINT and SIGTERM; one that came is raised at the end.
+
+    By handlers and not by a mask, which would hold for this thread only: libraries run others.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python runs handlers in the main thread only
+        return
+    came: list[int] = []
+    before = {s: signal.signal(s, lambda number, frame: came.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for number in came[:1]:
+        signal.raise_signal(number)
+
+
+def _publish(folders: dict[Path, Path]) -> None:
     moved: list[tuple[Path, Path | None]] = []
     try:
         for temporary, target in folders.items():
@@ -332,8 +357,6 @@ def publish(folders: dict[Path, Path]) -> None:
             if old is not None:
                 old.rename(target)
         raise
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, masked)
     for _, old in moved:
         if old is not None:
             shutil.rmtree(old, ignore_errors=True)
