@@ -7,7 +7,8 @@ cache folder, each time in a process of its own. A row holds wall seconds in all
 memory, and the machine. Memory is the larger of the converter's own peak and its largest child's
 (`resource.getrusage`), and beside it the sum of the converter and `--jobs` such children, which bounds what all hold
 together. Rows are appended to `benchmarks/results/convert.jsonl`; on a machine that others use, times are upper
-bounds, and the load is recorded beside them.
+bounds: the load is recorded beside them, and `cpu_s`, the processor seconds of the converter and its children, which
+depends on it little.
 """
 
 from __future__ import annotations
@@ -36,9 +37,11 @@ start = time.perf_counter()
 from pathlib import Path
 from converters.pipeline import ConvertConfig, convert
 done = convert(Path(sys.argv[1]), Path(sys.argv[2]), ConvertConfig(jobs=int(sys.argv[4])), cache=Path(sys.argv[3]))
-peak = {who: resource.getrusage(getattr(resource, f"RUSAGE_{who}")).ru_maxrss / 1024 for who in ("SELF", "CHILDREN")}
+usage = {who: resource.getrusage(getattr(resource, f"RUSAGE_{who}")) for who in ("SELF", "CHILDREN")}
+peak = {who: u.ru_maxrss / 1024 for who, u in usage.items()}
 print(json.dumps({
     "wall_s": round(time.perf_counter() - start, 1),
+    "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in usage.values()), 1),
     "stage_s": {k: round(v, 2) for k, v in done.stage_s.items()},
     "peak_mib": round(peak["SELF"]),
     "peak_child_mib": round(peak["CHILDREN"]),
