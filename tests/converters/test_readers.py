@@ -192,7 +192,7 @@ def test_a_model_without_any_area_is_refused(gibson_raw, text):
 
 def test_a_model_with_nan_is_refused(gibson_raw):
     path = table_obj(gibson_raw)
-    path.write_text(path.read_text().replace("v 0.5", "v nan", 1))
+    path.write_text(path.read_text().replace("v 0.500000 ", "v nan ", 1))
     refused(read_gibson, gibson_raw, "model_normalized.obj", "vertices are not finite")
 
 
