@@ -122,6 +122,9 @@ def main() -> None:
         for kind in ("cold", "warm"):
             load = os.getloadavg()[0]
             row: dict[str, Any] = {"cache": kind, "faces": count_faces(raw), "seed": args.seed}
+            row["building"] = (
+                "given folder" if args.raw else f"generated: --faces {args.faces} --objects {args.objects}"
+            )
             row |= measure(raw, base / kind, base / "cache", args.jobs)
             row |= {
                 "memory_bound_mib": row["peak_mib"] + args.jobs * row["peak_child_mib"],
