@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import shutil
 import signal
@@ -146,13 +145,6 @@ def test_a_failure_half_way_leaves_nothing_and_keeps_the_old_scene(gibson_raw, t
     with pytest.raises(SceneRejected, match="no traversable floor"):
         convert(gibson_raw, out, dataclasses.replace(SMALL, overwrite=True), cache=hull_cache)
     assert [p.name for p in out.parent.iterdir()] == ["out"] and contents(out) == {"old.txt": b"old"}
-
-
-def test_no_annotation_at_all(gibson_raw, tmp_path, hull_cache):
-    empty = [tiny_raw.annotation()[0] | {"aligned_models": []}]
-    (gibson_raw / "alignments.json").write_text(json.dumps(empty))
-    with pytest.raises(SceneRejected, match="no annotated object"):
-        convert(gibson_raw, tmp_path / "out", SMALL, cache=hull_cache)
 
 
 def test_settling_parts_two_objects_that_overlap(tiny_scene):
