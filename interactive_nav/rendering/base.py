@@ -95,6 +95,15 @@ class Renderer(abc.ABC):
             [N, H, W] u8.
         """
 
+    @abc.abstractmethod
+    def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """Which box each pixel shows: what colours and normals are made from.
+
+        Returns:
+            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
+            -1 nothing.
+        """
+
     def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
         """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""
         return one_of_batch(self.render_batch, (scene, qpos, camera))

@@ -209,3 +209,28 @@ def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax
     pos, axes = body_poses(tables, scene, qpos)
     pos, axes = pos[..., tables.body, :], axes[..., tables.body, :, :]
     return pos + rotate(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
+
+
+def with_robot(tables: BoxTables, world: World) -> BoxTables:
+    """The same boxes and one about the robot, for views from outside."""
+    slots, scenes = len(tables.slot_qpos), tables.half_m.shape[0]
+    radius, half_height = world.robot.footprint_radius_m, world.robot.height_m / 2
+
+    def add(array: jax.Array, row: list, at: int) -> jax.Array:
+        new = jnp.broadcast_to(jnp.asarray(row, array.dtype), (scenes, 1, *array.shape[2:]))
+        return jnp.concatenate([array[:, :at], new, array[:, at:]], 1)
+
+    eye = np.eye(3).tolist()
+    return tables.replace(
+        body=np.append(np.where(tables.body == slots, slots + 1, tables.body), slots),
+        slot_qpos=np.append(tables.slot_qpos, world.layout.robot_qpos),
+        hinged=np.append(tables.hinged, False),
+        pos_b=add(tables.pos_b, [0.0, 0.0, half_height], tables.num_boxes),
+        axes_b=add(tables.axes_b, eye, tables.num_boxes),
+        half_m=add(tables.half_m, [0.8 * radius, 0.8 * radius, half_height], tables.num_boxes),
+        class_id=add(tables.class_id, CLASS_IDS["robot"], tables.num_boxes),
+        hinge_pos_w=add(tables.hinge_pos_w, [0.0] * 3, slots),
+        hinge_axes_w=add(tables.hinge_axes_w, eye, slots),
+        hinge_axis_b=add(tables.hinge_axis_b, [0.0] * 3, slots),
+        hinge_anchor_b=add(tables.hinge_anchor_b, [0.0] * 3, slots),
+    )

@@ -1,8 +1,8 @@
 """Rays against boxes in plain JAX: `BoxTables`, poses and a lens in, depth and class images out, on any device.
 
 A ray meets a box where it has entered the box's three slabs and left none. A pixel keeps one integer, the bits
-of its nearest distance with the class id in the lowest four (2^-19 of the distance), so that a minimum over
-boxes yields both. Two orders of work:
+of its nearest distance with the class id in the lowest four (which costs 2^-19 of the distance), so that a minimum
+over boxes yields both. Two orders of work:
 
 - `scan`: every box against every pixel, a few boxes at a time, one fused pass over the image each; for GPUs.
 - `tiles`: the image is cut into tiles, each with the list of boxes that may show in it, and tiles with lists of
@@ -19,7 +19,8 @@ from interactive_nav.rendering.base import FAR_M, NEAR_M, CameraPose, Lens, Rend
 from interactive_nav.rendering.boxes import BoxTables, box_poses, compose, rotate
 
 _EMPTY = np.int32(2**31 - 1)
-_ID_BITS = 15
+_CLASS_MASK = 15
+"""The lowest four bits of a key hold a class id; `trace_batch` takes as many as box indices need."""
 _BOXES_AT_ONCE = 8
 _TILES_AT_ONCE = 64
 
@@ -41,11 +42,24 @@ class RayRenderer(Renderer):
 
     def render_batch(self, scene, qpos, camera):
         boxes = boxes_seen(self._tables, scene, qpos, camera)
-        if self._tiled and self._tables.num_boxes:
-            keys = _tiles(boxes, camera, self.lens)
-        else:
-            keys = _scan(boxes, camera, self.lens)
-        return decode(keys)
+        depth, ids = self._cast(boxes, camera, _CLASS_MASK)
+        return depth, ids.astype(jnp.uint8)
+
+    def trace_batch(self, scene, qpos, camera):
+        count = self._tables.num_boxes
+        boxes = boxes_seen(self._tables, scene, qpos, camera)
+        boxes["id"] = jnp.broadcast_to(jnp.arange(1, count + 1, dtype=jnp.int32), boxes["id"].shape)
+        depth, ids = self._cast(boxes, camera, (1 << count.bit_length()) - 1)
+        index = jnp.where(ids > 0, ids - 1, count)
+        return depth, jnp.where(depth > 0, index, -1)
+
+    def _cast(self, boxes: dict[str, jax.Array], camera: CameraPose, mask: int) -> tuple[jax.Array, jax.Array]:
+        """Depth f32, m, and the boxes' numbers i32; both 0 where nothing is met before the far plane."""
+        cast = _tiles if self._tiled and self._tables.num_boxes else _scan
+        keys = cast(boxes, camera, self.lens, mask)
+        distance = jax.lax.bitcast_convert_type(keys & ~mask, jnp.float32)
+        met = distance < FAR_M
+        return jnp.where(met, distance, 0.0), jnp.where(met, keys & mask, 0)
 
 
 def boxes_seen(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> dict[str, jax.Array]:
@@ -63,14 +77,6 @@ def boxes_seen(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: Cam
         "half": tables.half_m[scene],
         "id": tables.class_id[scene].astype(jnp.int32),
     }
-
-
-def decode(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Keys i32 to depth f32, m, 0 where empty or beyond the far plane, and class ids u8."""
-    distance = jax.lax.bitcast_convert_type(keys & ~_ID_BITS, jnp.float32)
-    met = distance < FAR_M
-    ids = jnp.where(met, keys & _ID_BITS, 0)
-    return jnp.where(met, distance, 0.0), ids.astype(jnp.uint8)
 
 
 def _lesser(a, b):
@@ -104,19 +110,19 @@ def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
     return entry, leave
 
 
-def _key(entry, leave, half, number) -> jax.Array:
+def _key(entry, leave, half, number, mask: int) -> jax.Array:
     met = (entry < leave) & (entry > NEAR_M) & (half >= 0)
-    return jnp.where(met, (jax.lax.bitcast_convert_type(entry, jnp.int32) & ~_ID_BITS) | number, _EMPTY)
+    return jnp.where(met, (jax.lax.bitcast_convert_type(entry, jnp.int32) & ~mask) | number, _EMPTY)
 
 
-def _floor_key(height, down) -> jax.Array:
+def _floor_key(height, down, mask: int) -> jax.Array:
     """The floor's key for a camera `height` above it and rays that fall by `down` per unit of depth; its id is 0."""
     met = down > 1e-6
     distance = jnp.where(met, height / jnp.where(met, down, 1.0), -1.0)
-    return jnp.where(distance > NEAR_M, jax.lax.bitcast_convert_type(distance, jnp.int32) & ~_ID_BITS, _EMPTY)
+    return jnp.where(distance > NEAR_M, jax.lax.bitcast_convert_type(distance, jnp.int32) & ~mask, _EMPTY)
 
 
-def _scan(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens) -> jax.Array:
+def _scan(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: int) -> jax.Array:
     right, up = jnp.asarray(lens.columns), jnp.asarray(lens.rows)[:, None]
 
     def direction(axes):
@@ -131,9 +137,9 @@ def _scan(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens) -> jax.Ar
         directions = [direction(box["axes"][:, i]) for i in range(3)]
         eye, half = [image(box["eye"][:, i]) for i in range(3)], [image(box["half"][:, i]) for i in range(3)]
         entry, leave = enter_and_leave(eye, half, directions)
-        return jnp.minimum(keys, _key(entry, leave, half[0], image(box["id"]))), None
+        return jnp.minimum(keys, _key(entry, leave, half[0], image(box["id"]), mask)), None
 
-    keys = _floor_key(camera.pos_w[:, 2, None, None], -direction(camera.axes_w[:, 2]))
+    keys = _floor_key(camera.pos_w[:, 2, None, None], -direction(camera.axes_w[:, 2]), mask)
     per_box = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), boxes)
     return jax.lax.scan(body, keys, per_box, unroll=_BOXES_AT_ONCE)[0]
 
@@ -163,7 +169,7 @@ def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Arr
     return (centre + reach > -slack)[..., :-1] & (centre - reach < slack)[..., 1:]
 
 
-def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens) -> jax.Array:
+def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: int) -> jax.Array:
     n, num_boxes = boxes["id"].shape
     tw, th = _tile_side(lens.width), _tile_side(lens.height)
     nx, ny = -(-lens.width // tw), -(-lens.height // th)
@@ -215,10 +221,10 @@ def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens) -> jax.A
             wide = [c[:, None] for c in column]
             entry, leave = enter_and_leave(wide[9:12], wide[12:15], directions)
             number = jax.lax.bitcast_convert_type(row[:, 15:], jnp.int32)
-            return k + 1, jnp.minimum(keys, _key(entry, leave, wide[12], number))
+            return k + 1, jnp.minimum(keys, _key(entry, leave, wide[12], number, mask))
 
         fall = falls[tiles]
-        keys = _floor_key(fall[:, 3:], direction(fall[:, 0], fall[:, 1], fall[:, 2]))
+        keys = _floor_key(fall[:, 3:], direction(fall[:, 0], fall[:, 1], fall[:, 2]), mask)
         return jax.lax.while_loop(lambda carry: carry[0] < todo, body, (jnp.int32(0), keys))[1]
 
     order = jnp.argsort(lengths)

@@ -7,13 +7,15 @@ one is made for each batch size and kept.
 
 from __future__ import annotations
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
 
-from interactive_nav.rendering.base import FAR_M, NEAR_M, Lens, Renderer
+from interactive_nav.rendering.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
 from interactive_nav.rendering.boxes import BoxTables, box_poses
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
@@ -56,7 +58,6 @@ class WarpRenderer(Renderer):
         return depth, jnp.take_along_axis(ids, flat, 1).reshape(depth.shape)
 
     def trace_batch(self, scene, qpos, camera):
-        """Depth [N, H, W] f32, m, and indices [N, H, W] i32 of the boxes met; B for the floor, -1 for nothing."""
         n = scene.shape[0]
         context = self._context(n)
         centre, axes = box_poses(self._tables, scene, qpos)
@@ -90,6 +91,56 @@ class WarpRenderer(Renderer):
         depth = depth.reshape(shape)
         met = (geom >= 0) & (depth > NEAR_M) & (depth < FAR_M)
         return jnp.where(met, depth, 0.0), jnp.where(met, geom, -1)
+
+
+class WarpColour:
+    """RGB of one scene's visual meshes, with textures, for a batch of poses of it."""
+
+    def __init__(self, model: mujoco.MjModel, lens: Lens, n: int, groups: list[int]):
+        """Makes a context; the first picture compiles.
+
+        Args:
+            model: with visual meshes, and one camera, whose field of view is set here.
+            lens: of the camera.
+            n: pictures a call.
+            groups: geom groups that are drawn.
+        """
+        model = copy.copy(model)
+        model.cam_fovy[:] = lens.fov_deg
+        self._host, self._lens = model, lens
+        self._model = mjx.put_model(model, impl="warp")
+        self._context = mjx.create_render_context(
+            model,
+            nworld=n,
+            cam_res=(lens.width, lens.height),
+            render_rgb=True,
+            render_depth=False,
+            render_seg=False,
+            enabled_geom_groups=groups,
+            enable_backface_culling=False,
+            background_color=(0.93, 0.95, 0.97, 1.0),
+        )
+        self.draw = jax.jit(self._draw)
+
+    def _draw(self, geom_xpos, geom_xmat, camera: CameraPose) -> jax.Array:
+        """Geoms' poses [N, ngeom, 3] and [N, ngeom, 3, 3], cameras [N, ...] to [N, H, W, 3] u8."""
+        n = geom_xpos.shape[0]
+        context, template = self._context.pytree(), mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
+        forward, right, up = (jnp.asarray(camera.axes_w, jnp.float32)[..., i] for i in range(3))
+        fields = {
+            "geom_xpos": jnp.asarray(geom_xpos, jnp.float32),
+            "geom_xmat": jnp.asarray(geom_xmat, jnp.float32),
+            "cam_xpos": jnp.asarray(camera.pos_w, jnp.float32)[:, None],
+            "cam_xmat": jnp.stack([right, up, -forward], -1)[:, None],
+            "qpos": jnp.zeros((n, self._host.nq)),
+        }
+
+        def one(fields):
+            data = mjx.refit_bvh(self._model, template.replace(**fields), context)
+            return mjx.render(self._model, data, context)[0]
+
+        packed = jax.vmap(one)(fields).reshape(n, self._lens.height, self._lens.width)
+        return jnp.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], -1).astype(jnp.uint8)
 
 
 def _box_model(num_boxes: int, lens: Lens) -> mujoco.MjModel:
