@@ -4,7 +4,8 @@
 
 Pictures show the scene's visual meshes. Depth, normals and segmentation come from C MuJoCo's rays, which run
 anywhere. RGB comes from MuJoCo's own renderer where a GL is (set MUJOCO_GL to egl or osmesa without a display), or
-from MJX-Warp's, both with textures; where neither is, from rays with a flat colour for each object.
+from MJX-Warp's, both with textures; where neither is, from rays with a flat colour for each object. MJX-Warp's runs
+on a CPU too, after a compilation of ten seconds a size, so there it is used only when asked for.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from interactive_nav.physics import resolve_backend
 from interactive_nav.rendering.base import FAR_M, CameraPose, Lens
 from interactive_nav.rendering.shading import BACKGROUND, PALETTE, lambert
 from interactive_nav.rendering.visual import ROBOT_GROUP, VISUAL_GROUP, VisualModel, build_visual
@@ -34,7 +36,7 @@ class Camera:
 
         Args:
             env: an `InteractiveNav`.
-            engine: of RGB: gl, warp, rays, or auto: gl where it works, else rays.
+            engine: of RGB: gl, warp, rays, or auto: gl where it works, else warp on an NVIDIA GPU, else rays.
 
         Raises:
             ValueError: unknown engine.
@@ -139,7 +141,7 @@ class Camera:
                         f"MuJoCo's renderer does not start here ({error}); set MUJOCO_GL to egl or osmesa and "
                         "install that library, or choose engine='warp' or 'rays'"
                     ) from error
-                self._engine = "rays"
+                self._engine = "warp" if resolve_backend("auto") == "warp" else "rays"
         if self._engine == "warp":
             from interactive_nav.rendering.warp import WarpColour
 

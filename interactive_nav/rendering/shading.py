@@ -54,22 +54,30 @@ def normals(
     """
     centre, axes = box_poses(tables, scene, qpos)
     n, boxes = centre.shape[:2]
-    # The floor is a box of no thickness after the others; so is "nothing", whose normal is put out below.
-    rows = jnp.concatenate([centre, axes.reshape(n, boxes, 9), tables.half_m[scene]], -1)
-    floor = jnp.concatenate([jnp.zeros(3), jnp.eye(3).ravel(), jnp.asarray([1e6, 1e6, 1e-6])])
-    rows = jnp.concatenate([rows, jnp.broadcast_to(floor, (n, 1, 15))], 1)
-    flat = jnp.where(index < 0, boxes, index).reshape(n, -1, 1)
-    row = jnp.take_along_axis(rows, flat, 1).reshape(*index.shape, 15)
-    box_axes = row[..., 3:12].reshape(*index.shape, 3, 3)
     forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
     ray = forward + right * jnp.asarray(lens.columns)[:, None] + up * jnp.asarray(lens.rows)[:, None, None]
-    point = camera.pos_w[:, None, None] + ray * depth[..., None] - row[..., :3]
-    local = rotate(jnp.swapaxes(box_axes, -1, -2), point)
-    # The face that the point lies on is the one that it is least inside of.
-    face = jnp.argmax(jnp.abs(local) - row[..., 12:15], -1)
-    chosen = jax.nn.one_hot(face, 3) * jnp.sign(local)
-    chosen = jnp.where((index == boxes)[..., None], jnp.asarray([0.0, 0.0, 1.0]), chosen)
-    return jnp.where((index < 0)[..., None], 0.0, rotate(box_axes, chosen))
+    point = camera.pos_w[:, None, None] + ray * depth[..., None]
+
+    def of_pixel(table):
+        """[N, B + 2, k] to [N, H, W, k]: rows by the pixels' indices; the floor's and nothing's come last."""
+        row = jnp.where(index < 0, boxes + 1, index) + (boxes + 2) * jnp.arange(n)[:, None, None]
+        return table.reshape(n * (boxes + 2), -1)[row]
+
+    def with_rest(table):
+        return jnp.concatenate([table, jnp.zeros((n, 2, table.shape[-1]))], 1)
+
+    # The face that a point lies on is the one that it is least inside of, by distance to the box's middle planes.
+    inverse = jnp.swapaxes(axes, -1, -2).reshape(n, boxes, 9)
+    planes = jnp.concatenate([inverse, rotate(jnp.swapaxes(axes, -1, -2), centre), tables.half_m[scene]], -1)
+    row = jax.lax.optimization_barrier(of_pixel(with_rest(planes)))
+    offsets = [(row[..., 3 * i : 3 * i + 3] * point).sum(-1) - row[..., 9 + i] for i in range(3)]
+    depths = [jnp.abs(o) - row[..., 12 + i] for i, o in enumerate(offsets)]
+    first = (depths[0] >= depths[1]) & (depths[0] >= depths[2])
+    second = ~first & (depths[1] >= depths[2])
+    normal = jnp.sign(offsets[2])[..., None] * row[..., 6:9]
+    normal = jnp.where(second[..., None], jnp.sign(offsets[1])[..., None] * row[..., 3:6], normal)
+    normal = jnp.where(first[..., None], jnp.sign(offsets[0])[..., None] * row[..., 0:3], normal)
+    return jnp.where((index == boxes)[..., None], jnp.asarray([0.0, 0.0, 1.0]), normal)
 
 
 def colours(tables: BoxTables, scene: jax.Array, camera: CameraPose, normal_w: jax.Array, index) -> jax.Array:
