@@ -21,6 +21,7 @@ from interactive_nav.rendering.boxes import BoxTables, box_poses, compose, rotat
 _EMPTY = np.int32(2**31 - 1)
 _CLASS_MASK = 15
 """The lowest four bits of a key hold a class id; `trace_batch` takes as many as box indices need."""
+_TINY = np.float32(1e-12)
 _BOXES_AT_ONCE = 8
 _TILES_AT_ONCE = 64
 
@@ -101,7 +102,8 @@ def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
     """
     entry = leave = None
     for o, h, d in zip(eye, half, directions, strict=True):
-        inverse = 1.0 / d
+        # A ray in a face's plane would divide by 0.
+        inverse = 1.0 / (d + _TINY)
         middle, reach = -o * inverse, h * jnp.abs(inverse)
         low, high = middle - reach, middle + reach
         entry = low if entry is None else _greater(entry, low)

@@ -47,10 +47,11 @@ def build_visual(world: World, scene: int) -> VisualModel:
         scene: index of the scene.
     """
     spec = mujoco.MjSpec.from_file(str(world.scenes[scene].path / "scene.xml"))
+    with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
     for geom in list(spec.geoms):
         # Hulls and boxes are for collision; a body without a visual mesh is drawn as its boxes.
         shown = geom.group == VISUAL_GROUP or geom.type == mujoco.mjtGeom.mjGEOM_PLANE
-        bare = not any(g.group == VISUAL_GROUP for g in geom.parent.geoms)
+        bare = geom.parent.name not in with_mesh
         geom.group = VISUAL_GROUP if shown or (bare and geom.type == mujoco.mjtGeom.mjGEOM_BOX) else 4
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
             geom.rgba = [0.56, 0.50, 0.43, 1.0]
