@@ -1,5 +1,6 @@
 """Observations beside the task's own: hand-made poses in a room of known size, noise, and the batched loop."""
 
+import dataclasses
 import math
 
 import jax
@@ -37,29 +38,17 @@ def moment(world):
     qpos[at + 7 : at + 9] = [7.0, -0.5]
     qvel = np.zeros(world.models[0].nv, np.float32)
     qvel[layout.robot_qvel + 6 : layout.robot_qvel + 8] = [3.0, -2.0]
-    zero, count = jnp.zeros(()), jnp.zeros((), jnp.int32)
-    nav = NavInfo(
-        scene_index=count,
-        goal_index=count,
-        goal_xy_w=jnp.zeros(2),
-        start_xy_w=jnp.zeros(2),
-        robot_pos_w=jnp.asarray([-1.0, 0.2, 0.0]),
-        yaw_rad=jnp.asarray(YAW),
-        waypoints_b=jnp.zeros((10, 2)),
-        object_pos_w=jnp.zeros((layout.num_slots, 3)),
-        geodesic_m=zero,
-        shortest_path_m=zero,
-        robot_path_m=zero,
-        object_path_m=jnp.zeros(layout.num_slots),
-        force_sum_n=zero,
-        interaction_steps=count,
-        structure_steps=count,
-        overflow_steps=count,
-        objects_dropped=count,
-        step_count=count + 7,
-        odometry=jnp.asarray([0.5, -0.1, 4.0]),
-        touching=jnp.asarray([True, False]),
-    )
+    zeros = {field.name: jnp.zeros((), jnp.int32) for field in dataclasses.fields(NavInfo)}
+    told = {
+        "goal_xy_w": jnp.zeros(2),
+        "robot_pos_w": jnp.asarray([-1.0, 0.2, 0.0]),
+        "yaw_rad": jnp.asarray(YAW),
+        "waypoints_b": jnp.zeros((10, 2)),
+        "step_count": jnp.asarray(7, jnp.int32),
+        "odometry": jnp.asarray([0.5, -0.1, 4.0]),
+        "touching": jnp.asarray([True, False]),
+    }
+    nav = NavInfo(**(zeros | told))
     return PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(qvel)), nav, jax.random.PRNGKey(5)
 
 
