@@ -7,6 +7,7 @@ invisible to itself.
 from __future__ import annotations
 
 import difflib
+from typing import Any
 
 import flax.struct
 import jax
@@ -216,7 +217,7 @@ def with_robot(tables: BoxTables, world: World) -> BoxTables:
     slots, scenes = len(tables.slot_qpos), tables.half_m.shape[0]
     radius, half_height = world.robot.footprint_radius_m, world.robot.height_m / 2
 
-    def add(array: jax.Array, row: list, at: int) -> jax.Array:
+    def add(array: jax.Array, row: Any, at: int) -> jax.Array:
         new = jnp.broadcast_to(jnp.asarray(row, array.dtype), (scenes, 1, *array.shape[2:]))
         return jnp.concatenate([array[:, :at], new, array[:, at:]], 1)
 

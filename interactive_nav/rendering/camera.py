@@ -15,6 +15,7 @@ import os
 import warnings
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -149,7 +150,7 @@ class Camera:
             if key not in self._renderers:
                 shown = [i for i, g in enumerate(groups) if g]
                 self._renderers[key] = WarpColour(visual.model, lens, 1, shown)
-            camera = CameraPose(pose.pos_w[None], pose.axes_w[None])
+            camera = CameraPose(jnp.asarray(pose.pos_w[None]), jnp.asarray(pose.axes_w[None]))
             arrays = data.geom_xpos[None], data.geom_xmat.reshape(1, -1, 3, 3)
             return np.asarray(self._renderers[key].draw(*arrays, camera))[0]
         return None

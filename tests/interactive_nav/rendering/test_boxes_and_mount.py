@@ -1,6 +1,7 @@
 """Class ids as the original's, and camera poses against C MuJoCo's kinematics."""
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -95,5 +96,5 @@ def test_a_camera_on_no_body_of_the_robot_is_refused():
 
 
 def test_looking_straight_down_has_axes():
-    axes = np.asarray(look_along(np.zeros(3, np.float32), np.array([0, 0, -2.0], np.float32)).axes_w)
+    axes = np.asarray(look_along(jnp.zeros(3), jnp.asarray([0.0, 0.0, -2.0])).axes_w)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)

@@ -69,7 +69,7 @@ def test_both_orders_of_work_draw_the_same(boxes, jumble, drawn):
 @pytest.mark.parametrize("size", [(20, 11), (37, 130)])
 def test_sizes_that_tiles_do_not_divide(boxes, jumble, size):
     scene, qpos, eye, forward = (x[:2] for x in jumble)
-    lens, camera = Lens(*size, 80.0), look_along(eye, forward)
+    lens, camera = Lens(size[0], size[1], 80.0), look_along(eye, forward)
     tiled = jax.jit(RayRenderer(boxes, lens, tiled=True).trace_batch)(scene, qpos, camera)
     scanned = jax.jit(RayRenderer(boxes, lens, tiled=False).trace_batch)(scene, qpos, camera)
     assert tiled[0].shape == (2, size[1], size[0])
