@@ -9,6 +9,12 @@ from typing import Any
 
 BACKENDS = ("auto", "warp", "jax", "native")
 OBSERVATIONS = ("goal", "velocity", "waypoints")
+"""Parts of the observation by default."""
+SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar")
+"""Parts of the state vector."""
+IMAGES = ("depth", "segmentation")
+RENDERERS = ("auto", "warp", "rays")
+IMAGE_DTYPES = ("float32", "float16", "uint8")
 COLLISIONS = ("boxes", "hulls")
 CONES = ("pyramidal", "elliptic")
 
@@ -24,7 +30,8 @@ class NavConfig:
     num_objects: int = 10
     """Small objects strewn about at random each episode."""
     observations: tuple[str, ...] = OBSERVATIONS
-    """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity."""
+    """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
+    odometry, collision, joints, lidar. With images (depth, segmentation) the observation is a dict."""
     k_int: float = 0.1
     """Interaction penalty per control step in which the robot touches a movable object."""
     success_reward: float = 10.0
@@ -74,6 +81,36 @@ class NavConfig:
     """Native backend: objects at rest sleep until touched."""
     threads: int = 0
     """Native backend: threads; 0: all cores."""
+    renderer: str = "auto"
+    """Who draws: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
+    image_size: int = 68
+    """Side of the square images, pixels."""
+    image_fov_deg: float | None = None
+    """Field of view; none: the robot's camera's (120 degrees)."""
+    image_dtype: str = "float32"
+    """Of images: float32 or float16 in [0, 1], or uint8, 255 times that."""
+    depth_range_m: float = 5.0
+    """Depth is cut off here and divided by it."""
+    segmentation_classes: int = 4
+    """Furniture classes: 4 as in the original's code (desk and table are one), or the paper's 5."""
+    depth_dropout: float = 0.0
+    """Share of depth pixels that read 0, drawn anew each step."""
+    depth_noise: float = 0.0
+    """Standard deviation of depth, as a share of it."""
+    lidar_rays: int = 228
+    """Beams of the planar scan, evenly over `lidar_fov_deg` from the right; by default the TurtleBot's Hokuyo."""
+    lidar_fov_deg: float = 240.0
+    """Angle that the scan covers, ahead in its middle."""
+    lidar_range_m: float = 5.6
+    """Distances are divided by it; 1 where nothing is nearer."""
+    lidar_pos_m: tuple[float, float, float] = (0.0, 0.0, 0.37)
+    """Scanner in the robot's base frame."""
+    lidar_dropout: float = 0.0
+    """Share of beams that read 1, drawn anew each step."""
+    lidar_noise: float = 0.0
+    """Standard deviation of a beam's distance, as a share of it."""
+    odometry_noise: float = 0.0
+    """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     def __post_init__(self) -> None:
         def refuse(field: str, expected: str) -> None:
@@ -86,10 +123,30 @@ class NavConfig:
             refuse("collision", f"one of {', '.join(COLLISIONS)}")
         if self.cone not in CONES:
             refuse("cone", f"one of {', '.join(CONES)}")
-        unknown = [o for o in self.observations if o not in OBSERVATIONS]
+        known = (*SIGNALS, *IMAGES)
+        unknown = [o for o in self.observations if o not in known]
         if unknown or not self.observations or len(set(self.observations)) != len(self.observations):
-            refuse("observations", f"a choice from {', '.join(OBSERVATIONS)}")
-        for field in ("episode_steps", "num_waypoints", "max_goals", "solver_iterations"):
+            refuse("observations", f"a choice from {', '.join(known)}")
+        for field, choice in (("renderer", RENDERERS), ("image_dtype", IMAGE_DTYPES), ("segmentation_classes", (4, 5))):
+            if getattr(self, field) not in choice:
+                refuse(field, f"one of {', '.join(map(str, choice))}")
+        if self.image_fov_deg is not None and not 0 < self.image_fov_deg < 180:
+            refuse("image_fov_deg", "between 0 and 180, or none")
+        if not 0 < self.lidar_fov_deg <= 360:
+            refuse("lidar_fov_deg", "between 0 and 360")
+        object.__setattr__(self, "lidar_pos_m", tuple(self.lidar_pos_m))
+        if len(self.lidar_pos_m) != 3:
+            refuse("lidar_pos_m", "three numbers")
+        for field in ("depth_dropout", "lidar_dropout"):
+            if not 0 <= getattr(self, field) <= 1:
+                refuse(field, "between 0 and 1")
+        for field in ("depth_noise", "lidar_noise", "odometry_noise"):
+            if not getattr(self, field) >= 0:
+                refuse(field, "0 or more")
+        for field in ("depth_range_m", "lidar_range_m"):
+            if not getattr(self, field) > 0:
+                refuse(field, "a positive number")
+        for field in ("episode_steps", "num_waypoints", "max_goals", "solver_iterations", "image_size", "lidar_rays"):
             if getattr(self, field) < 1:
                 refuse(field, "at least 1")
         for field in (

@@ -15,13 +15,14 @@ from brax.envs.base import Env, State
 from interactive_nav import metrics as scores
 from interactive_nav.config import NavConfig
 from interactive_nav.navigation import geodesic_at, waypoints_at
-from interactive_nav.observation import observe, parts, rotation_from_quat, waypoints_in_body
+from interactive_nav.observation import advance_odometry, rotation_from_quat, waypoints_in_body, wrap_angle
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
 from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.placement import draw_episode
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
+from interactive_nav.sensors import Sensors
 from interactive_nav.tables import build_tables, furniture_map, rest_poses
 from interactive_nav.types import EpisodeStart, NavInfo
 from interactive_nav.world import build_world, parking_spot
@@ -55,7 +56,8 @@ REWARD_TERMS = ("reward/success", "reward/potential", "reward/interaction")
 class InteractiveNav(Env):
     """A robot reaches a goal in a cluttered home; pushing things aside is allowed and costs something.
 
-    Observation: f32 (29,) by default, see `interactive_nav.observation`.
+    Observation: f32 (29,) by default, see `interactive_nav.observation`; a dict with images, see
+    `interactive_nav.sensors`.
     Action: f32 (A,) in [-1, 1], one per actuator (wheels: left, right).
     Reward: success + potential + interaction, see `interactive_nav.reward`.
     Done: success, time limit, a non-finite state, or dropped contacts; `info["truncation"]` is 1 where the
@@ -80,6 +82,7 @@ class InteractiveNav(Env):
         self.world = build_world(robot, scenes, config)
         self.tables = build_tables(self.world, config)
         self.physics = make_physics(self.world, config)
+        self.sensors = Sensors(self.world, config, self.physics.name)
         self.success_distance_m = config.success_distance_m or robot.body_width_m
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
         self._num_small = len(self.world.small_objects)
@@ -91,10 +94,9 @@ class InteractiveNav(Env):
         return self.physics.name
 
     @property
-    def observation_size(self) -> int:
-        """Length of the observation."""
-        sizes = parts(self.config.num_waypoints)
-        return sum(size for name, size in sizes.items() if name in self.config.observations)
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:  # type: ignore[override]
+        """Length of the observation; with images, the shape under each key."""
+        return self.sensors.observation_size
 
     @property
     def action_size(self) -> int:
@@ -119,6 +121,10 @@ class InteractiveNav(Env):
         Returns:
             The first state of the episode.
         """
+        return self.observe(self.draw(rng))
+
+    def draw(self, rng: jax.Array) -> State:
+        """`reset` without an observation: `obs` is empty until `observe`."""
         rng, key = jax.random.split(rng)
         start = draw_episode(
             key,
@@ -129,7 +135,7 @@ class InteractiveNav(Env):
             self.config.max_goal_distance_m,
             0.35 * self.config.nav_cell_m,
         )
-        return self.reset_to(start, rng)
+        return self._begin(start, rng)
 
     def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
         """The first state of a given episode (fixed evaluation episodes, tests).
@@ -138,6 +144,9 @@ class InteractiveNav(Env):
             start: what `draw_episode` returns; leaves of one environment.
             rng: key that the state carries for its next episode.
         """
+        return self.observe(self._begin(start, rng))
+
+    def _begin(self, start: EpisodeStart, rng: jax.Array) -> State:
         physics = self._initial_physics(start)
         pos_w, rotation = self._robot_pose(physics)
         scene, goal = start.scene_index, start.goal_index
@@ -166,11 +175,12 @@ class InteractiveNav(Env):
             unconverged_steps=count,
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
             step_count=count,
+            odometry=jnp.zeros(3),
+            touching=jnp.zeros(2, bool),
         )
         info = {"nav": nav, "rng": rng, "truncation": zero, "time_out": zero}
-        obs = self._observe(physics, nav, rotation)
         names = (*EPISODE_METRICS, *REWARD_TERMS)
-        return State(physics, obs, zero, zero, {name: zero for name in names}, info)  # pyright: ignore[reportArgumentType]
+        return State(physics, (), zero, zero, {name: zero for name in names}, info)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one environment by one control period.
@@ -179,6 +189,22 @@ class InteractiveNav(Env):
             state: what `reset` or `step` returned.
             action: (A,) in [-1, 1]; clipped, non-finite entries count as 0.
         """
+        state = self.advance(state, action)
+        return self.observe(state, blank=state.metrics["nonfinite"] > 0)
+
+    def observe(self, state: State, blank: jax.Array | bool = False) -> State:
+        """The state with the observation of where it is now.
+
+        Args:
+            state: of one environment; `obs` may be empty or old.
+            blank: observe nothing but zeros, as after a broken step.
+        """
+        nav: NavInfo = state.info["nav"]
+        obs = self.sensors.observe(state.pipeline_state, nav, state.info["rng"])  # pyright: ignore[reportArgumentType]
+        return state.replace(obs=jax.tree.map(lambda x: jnp.where(blank, jnp.zeros_like(x), x), obs))
+
+    def advance(self, state: State, action: jax.Array) -> State:
+        """`step` without an observation: `obs` stays what it was until `observe`."""
         nav: NavInfo = state.info["nav"]
         action = jnp.where(jnp.isfinite(action), action, 0.0)
         command = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
@@ -187,7 +213,7 @@ class InteractiveNav(Env):
             nav.scene_index, before, command, nav.step_count * self.config.control_dt_s
         )
         broken = signals.nonfinite > 0
-        nav, rotation = self._advance(nav, physics, signals, broken)
+        nav = self._advance(nav, physics, signals, broken, state.info["rng"])
 
         # Contacts were dropped: what the robot did is no longer known, and the episode ends here.
         lost = ~broken & (signals.overflow > 0)
@@ -207,11 +233,9 @@ class InteractiveNav(Env):
         values = self._scores(nav, success, broken)
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
-        obs = jnp.where(broken, 0.0, self._observe(physics, nav, rotation))
         truncation = (timed_out | lost).astype(jnp.float32)
         return state.replace(
             pipeline_state=physics,
-            obs=obs,
             reward=reward,
             done=done,
             metrics={**state.metrics, **values},
@@ -274,8 +298,8 @@ class InteractiveNav(Env):
         return waypoints_in_body(world, pos_w, rotation)
 
     def _advance(
-        self, nav: NavInfo, physics: PhysicsState, signals: StepSignals, broken: jax.Array
-    ) -> tuple[NavInfo, jax.Array]:
+        self, nav: NavInfo, physics: PhysicsState, signals: StepSignals, broken: jax.Array, rng: jax.Array
+    ) -> NavInfo:
         """The task's memory after a step; a broken step leaves positions and totals as they were."""
         scene, goal = nav.scene_index, nav.goal_index
         pos_w, rotation = self._robot_pose(physics)
@@ -285,23 +309,29 @@ class InteractiveNav(Env):
         travelled = _moved(pos_w - nav.robot_pos_w)
         pushed = jnp.where(self.tables.mass_kg[scene, 1:] > 0, _moved(objects - nav.object_pos_w), 0.0)
         ok = (~broken).astype(jnp.int32)
-        new = nav.replace(
+        yaw = jnp.where(broken, nav.yaw_rad, _yaw(rotation))
+        touches, hits_wall = self._touches(scene, signals), signals.structure_force_n > TOUCH_FORCE_N
+        slip = self.sensors.odometry_error(rng, nav.step_count)
+        return nav.replace(
             robot_pos_w=pos_w,
-            yaw_rad=jnp.where(broken, nav.yaw_rad, _yaw(rotation)),
+            yaw_rad=yaw,
             waypoints_b=self._waypoints(scene, goal, pos_w, rotation),
             object_pos_w=objects,
             geodesic_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
             robot_path_m=nav.robot_path_m + travelled,
             object_path_m=nav.object_path_m + pushed,
             force_sum_n=nav.force_sum_n + jnp.where(broken, 0.0, signals.force_n),
-            interaction_steps=nav.interaction_steps + ok * self._touches(scene, signals).astype(jnp.int32),
-            structure_steps=nav.structure_steps + ok * (signals.structure_force_n > TOUCH_FORCE_N).astype(jnp.int32),
+            interaction_steps=nav.interaction_steps + ok * touches.astype(jnp.int32),
+            structure_steps=nav.structure_steps + ok * hits_wall.astype(jnp.int32),
             overflow_steps=nav.overflow_steps + signals.overflow,
             left_out_steps=nav.left_out_steps + signals.left_out,
             unconverged_steps=nav.unconverged_steps + signals.unconverged,
             step_count=nav.step_count + 1,
+            odometry=advance_odometry(
+                nav.odometry, (pos_w - nav.robot_pos_w)[:2], nav.yaw_rad, wrap_angle(yaw - nav.yaw_rad), slip
+            ),
+            touching=~broken & jnp.stack([touches, hits_wall]),
         )
-        return new, rotation
 
     def _scores(self, nav: NavInfo, success: jax.Array, broken: jax.Array) -> dict[str, jax.Array]:
         masses = self.tables.mass_kg[nav.scene_index]
@@ -331,18 +361,6 @@ class InteractiveNav(Env):
             "objects_dropped": nav.objects_dropped,
         }
         return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
-
-    def _observe(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array) -> jax.Array:
-        v = self.world.layout.robot_qvel
-        return observe(
-            self.config.observations,
-            nav.robot_pos_w,
-            rotation,
-            physics.qvel[v : v + 3],
-            physics.qvel[v + 3 : v + 6],
-            nav.goal_xy_w,
-            nav.waypoints_b,
-        )
 
 
 def _yaw(rotation: jax.Array) -> jax.Array:

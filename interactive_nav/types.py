@@ -96,6 +96,10 @@ class NavInfo:
     """[] i32 small objects for which no free place was found: parked outside."""
     step_count: jax.Array
     """[] i32 control steps done."""
+    odometry: jax.Array
+    """(3,) f32 x, y (m) and yaw (rad) reckoned from the start's frame."""
+    touching: jax.Array
+    """(2,) bool: a movable object, a wall was touched in the last control step."""
 
 
 @flax.struct.dataclass

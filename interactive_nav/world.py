@@ -124,7 +124,8 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
     return np.stack(kept)
 
 
-def _sorted_movables(scene: Scene) -> tuple[list[Movable], list[Movable]]:
+def sorted_movables(scene: Scene) -> tuple[list[Movable], list[Movable]]:
+    """A scene's free and hinged bodies, in the order of the slots that hold them: most boxes first."""
     free = sorted((m for m in scene.movables if m.hinge is None), key=lambda m: -len(m.boxes))
     hinged = sorted((m for m in scene.movables if m.hinge is not None), key=lambda m: -len(m.boxes))
     return free, hinged
@@ -316,7 +317,7 @@ def _build_spec(
         name = f"{obj.category}_small_{i}"
         _add_small(spec, name, obj, len(slots))
         slots.append((name, "small"))
-    lists = [_sorted_movables(s) for s in scenes]
+    lists = [sorted_movables(s) for s in scenes]
     for kind, per_scene in (("free", [a for a, _ in lists]), ("hinge", [b for _, b in lists])):
         for i in range(max(len(x) for x in per_scene)):
             column = _slot(per_scene, i)
@@ -444,7 +445,7 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     layout = _layout(models[0], robot, slots)
     occupied, mass, names, rest, moved = [], [], [], [], []
     for scene, model in zip(scenes, models, strict=True):
-        free, hinged = _sorted_movables(scene)
+        free, hinged = sorted_movables(scene)
         count = {"free": len(free), "hinge": len(hinged)}
         own, label = [], []
         for name, kind in slots:

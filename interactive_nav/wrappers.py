@@ -26,8 +26,8 @@ class AutoResetEnv(Env):
         self.env = env
 
     @property
-    def observation_size(self) -> int:
-        """Length of the observation."""
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:  # type: ignore[override]
+        """Length of the observation; with images, the shape under each key."""
         return self.env.observation_size
 
     @property
@@ -60,7 +60,7 @@ class AutoResetEnv(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """N states and [N, A] actions to N states."""
-        stepped = jax.vmap(self.env.step)(state, action)
+        stepped = jax.vmap(self.env.advance)(state, action)
         done = stepped.done > 0
         steps = stepped.info["nav"].step_count.astype(jnp.float32)
         total = state.info["running_reward"] + stepped.reward
@@ -72,8 +72,8 @@ class AutoResetEnv(Env):
         def draw(current):
             return self._with_new_episodes(current, done)
 
-        moving = (stepped.pipeline_state, stepped.obs, stepped.info["nav"], stepped.info["rng"])
-        physics, obs, nav, rng = jax.lax.cond(done.any(), draw, lambda x: x, moving)
+        moving = (stepped.pipeline_state, stepped.info["nav"], stepped.info["rng"])
+        physics, nav, rng = jax.lax.cond(done.any(), draw, lambda x: x, moving)
         info = {
             **stepped.info,
             "nav": nav,
@@ -83,12 +83,12 @@ class AutoResetEnv(Env):
             "running_reward": jnp.where(done, 0.0, total),
             "episode_metrics": episode_metrics,
         }
-        return stepped.replace(pipeline_state=physics, obs=obs, info=info)
+        # Observed once, after new episodes have begun: images cost as much as physics.
+        return jax.vmap(self.env.observe)(stepped.replace(pipeline_state=physics, info=info))
 
     def _with_new_episodes(self, current, done: jax.Array):
-        rng = current[3]
-        fresh = jax.vmap(self.env.reset)(rng)
-        new = (fresh.pipeline_state, fresh.obs, fresh.info["nav"], fresh.info["rng"])
+        fresh = jax.vmap(self.env.draw)(current[-1])
+        new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
 
         def choose(a, b):
             return jnp.where(done.reshape(done.shape + (1,) * (a.ndim - 1)), a, b)

@@ -1,0 +1,148 @@
+"""What every renderer offers: scenes, `qpos` and camera poses in, depth and class images out, for a batch at once."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import custom_batching
+
+NEAR_M = 0.01
+FAR_M = 100.0
+"""Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """A pinhole camera with square pixels."""
+
+    width: int
+    height: int
+    fov_deg: float
+    """Vertical field of view."""
+
+    @property
+    def half_height(self) -> float:
+        """Half of the image's height at depth 1."""
+        return math.tan(math.radians(self.fov_deg) / 2)
+
+    @property
+    def pixel(self) -> float:
+        """Side of a pixel at depth 1."""
+        return 2 * self.half_height / self.height
+
+    @property
+    def columns(self) -> np.ndarray:
+        """[width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
+        return ((np.arange(self.width) + 0.5 - self.width / 2) * self.pixel).astype(np.float32)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[height] f32: upward offset at depth 1, top to bottom."""
+        return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
+
+
+@flax.struct.dataclass
+class CameraPose:
+    """Where a camera is, world frame."""
+
+    pos_w: jax.Array
+    """[..., 3] f32, m."""
+    axes_w: jax.Array
+    """[..., 3, 3] f32, columns: forward, right, up."""
+
+
+def look_along(pos_w: jax.Array, forward_w: jax.Array) -> CameraPose:
+    """A camera without roll: its right is horizontal, as if the world's z were up.
+
+    Args:
+        pos_w: [..., 3] m.
+        forward_w: [..., 3], any length; a vertical one takes the world's -y as right.
+    """
+    forward = forward_w / jnp.linalg.norm(forward_w, axis=-1, keepdims=True)
+    flat = jnp.stack([forward[..., 1], -forward[..., 0], jnp.zeros_like(forward[..., 0])], -1)
+    length = jnp.linalg.norm(flat, axis=-1, keepdims=True)
+    aside = jnp.asarray([0.0, -1.0, 0.0], forward.dtype)
+    right = jnp.where(length > 1e-6, flat / jnp.where(length > 1e-6, length, 1.0), aside)
+    up = jnp.cross(right, forward)
+    return CameraPose(pos_w, jnp.stack([forward, right, up], -1))
+
+
+class Renderer(abc.ABC):
+    """Draws N environments at once through one lens."""
+
+    name: str
+    lens: Lens
+
+    @abc.abstractmethod
+    def render_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """Draws a batch.
+
+        Args:
+            scene: [N] i32 index of each environment's scene.
+            qpos: [N, nq] f32.
+            camera: leaves [N, ...].
+
+        Returns:
+            Depth [N, H, W] f32, the distance along the optical axis, m, 0 where nothing is met, and class ids
+            [N, H, W] u8.
+        """
+
+    @abc.abstractmethod
+    def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """Which box each pixel shows: what colours and normals are made from.
+
+        Returns:
+            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
+            -1 nothing.
+        """
+
+    def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""
+        return one_of_batch(self.render_batch, (scene, qpos, camera))
+
+
+def _flatten(tree: Any, outer: int, inner: int) -> Any:
+    return jax.tree.map(lambda x: x.reshape((outer * inner, *x.shape[2:])), tree)
+
+
+def _broadcast(tree: Any, batched: Any, size: int) -> Any:
+    return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
+
+
+def _many(batch: Callable[..., Any], args: tuple) -> Any:
+    @custom_batching.custom_vmap
+    def many(*args):
+        return batch(*args)
+
+    @many.def_vmap
+    def rule(axis_size, in_batched, *args):
+        args = _broadcast(args, tuple(in_batched), axis_size)
+        inner = jax.tree.leaves(args)[0].shape[1]
+        out = _many(batch, _flatten(args, axis_size, inner))
+        out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return many(*args)
+
+
+def one_of_batch(batch: Callable[..., Any], args: tuple) -> Any:
+    """A batch function's result for one element; vmaps of it call the batch function once, with all elements."""
+
+    @custom_batching.custom_vmap
+    def single(*args):
+        return jax.tree.map(lambda x: x[0], _many(batch, jax.tree.map(lambda x: x[None], args)))
+
+    @single.def_vmap
+    def rule(axis_size, in_batched, *args):
+        out = _many(batch, _broadcast(args, tuple(in_batched), axis_size))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return single(*args)

@@ -1,0 +1,94 @@
+"""Pictures for people, drawn by rays: they run everywhere, so do these tests."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from interactive_nav.config import NavConfig
+from interactive_nav.rendering.base import Lens, look_along
+from interactive_nav.rendering.camera import STREAMS, Camera
+from interactive_nav.rendering.rays import RayRenderer
+from interactive_nav.rendering.shading import FLOOR, PALETTE, colours, normals
+from interactive_nav.sensors import Sensors
+
+
+@pytest.fixture(scope="module")
+def scene_and_state(world):
+    """What a camera asks of an environment, and the second scene at rest with the robot at (1, 1.4), heading -x."""
+    env = types.SimpleNamespace(world=world, scenes=world.scenes, sensors=Sensors(world, NavConfig(), "native"))
+    qpos = world.rest_qpos[1].copy()
+    at = world.layout.robot_qpos
+    qpos[at : at + 7] = [1.0, 1.4, 0, 0, 0, 0, 1]
+    info = {"nav": types.SimpleNamespace(scene_index=1)}
+    return env, types.SimpleNamespace(pipeline_state=types.SimpleNamespace(qpos=qpos), info=info)
+
+
+def test_the_whole_scene_from_above(scene_and_state):
+    env, state = scene_and_state
+    frame = Camera(env, "rays").frame(state, 120, 100, STREAMS, view="top")
+    assert frame["rgb"].shape == (100, 120, 3) and frame["rgb"].dtype == np.uint8
+    ids = frame["segmentation"]
+    # x to the right, y up: the chair (1.2, 0) right of the middle, the table (-1.2, 1) left and above, the robot.
+    rows, columns = {}, {}
+    for name, number in (("robot", 1), ("chair", 2), ("table", 4)):
+        row, column = np.nonzero(ids == number)
+        assert len(row) > 10, name
+        rows[name], columns[name] = row.mean(), column.mean()
+    assert columns["table"] < 60 < columns["chair"] and rows["table"] < 45
+    assert rows["robot"] < rows["chair"] and 5 in ids
+    # The floor's normal points at the viewer; at its edges it is as deep as near the middle.
+    np.testing.assert_allclose(frame["normals"][75, 40], [0, 0, 1], atol=1e-6)
+    floor = frame["depth"][ids == 0]
+    assert floor.max() == pytest.approx(frame["depth"][75, 40], abs=1e-3)
+
+
+def test_the_robots_own_view_is_the_sensors_view(scene_and_state):
+    env, state = scene_and_state
+    frame = Camera(env, "rays").frame(state, 68, 68, ("depth", "segmentation"))
+    assert set(frame) == {"depth", "segmentation"} and not (frame["segmentation"] == 1).any()
+    qpos = jnp.asarray(state.pipeline_state.qpos, jnp.float32)[None]
+    camera = env.sensors.mount.pose(qpos)
+    draw = jax.jit(RayRenderer(env.sensors.boxes, env.sensors.lens).render_batch)
+    depth, ids = draw(jnp.ones(1, jnp.int32), qpos, camera)
+    # The toy scene's furniture is drawn as its boxes; its walls have no visual mesh but themselves.
+    assert np.mean(np.abs(frame["depth"] - depth[0]) < 0.01) > 0.99
+    assert np.mean(frame["segmentation"] == ids[0]) > 0.99
+
+
+def test_the_follower_sees_the_robot(scene_and_state):
+    env, state = scene_and_state
+    frame = Camera(env, "rays").frame(state, 60, 60, ("segmentation",), view="follow")
+    assert 1 in frame["segmentation"][20:40, 20:40]
+
+
+def test_what_cannot_be_drawn_is_refused(scene_and_state):
+    env, state = scene_and_state
+    camera = Camera(env, "rays")
+    with pytest.raises(ValueError, match="engine is 'opengl', expected one of auto, gl, warp, rays"):
+        Camera(env, "opengl")
+    with pytest.raises(ValueError, match="streams is .*, expected a choice from rgb, normals, depth, segmentation"):
+        camera.frame(state, streams=("colour",))
+    with pytest.raises(ValueError, match="view is 'side', expected one of robot, top, follow"):
+        camera.frame(state, view="side")
+    batch = types.SimpleNamespace(pipeline_state=types.SimpleNamespace(qpos=np.zeros((3, 9))), info=state.info)
+    with pytest.raises(ValueError, match=r"state is a batch of shape \(3,\), expected one environment"):
+        camera.frame(batch)
+
+
+def test_normals_and_colours_of_boxes(world, boxes):
+    # Scene 0, from 0.5 m before the wall x = 2, looking at it: below the horizon the floor, above it the wall.
+    lens, scene = Lens(40, 40, 100.0), jnp.zeros(1, jnp.int32)
+    qpos = jnp.asarray(world.rest_qpos[:1], jnp.float32)
+    camera = look_along(jnp.asarray([[1.5, 1.2, 0.3]]), jnp.asarray([[1.0, 0.0, 0.0]]))
+    depth, index = jax.jit(RayRenderer(boxes, lens).trace_batch)(scene, qpos, camera)
+    normal = np.asarray(normals(boxes, scene, qpos, camera, lens, depth, index))[0]
+    # Floor where the ray falls by more than 0.3 m in 0.5 m: below -31 degrees.
+    np.testing.assert_allclose(normal[-1, 20], [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(normal[20, 20], [-1, 0, 0], atol=1e-5)
+    rgb = np.asarray(colours(boxes, scene, camera, jnp.asarray(normal)[None], index))[0]
+    # The floor is lit fully by the sun (0.9 / |l| of 0.4) and not by the lamp.
+    sun = 0.9 / np.linalg.norm([0.35, 0.25, 0.9])
+    np.testing.assert_allclose(rgb[-1, 20], 255 * PALETTE[FLOOR] * (0.45 + 0.4 * sun), atol=1)
