@@ -1,12 +1,14 @@
-"""`python -m converters convert|check|generate|preview`: parses, prints, sets exit codes.
+"""`python -m converters convert|propose|check|generate|preview`: parses, prints, sets exit codes.
 
-Exit codes: 0 done, 1 a gate failed, 2 unusable input (one line on stderr), 130 or 143 interrupted.
+Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
+line on stderr), 130 or 143 interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import signal
 import sys
@@ -28,6 +30,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from converters.gates import Gate
+    from converters.propose import Proposed
 
 
 class Interrupted(BaseException):
@@ -110,6 +113,8 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         jobs=arguments.jobs,
         seed=arguments.seed,
         overwrite=arguments.overwrite,
+        auto_align=arguments.auto_align or arguments.library is not None,
+        library=arguments.library,
     )
     with _progress(console) as report:
         result = convert(arguments.source, arguments.out, config, report)
@@ -124,7 +129,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
         soft_wrap=True,
     )
-    return 0
+    return 1 if failed else 0
 
 
 def _check(arguments: argparse.Namespace, console: Console) -> int:
@@ -163,6 +168,63 @@ def _preview(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _proposal_tables(found: Proposed) -> Iterator[Table]:
+    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
+    for k, proposal in enumerate(found.proposals):
+        model = found.retrieved.get(k)
+        table.add_row(
+            proposal.category,
+            f"{proposal.confidence:.2f}",
+            " ".join(f"{v:.2f}" for v in proposal.centre),
+            " ".join(f"{v:.2f}" for v in proposal.extent_m),
+            model.cad.cad_id[:8] if model else "-",
+            f"{model.confidence:.2f}" if model else "-",
+        )
+    yield table
+    if not found.comparisons:
+        return
+    table = Table(
+        "class",
+        "annotated",
+        "chosen",
+        "rank",
+        "cm",
+        "yaw °",
+        "scale x y z",
+        "IoU",
+        "sure",
+        title="Retrieved models against the annotation",
+        caption="cm, yaw and scale: the annotated model's own best fit against its annotated pose",
+    )
+    for row in found.comparisons:
+        table.add_row(
+            row.category,
+            row.true_cad[:6],
+            row.chosen_cad[:6],
+            f"{row.rank}/{row.n_tried}",
+            f"{100 * row.difference.translation_m:.1f}",
+            f"{math.degrees(row.difference.yaw_rad):.1f}",
+            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
+            f"{row.iou:.2f}",
+            f"{row.confidence:.2f}",
+        )
+    yield table
+
+
+def _propose(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.pipeline import read_source
+    from converters.propose import propose
+
+    library = (arguments.library or arguments.source) if arguments.auto_align or arguments.library else None
+    with _progress(console) as report:
+        raw = read_source(arguments.source, arguments.format)
+        found = propose(raw, arguments.output, library, report)
+    for table in _proposal_tables(found):
+        console.print(table)
+    console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
+    return 0
+
+
 def _positive(text: str) -> int:
     value = int(text)
     if value < 1:
@@ -193,6 +255,21 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(run=_convert)
+    convert.add_argument(
+        "--auto-align",
+        action="store_true",
+        help="also fit library models to labelled furniture that has no annotation",
+    )
+    convert.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ for --auto-align (default: SRC)")
+    propose = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
+    propose.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
+    propose.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
+    propose.add_argument("--format", choices=("auto", "gibson", "scan2cad"), default="auto")
+    propose.add_argument(
+        "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
+    )
+    propose.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
+    propose.set_defaults(run=_propose)
     check = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
     check.add_argument("scene", type=Path, metavar="SCENE_DIR")
     check.set_defaults(run=_check)

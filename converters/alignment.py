@@ -78,7 +78,7 @@ def _check_spread(points: np.ndarray) -> None:
     """
     centred = points - points.mean(axis=0)
     spread = np.sqrt((centred**2).mean(axis=0))
-    _, singular, axes = np.linalg.svd(centred)
+    _, singular, axes = np.linalg.svd(centred, full_matrices=False)
     largest = singular[0] / math.sqrt(len(points))
     if largest < 1e-9:
         raise AlignmentError("the keypoints coincide: no parameter but the translation is observable")
@@ -94,7 +94,7 @@ def _check_spread(points: np.ndarray) -> None:
             f"the keypoints have no extent along the model's {axis} axis: they are coplanar and the {axis} scale "
             "is unobservable; choose points off that plane"
         )
-    _, across, directions = np.linalg.svd(centred[:, :2])
+    _, across, directions = np.linalg.svd(centred[:, :2], full_matrices=False)
     if across[1] / math.sqrt(len(points)) < MIN_SPREAD * largest:
         raise AlignmentError(
             f"the keypoints lie in one upright plane (along {np.round(directions[0], 2).tolist()} seen from above): "
@@ -102,7 +102,9 @@ def _check_spread(points: np.ndarray) -> None:
         )
 
 
-def _least_squares(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment:
+def least_squares(
+    p: np.ndarray, q: np.ndarray, round_model: bool = False, weights: np.ndarray | None = None
+) -> Alignment:
     """Least squares over all pairs, in closed form where all scales come out positive.
 
     For a fixed yaw the best scales are one-dimensional regressions, and the explained variance left as a
@@ -113,16 +115,18 @@ def _least_squares(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment
         p: (k, 3) CAD frame.
         q: (k, 3) scan frame, m.
         round_model: one scale for both horizontal axes (what is round stays round).
+        weights: (k,) of the squared distances, or None for equal ones.
 
     Raises:
         AlignmentError: degenerate or contradictory pairs.
     """
     _check_spread(p)
-    p_mean, q_mean = p.mean(axis=0), q.mean(axis=0)
-    pc, qc = p - p_mean, q - q_mean
+    share = np.full(len(p), 1.0 / len(p)) if weights is None else weights / weights.sum()
+    p_mean, q_mean = share @ p, share @ q
+    root = np.sqrt(share)[:, None]
+    pc, qc = (p - p_mean) * root, (q - q_mean) * root
     power = (pc**2).sum(axis=0)
-    a, b = qc[:, 0] @ pc[:, 0], qc[:, 1] @ pc[:, 0]
-    d, e = qc[:, 0] @ pc[:, 1], qc[:, 1] @ pc[:, 1]
+    (a, d), (b, e) = (qc[:, :2].T @ pc[:, :2]).tolist()
     if round_model:
         yaw = math.atan2(b - d, a + e)
         both = math.hypot(b - d, a + e) / (power[0] + power[1])
@@ -148,7 +152,7 @@ def _least_squares(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment
     turn = yaw_matrix(yaw)
     translation = q_mean - turn @ (scale * p_mean)
     residual = p * scale @ turn.T + translation - q
-    return Alignment(scale, translation, yaw, float(np.sqrt((residual**2).sum(axis=1).mean())))
+    return Alignment(scale, translation, yaw, float(np.sqrt(share @ (residual**2).sum(axis=1))))
 
 
 def apply_alignment(found: Alignment, points: np.ndarray) -> np.ndarray:
@@ -172,7 +176,7 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
     def offer(keep: np.ndarray) -> Alignment | None:
         nonlocal best
         try:
-            found = _least_squares(p[keep], q[keep], round_model)
+            found = least_squares(p[keep], q[keep], round_model)
         except AlignmentError:
             return None
         if best is None or found.rms_m < best[1].rms_m:
@@ -190,7 +194,7 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
             found = offer(keep) if len(keep) == k - count else None
             if found is None:
                 try:
-                    found = _least_squares(p[keep], q[keep], round_model)
+                    found = least_squares(p[keep], q[keep], round_model)
                 except AlignmentError:
                     break
             closest = np.sort(np.argsort(_squared(found, p, q), kind="stable")[: k - count])
@@ -209,7 +213,7 @@ def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
     k = len(p)
     every = np.ones(k, bool)
     try:
-        full = (_squared(_least_squares(p, q, round_model), p, q)).sum()
+        full = (_squared(least_squares(p, q, round_model), p, q)).sum()
     except AlignmentError:
         full = math.inf  # a gross outlier can mirror the fit of all pairs
     for count in range(math.ceil(k / PAIRS_PER_OUTLIER), 0, -1):
@@ -289,7 +293,7 @@ def gross_outliers(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: st
 def _robust_fit(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment:
     _check_spread(p)
     keep = _inliers(p, q, round_model)
-    return _least_squares(p[keep], q[keep], round_model)
+    return least_squares(p[keep], q[keep], round_model)
 
 
 def _equivalents(p: np.ndarray, q: np.ndarray, found: Alignment, folds: int) -> np.ndarray:

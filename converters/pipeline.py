@@ -26,7 +26,10 @@ from converters.manifest import make_manifest
 from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
 from converters.objects import PlacedObject, name_objects, place_object, rotation_of, to_world
 from converters.physical import physical_properties
+from converters.proposals import propose_instances
+from converters.propose import floor_of
 from converters.raw import RawScene
+from converters.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
 from converters.settle import Settled, settle
 from converters.texture import ColourCloud, VisualMesh, bake_object, bake_structure, colour_cloud
 from converters.walls import wall_boxes
@@ -67,6 +70,10 @@ class ConvertConfig:
     object_faces: int = 1500
     structure_texture: int = 1024
     object_texture: int = 256
+    auto_align: bool = False
+    """Fits library models to labelled furniture that has no annotation."""
+    library: Path | None = None
+    """Folder with `cad/` for that; None: the source folder."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,6 +125,36 @@ def detect_format(source: Path) -> str:
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson) or {scan2cad.ANNOTATION} (scan2cad) in it"
     )
+
+
+def read_source(source: Path, layout: str = "auto") -> RawScene:
+    """Reads a raw folder in the given layout, or in the one that its files show.
+
+    Raises:
+        SceneRejected: no known layout, or bad input.
+    """
+    return READERS[layout if layout != "auto" else detect_format(source)][1](source)
+
+
+def with_retrieved(
+    raw: RawScene, library_root: Path, progress: Callable[[float], None]
+) -> tuple[RawScene, dict[int, float]]:
+    """Adds what `--auto-align` finds to the annotations.
+
+    Returns:
+        The scene, and index of an added annotation -> its confidence.
+    """
+    proposals = propose_instances(raw.scan)
+    proposals = tuple(proposals[k] for k in without_annotation(proposals, raw.annotations, raw.cads))
+    found = auto_align(proposals, read_library(library_root), floor_of(raw), progress) if proposals else {}
+    sure = [found[k] for k in sorted(found) if found[k].confidence >= MIN_CONFIDENCE]
+    first = len(raw.annotations)
+    added = dataclasses.replace(
+        raw,
+        annotations=raw.annotations + tuple(as_annotation(r) for r in sure),
+        cads=raw.cads | {r.cad.cad_id: r.cad for r in sure},
+    )
+    return added, {first + k: r.confidence for k, r in enumerate(sure)}
 
 
 def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
@@ -174,10 +211,17 @@ def _object_visual(
 
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
     """Every stage after reading; writes into `folder`, which exists and is empty."""
-    with clock.stage("align"):
+    with clock.stage("align") as progress:
+        retrieved: dict[int, float] = {}
+        if config.auto_align and config.library is not None:
+            raw, retrieved = with_retrieved(raw, config.library, progress)
         placements, rows = align_objects(raw)
         if not raw.annotations:
-            raise SceneRejected(f"{raw.name}: no annotated object, expected at least one; annotate the furniture")
+            raise SceneRejected(
+                f"{raw.name}: no annotated object, expected at least one; annotate the furniture, or try --auto-align"
+            )
+        for k, confidence in retrieved.items():
+            rows[k]["retrieved_confidence"] = confidence
         floor_height = raw.floor_height_m
         if floor_height is None:
             floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)
@@ -283,6 +327,7 @@ def convert(
     clock = _Clock(report or (lambda stage, share: None))
     with fresh_folder(target, config.overwrite) as folder:
         with clock.stage("read"):
-            name = config.format if config.format != "auto" else detect_format(source)
-            raw = dataclasses.replace(READERS[name][1](source), name=target.name)
+            raw = dataclasses.replace(read_source(source, config.format), name=target.name)
+        if config.auto_align and config.library is None:
+            config = dataclasses.replace(config, library=source)
         return convert_raw(raw, folder, config, clock, cache or cache_folder())
