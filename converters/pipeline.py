@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
+import functools
+import multiprocessing
 import os
 import shutil
 import time
@@ -16,12 +19,13 @@ import numpy as np
 
 from converters import gibson, scan2cad
 from converters.alignment import Alignment, compare, upright
-from converters.cut import cut_furniture
+from converters.cut import cut_furniture, face_areas
 from converters.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
 from converters.emit import SceneParts, write_scene
 from converters.errors import SceneRejected
-from converters.floor import floor_patch, level_floor
+from converters.floor import level_floor
 from converters.gates import Gate, evaluate
+from converters.holes import fill_holes
 from converters.manifest import make_manifest
 from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
 from converters.objects import PlacedObject, name_objects, place_object, rotation_of, to_world
@@ -51,6 +55,9 @@ STAGES = {
     "gates": 3.0,
 }
 """Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
+
+PARALLEL_OBJECTS = 8
+"""From so many objects on, starting processes for their textures pays."""
 
 Report = Callable[[str, float], None]
 """Called with the stage's name and the share of the whole work that is done, 0 to 1."""
@@ -170,43 +177,59 @@ def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]
 
 
 def _structure_visual(
-    raw: RawScene, vertices_w: np.ndarray, keep: np.ndarray, plan: FloorPlan, config: ConvertConfig
-) -> VisualMesh:
-    """The cleaned scan with a level floor, patched where furniture hid it, simplified and textured."""
+    raw: RawScene,
+    vertices_w: np.ndarray,
+    keep: np.ndarray,
+    plan: FloorPlan,
+    annotated: tuple[PlacedObject, ...],
+    config: ConvertConfig,
+) -> tuple[VisualMesh, float]:
+    """The cleaned scan, levelled, filled, simplified and textured; and the area of the patches, m2."""
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
-    seen_floor = np.flatnonzero((np.abs(cloud.points[:, 2]) < 0.02) & (np.abs(cloud.normals[:, 2]) > 0.7))
-    patch_vertices, patch_faces, patch_cloud = floor_patch(plan, cloud, seen_floor)
+    filled, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
     both = ColourCloud(
         *(np.vstack([getattr(cloud, f), getattr(patch_cloud, f)]) for f in ("points", "normals", "colours"))
     )
-    return bake_structure(
-        level,
-        raw.scan.faces[kept],
-        patch_vertices,
-        patch_faces,
-        both,
-        config.structure_faces,
-        config.structure_texture,
-    )
+    area = float(face_areas(filled.vertices, filled.faces[filled.patch_plane >= 0]).sum())
+    visual = bake_structure(filled.vertices, filled.faces, both, config.structure_faces, config.structure_texture)
+    return visual, area
 
 
-def _object_visual(
-    raw: RawScene, vertices_w: np.ndarray, removed: np.ndarray, annotated: PlacedObject, config: ConvertConfig
-) -> tuple[VisualMesh, float]:
+def _object_visual(cloud: ColourCloud, annotated: PlacedObject, max_faces: int, size: int) -> tuple[VisualMesh, float]:
     """The CAD model retextured at its annotated pose (where the scan showed it), in the body frame."""
-    cloud = colour_cloud(raw.scan, vertices_w, raw.scan.faces, removed)
     visual, seen = bake_object(
         to_world(annotated, annotated.vertices_b),
         annotated.faces,
         annotated.face_colours,
         cloud,
-        config.object_faces,
-        config.object_texture,
+        max_faces,
+        size,
     )
     back = (visual.vertices - annotated.position_w) @ rotation_of(annotated.quaternion_w)
     return dataclasses.replace(visual, vertices=back), seen
+
+
+def _object_visuals(
+    raw: RawScene,
+    vertices_w: np.ndarray,
+    owner: np.ndarray,
+    annotated: tuple[PlacedObject, ...],
+    config: ConvertConfig,
+) -> list[tuple[VisualMesh, float]]:
+    """Every object's visual and the share of it that the scan showed, side by side in processes."""
+    clouds = [
+        colour_cloud(raw.scan, vertices_w, raw.scan.faces, np.flatnonzero(owner == k)) for k in range(len(annotated))
+    ]
+    count = len(annotated)
+    bake = functools.partial(_object_visual, max_faces=config.object_faces, size=config.object_texture)
+    if config.jobs < 2 or count < PARALLEL_OBJECTS:
+        return [bake(c, o) for c, o in zip(clouds, annotated, strict=True)]
+    # Not forked: the caller may hold threads.
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(min(config.jobs, count), mp_context=context) as pool:
+        return list(pool.map(bake, clouds, annotated))
 
 
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
@@ -256,13 +279,10 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
     with clock.stage("settle"):
         settled = settle(SceneParts(raw.name, annotated, physical, walls))
     with clock.stage("texture") as progress:
-        structure = _structure_visual(raw, vertices_w, cut.keep, plan, config)
-        visuals, seen = [], []
-        for k, placed in enumerate(annotated):
-            progress(0.5 + 0.5 * k / len(annotated))
-            visual, share = _object_visual(raw, vertices_w, np.flatnonzero(cut.owner == k), placed, config)
-            visuals.append(visual)
-            seen.append(share)
+        structure, _ = _structure_visual(raw, vertices_w, cut.keep, plan, annotated, config)
+        progress(0.5)
+        baked = _object_visuals(raw, vertices_w, cut.owner, annotated, config)
+        visuals, seen = [v for v, _ in baked], [share for _, share in baked]
     for row, moved, drop, share, placed in zip(
         rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
     ):
