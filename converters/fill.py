@@ -70,7 +70,8 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
 
     A draw is one upright face: its middle and the horizontal direction of its normal are a hypothesis; its
     support is the area of the faces within `WALL_TOLERANCE_M` whose normals agree within 25 degrees. The best
-    of `RANSAC_DRAWS` is refined by least squares over its support, which is then taken out.
+    of `RANSAC_DRAWS` is refined by least squares over its support, which is then taken out. A plane's normal looks
+    to the side that its faces look to: the room, as scans are made from inside.
 
     Args:
         vertices: (n, 3) m, z up.
@@ -95,7 +96,7 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
         draws = rng.choice(index, RANSAC_DRAWS, p=area[index] / area[index].sum())
         for d in np.unique(draws):
             near = np.abs((middle[index, :2] - middle[d, :2]) @ flat[d]) < WALL_TOLERANCE_M
-            agree = near & (np.abs(flat[index] @ flat[d]) > 0.9)
+            agree = near & (flat[index] @ flat[d] > 0.9)
             support = float(area[index[agree]].sum())
             if support > best_support:
                 best, best_support = index[agree], support
@@ -104,9 +105,10 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
         weight = area[best] / area[best].sum()
         centre = weight @ middle[best, :2]
         spread = (middle[best, :2] - centre).T @ ((middle[best, :2] - centre) * weight[:, None])
-        along = np.linalg.eigh(spread)[1][:, 1]
-        origin = np.array([*centre, 0.0])
-        planes.append(Plane(origin, np.array([*along, 0.0]), np.array([0.0, 0.0, 1.0])))
+        x, y = np.linalg.eigh(spread)[1][:, 1]
+        if np.array([y, -x]) @ (weight @ flat[best]) < 0:  # the normal looks to where the scan's faces look
+            x, y = -x, -y
+        planes.append(Plane(np.array([*centre, 0.0]), np.array([x, y, 0.0]), np.array([0.0, 0.0, 1.0])))
         left[best] = False
     return planes
 

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 from scipy.spatial import KDTree
-from shapely.geometry import Polygon
+from shapely.geometry import MultiPoint, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from converters.alignment import yaw_matrix
@@ -34,18 +34,24 @@ SMALL_HOLE_M2 = 0.3
 REACH_M = 0.6
 """Furniture this near a wall hides it."""
 SHADOW_MARGIN_M = 0.15
+COLUMN_M = 0.05
+COLUMN_SEEN_M = 0.15
+"""Height of wall seen in a column of `COLUMN_M` from which there is wall at all: the plane may run on past its end."""
+COLUMN_GAP = 6
+"""Columns: wider stretches without wall are openings."""
 SKIRT_M = 0.25
 """Width of the floor strip that joins a wall patch to the floor."""
 SEEN_BORDER_SHARE = 0.35
 """Least share of a wall patch's border (its foot apart) that runs along seen wall: else it may be an opening."""
 
 
-def floor_region(plan: FloorPlan, seen: BaseGeometry) -> BaseGeometry:
+def floor_region(plan: FloorPlan, seen: BaseGeometry, objects: tuple[PlacedObject, ...]) -> BaseGeometry:
     """Floor that the plan says is there and the scan shows not or in part, in world x, y.
 
     Args:
         plan: of the floor.
         seen: union of the scan's floor faces, world x, y.
+        objects: under them, within the seen floor's outline, there is floor.
     """
     hidden = plan.floor & ~plan.floor_whole
     needed = ndimage.binary_dilation(hidden, np.ones((3, 3))) & plan.floor
@@ -59,6 +65,10 @@ def floor_region(plan: FloorPlan, seen: BaseGeometry) -> BaseGeometry:
             hole = Polygon(ring)
             if hole.area < SMALL_HOLE_M2:
                 boxes.append(hole)
+    outline = shapely.union_all([Polygon(p.exterior) for p in polygons_of(seen)])
+    for placed in objects:
+        shadow = MultiPoint(to_world(placed, placed.vertices_b)[:, :2]).convex_hull.buffer(SHADOW_MARGIN_M)
+        boxes.append(shadow.intersection(outline))
     return shapely.union_all(boxes) if boxes else Polygon()
 
 
@@ -82,15 +92,16 @@ def wall_region(
     inside = seen_in_plane(vertices, faces, plane, WALL_TOLERANCE_M)
     if len(inside) == 0:
         return Polygon()
-    flat = plane.flatten(vertices[np.unique(faces[inside])])
-    seen = shapely.union_all(shapely.polygons(plane.flatten(vertices)[faces[inside]]))
-    (low_u, low_v), (high_u, high_v) = flat.min(axis=0), flat.max(axis=0)
-    extent = shapely.box(low_u, max(LIFT_M, low_v - 10), high_u, high_v)
+    corners = plane.flatten(vertices)[faces[inside]]
+    seen = shapely.union_all(shapely.polygons(corners))
+    extent = _columns(corners)
+    if extent.is_empty:
+        return Polygon()
     shadows, doors = [], []
     for placed in objects:
         points = to_world(placed, placed.vertices_b)
         distance = plane.distance(points)
-        if np.abs(distance).min() > REACH_M and (distance.min() > 0) == (distance.max() > 0):
+        if distance.max() < 0 or distance.min() > REACH_M or distance.mean() < -SHADOW_MARGIN_M:
             continue
         u, v = plane.flatten(points).T
         margin = SHADOW_MARGIN_M
@@ -115,18 +126,40 @@ def wall_region(
     return shapely.union_all(closed) if closed else Polygon()
 
 
-def skirts(plane: Plane, region: BaseGeometry, inner: np.ndarray) -> tuple[BaseGeometry, BaseGeometry]:
+def _columns(corners: np.ndarray) -> BaseGeometry:
+    """Region from the floor up to the seen wall's top, along the stretches where wall is seen at all.
+
+    Args:
+        corners: (m, 3, 2) of the wall's seen faces, plane coordinates.
+    """
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) / 2
+    low, high = corners[..., 0].min(), corners[..., 0].max()
+    count = max(int((high - low) / COLUMN_M), 1)
+    column = np.clip(((corners[..., 0].mean(axis=1) - low) / COLUMN_M).astype(int), 0, count - 1)
+    covered = np.bincount(column, area, count) / COLUMN_M > COLUMN_SEEN_M
+    padded = np.pad(covered, COLUMN_GAP)
+    covered = ndimage.binary_closing(padded, np.ones(2 * COLUMN_GAP + 1))[COLUMN_GAP:-COLUMN_GAP]
+    top = float(corners[..., 1].max())
+    runs, number = ndimage.label(covered)  # pyright: ignore[reportGeneralTypeIssues]
+    boxes = []
+    for k in range(1, number + 1):
+        index = np.flatnonzero(runs == k)
+        last = high if index[-1] == count - 1 else low + (index[-1] + 1) * COLUMN_M
+        boxes.append(shapely.box(low + index[0] * COLUMN_M, LIFT_M, last, max(top, 2 * LIFT_M)))
+    return shapely.union_all(boxes) if boxes else Polygon()
+
+
+def skirts(plane: Plane, region: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
     """Floor strips in front of and behind the wall patches that stand on the floor, world x, y.
 
     Args:
-        plane: of the wall.
+        plane: of the wall; its normal looks into the room.
         region: to be filled, in the plane's coordinates.
-        inner: (2,) point on the room's side.
 
     Returns:
         Strip to add to the floor's region, strip to take out of it.
     """
-    side = float(np.sign((inner - plane.origin[:2]) @ plane.normal[:2])) or 1.0
     add, cut = [], []
     for piece in polygons_of(region):
         foot = piece.intersection(shapely.box(piece.bounds[0], LIFT_M - 1e-6, piece.bounds[2], LIFT_M + 1e-6))
@@ -136,7 +169,7 @@ def skirts(plane: Plane, region: BaseGeometry, inner: np.ndarray) -> tuple[BaseG
         if right - left < 1e-3:
             continue
         ends = [plane.lift(np.array([[u, LIFT_M]]))[0, :2] for u in (left, right)]
-        for strips, direction in ((add, side), (cut, -side)):
+        for strips, direction in ((add, 1.0), (cut, -1.0)):
             off = direction * SKIRT_M * plane.normal[:2]
             strips.append(shapely.make_valid(Polygon([ends[0], ends[1], ends[1] + off, ends[0] + off])))
     return (
@@ -164,16 +197,13 @@ def hidden_surfaces(
     ground = floor_plane(LIFT_M)
     inside = seen_in_plane(vertices, faces, ground, FLOOR_TOLERANCE_M)
     seen = shapely.union_all(shapely.polygons(vertices[faces[inside]][..., :2])) if len(inside) else Polygon()
-    floor = floor_region(plan, seen)
+    floor = floor_region(plan, seen, objects)
     walls: list[tuple[Plane, BaseGeometry, float]] = []
-    free = plan.grid.centres_w()[plan.traversable]
     for plane in planes:
         region = wall_region(plan, plane, vertices, faces, objects)
         if region.is_empty:
             continue
-        middle = plane.lift(np.array([[region.centroid.x, 0.0]]))[0, :2]
-        inner = free[int(np.argmin(np.linalg.norm(free - middle, axis=1)))]
-        add, cut = skirts(plane, region, inner)
+        add, cut = skirts(plane, region)
         floor = floor.difference(cut).union(add)
         walls.append((plane, region, WALL_TOLERANCE_M))
     return [(ground, floor, FLOOR_TOLERANCE_M), *walls]
