@@ -31,6 +31,8 @@ PATCH_SPACING_M = 0.03
 """Between the coloured points on patches."""
 SMALL_HOLE_M2 = 0.3
 """Holes inside seen floor up to this size are closed whatever the plan says (mislabelled legs)."""
+NOTCH_M = 0.3
+"""Half the width up to which a notch in the seen floor's outline, under furniture, is floor."""
 REACH_M = 0.6
 """Furniture this near a wall hides it."""
 SHADOW_MARGIN_M = 0.15
@@ -66,6 +68,7 @@ def floor_region(plan: FloorPlan, seen: BaseGeometry, objects: tuple[PlacedObjec
             if hole.area < SMALL_HOLE_M2:
                 boxes.append(hole)
     outline = shapely.union_all([Polygon(p.exterior) for p in polygons_of(seen)])
+    outline = outline.buffer(NOTCH_M, join_style="mitre").buffer(-NOTCH_M, join_style="mitre")
     for placed in objects:
         shadow = MultiPoint(to_world(placed, placed.vertices_b)[:, :2]).convex_hull.buffer(SHADOW_MARGIN_M)
         boxes.append(shadow.intersection(outline))
