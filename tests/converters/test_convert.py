@@ -57,6 +57,15 @@ def test_names_classes_and_joints_are_as_promised(tiny_scene):
     assert "/" not in manifest.name and str(Path.home()) not in (folder / "scene.xml").read_text()
 
 
+def test_the_model_names_each_bodys_semantic_class(tiny_scene):
+    spec = mujoco.MjSpec.from_file(str(tiny_scene[0] / "scene.xml"))
+    assert {t.name: t.data for t in spec.texts} == {
+        "class_structure": "structure",
+        "class_table_0": "table",
+        "class_basket_0": "basket",
+    }
+
+
 def test_objects_stand_where_they_were_annotated(tiny_scene):
     folder, converted = tiny_scene
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
