@@ -123,6 +123,9 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
     times = ", ".join(f"{k} {v:.1f}" for k, v in result.stage_s.items())
     failed = [g.name for g in result.gates if not g.passed]
     console.print(f"Seconds: {times}", soft_wrap=True)
+    for row in result.manifest.alignment:
+        if "note" in row:
+            console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
     console.print(
         f"{arguments.out}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
         f"{result.manifest.floor_area_m2:.1f} m² traversable; "

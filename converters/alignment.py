@@ -25,6 +25,8 @@ PAIRS_PER_OUTLIER = 8
 """At most one gross outlier in so many pairs (rounded up) is thrown out."""
 OUTLIER_P = 1e-3
 """Chance of throwing out a sound pair, all pairs taken together, where errors are Gaussian."""
+LYING_DEG = 15.0
+"""Annotated tilt from which a scene's report says that the object was stood upright."""
 MAX_SUBSETS = 3000
 """Up to so many ways to leave pairs out are all tried; beyond, `RANDOM_STARTS` random ones are refined."""
 RANDOM_STARTS = 200
@@ -369,6 +371,10 @@ def compare(
         "symmetry": annotation.symmetry,
         "tilt_removed_deg": round(math.degrees(tilt_rad), 3),
     }
+    if tilt_rad > math.radians(LYING_DEG):
+        row["note"] = (
+            f"annotated {math.degrees(tilt_rad):.0f} degrees off the vertical; placed upright (yaw is the only rotation)"
+        )
     if len(annotation.keypoints_cad):
         at = annotation.keypoints_cad @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
         distance2 = ((at - annotation.keypoints_scan) ** 2).sum(axis=1)

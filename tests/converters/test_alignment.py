@@ -227,3 +227,10 @@ def test_a_quarter_turn_of_a_four_fold_model_swaps_the_scales_compared():
 def test_unknown_symmetry_is_refused():
     with pytest.raises(AlignmentError, match="symmetry is 'round', expected one of __SYM_NONE"):
         solve_alignment(CORNERS, CORNERS, "round")
+
+
+@pytest.mark.parametrize(("tilt", "noted"), [(0.1, False), (math.pi / 2 - 0.01, True)])
+def test_an_object_annotated_lying_is_reported_as_stood_upright(tilt, noted):
+    annotation = Annotation("chair", "c", pose((1, 1, 1), 0.0, (0, 0, 0), tilt), "__SYM_NONE", CORNERS, CORNERS)
+    row = compare(annotation, *upright(annotation.pose, np.zeros(3)), np.zeros(3), "chair_0")
+    assert ("placed upright" in row.get("note", "")) is noted
