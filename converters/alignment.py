@@ -372,9 +372,8 @@ def compare(
         "tilt_removed_deg": round(math.degrees(tilt_rad), 3),
     }
     if tilt_rad > math.radians(LYING_DEG):
-        row["note"] = (
-            f"annotated {math.degrees(tilt_rad):.0f} degrees off the vertical; placed upright (yaw is the only rotation)"
-        )
+        degrees = math.degrees(tilt_rad)
+        row["note"] = f"annotated {degrees:.0f} degrees off the vertical; placed upright, yaw is the only rotation"
     if len(annotation.keypoints_cad):
         at = annotation.keypoints_cad @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
         distance2 = ((at - annotation.keypoints_scan) ** 2).sum(axis=1)
