@@ -1,4 +1,4 @@
-"""`python -m converters convert|propose|check|generate|preview`: parses, prints, sets exit codes.
+"""`python -m converters convert|object|propose|check|generate|preview`: parses, prints, sets exit codes.
 
 Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
 line on stderr), 130 or 143 interrupted.
@@ -27,6 +27,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
+
+from scenes_mjcf.schema import CATEGORIES
 
 if TYPE_CHECKING:
     from converters.gates import Gate
@@ -105,7 +107,7 @@ def _alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
 
 
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.pipeline import ConvertConfig, convert
+    from converters.pipeline import ConvertConfig, convert_building
 
     config = ConvertConfig(
         format=arguments.format,
@@ -115,24 +117,59 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         overwrite=arguments.overwrite,
         auto_align=arguments.auto_align or arguments.library is not None,
         library=arguments.library,
+        strict=arguments.strict,
+        timeout_s=arguments.timeout,
     )
     with _progress(console) as report:
-        result = convert(arguments.source, arguments.out, config, report)
-    console.print(_alignment_table(result.manifest.alignment))
-    console.print(_gate_table(result.gates))
-    times = ", ".join(f"{k} {v:.1f}" for k, v in result.stage_s.items())
-    failed = [g.name for g in result.gates if not g.passed]
+        results = convert_building(arguments.source, arguments.out, config, report)
+    for result in results:
+        if any(row.get("n_keypoints") for row in result.manifest.alignment):
+            console.print(_alignment_table(result.manifest.alignment))
+        console.print(_gate_table(result.gates))
+        for warning in result.manifest.warnings:
+            console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+    times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
     console.print(f"Seconds: {times}", soft_wrap=True)
-    for row in result.manifest.alignment:
-        if "note" in row:
-            console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
+    for result in results:
+        for row in result.manifest.alignment:
+            if "note" in row:
+                console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
+        failed = [g.name for g in result.gates if not g.passed]
+        console.print(
+            f"{result.folder}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
+            f"{result.manifest.floor_area_m2:.1f} m² traversable; "
+            + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
+            soft_wrap=True,
+        )
+    return 0 if all(g.passed for result in results for g in result.gates) else 1
+
+
+def _object(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.single_object import ObjectConfig, convert_object
+
+    config = ObjectConfig(
+        category=arguments.category,
+        mass_kg=arguments.mass,
+        friction=arguments.friction,
+        scale=arguments.scale,
+        up=arguments.up,
+        seed=arguments.seed,
+        overwrite=arguments.overwrite,
+        strict=arguments.strict,
+        timeout_s=arguments.timeout,
+    )
+    made = convert_object(arguments.source, arguments.out, config)
+    for warning in made["warnings"]:
+        console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+    size = " x ".join(f"{100 * v:.1f}" for v in made["size_m"])
     console.print(
-        f"{arguments.out}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
-        f"{result.manifest.floor_area_m2:.1f} m² traversable; "
-        + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
+        f"{arguments.out}: {made['category']}, {made['mass_kg']:.3f} kg ({made['mass_source']}), {size} cm, "
+        f"{made['n_hulls']} hulls ({made['hull_source']}); at rest it drifts "
+        f"{1000 * made['rest']['drift_hulls_m']:.2f} mm with hulls, "
+        f"{1000 * made['rest']['drift_boxes_m']:.2f} mm with boxes",
         soft_wrap=True,
     )
-    return 1 if failed else 0
+    return 0
 
 
 def _check(arguments: argparse.Namespace, console: Console) -> int:
@@ -235,15 +272,40 @@ def _positive(text: str) -> int:
     return value
 
 
+def _positive_number(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _add_decompose_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
+    command.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
+    command.add_argument("--strict", action="store_true", help="refuse what would be repaired with a warning")
+    command.add_argument(
+        "--timeout",
+        type=_positive_number,
+        default=240.0,
+        metavar="S",
+        help="seconds for the decomposition of one model before its convex hull is taken (default 240)",
+    )
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     convert = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
     convert.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
-    convert.add_argument("out", type=Path, metavar="OUT", help="scene folder to make; its name becomes the scene's")
+    convert.add_argument(
+        "out",
+        type=Path,
+        metavar="OUT",
+        help="scene folder to make, its name becomes the scene's; several floors make OUT_0, OUT_1, ...",
+    )
     convert.add_argument(
         "--format",
-        choices=("auto", "gibson", "scan2cad"),
+        choices=("auto", "gibson", "interactive-gibson", "scan2cad"),
         default="auto",
         help="layout of SRC (default: told from its files)",
     )
@@ -255,8 +317,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="N",
         help="decompositions side by side (default: one a processor)",
     )
-    convert.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
-    convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
+    _add_decompose_options(convert)
     convert.set_defaults(run=_convert)
     convert.add_argument(
         "--auto-align",
@@ -267,12 +328,28 @@ def _parser() -> argparse.ArgumentParser:
     propose = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
     propose.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
     propose.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
-    propose.add_argument("--format", choices=("auto", "gibson", "scan2cad"), default="auto")
+    propose.add_argument("--format", choices=("auto", "gibson", "interactive-gibson", "scan2cad"), default="auto")
     propose.add_argument(
         "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
     )
     propose.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
     propose.set_defaults(run=_propose)
+    single = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
+    single.add_argument(
+        "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"
+    )
+    single.add_argument("out", type=Path, metavar="OUT", help="folder to make; its name becomes the body's")
+    single.add_argument("--category", choices=CATEGORIES, help="default: told from the file's name")
+    single.add_argument(
+        "--mass", type=_positive_number, metavar="KG", help="default: the URDF's, else density x volume"
+    )
+    single.add_argument(
+        "--friction", type=_positive_number, metavar="MU", help="default: the URDF's, else the category's"
+    )
+    single.add_argument("--scale", type=_positive_number, default=1.0, help="of a mesh that is not in metres")
+    single.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up (default z)")
+    _add_decompose_options(single)
+    single.set_defaults(run=_object)
     check = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
     check.add_argument("scene", type=Path, metavar="SCENE_DIR")
     check.set_defaults(run=_check)
@@ -301,7 +378,8 @@ def main(argv: list[str] | None = None) -> int:
         print("terminated; nothing was written", file=sys.stderr)
         return 143
     except OSError as error:
-        print(f"error: {error.filename or 'file system'}: {error.strerror or error}", file=sys.stderr)
+        where = error.filename or getattr(arguments, "out", None) or "file system"
+        print(f"error: {where}: {error.strerror or error}; nothing was written", file=sys.stderr)
         return 2
     except (ValueError, RuntimeError) as error:
         from converters.errors import SceneRejected, StageFailed

@@ -7,6 +7,8 @@ import sys
 import coacd
 import numpy as np
 
+from converters.errors import CANNOT_WRITE
+
 
 def main(source: str, target: str) -> None:
     """Runs coacd once. Its return value is a list of [vertices (n, 3), faces (m, 3)]."""
@@ -18,7 +20,13 @@ def main(source: str, target: str) -> None:
     parts = coacd.run_coacd(mesh, decimate=True, **parameters)
     arrays = {f"v{i}": np.asarray(v, np.float64) for i, (v, _) in enumerate(parts)}
     arrays |= {f"f{i}": np.asarray(f, np.int64) for i, (_, f) in enumerate(parts)}
-    np.savez(target, count=len(parts), **arrays)  # pyright: ignore[reportArgumentType]
+    if not parts:
+        raise ValueError("coacd returned no part")
+    try:
+        np.savez(target, count=len(parts), **arrays)  # pyright: ignore[reportArgumentType]
+    except OSError as error:
+        print(error)
+        sys.exit(CANNOT_WRITE)
 
 
 if __name__ == "__main__":

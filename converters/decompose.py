@@ -1,5 +1,7 @@
 """CAD meshes in, convex hulls out: coacd in one process a model, results cached by content.
 
+A model on which coacd fails or runs past the time limit gets its convex hull instead, which the result names.
+
 coacd runs outside this process because it prints its log to the terminal, may crash on bad meshes, and
 cannot be interrupted from Python. A model is decomposed once, unscaled: scaling keeps a hull convex.
 """
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import os
 import subprocess
@@ -19,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.errors import StageFailed
-from converters.objects import Hull
+from converters.errors import CANNOT_WRITE, StageFailed
+from converters.objects import Hull, convex_hull
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,11 +49,11 @@ within the threshold, and a voxel is 7 cm, so that a leaf of 4 cm would become a
 
 
 def cache_folder() -> Path:
-    """`$INTERACTIVE_NAV_CACHE/hulls`, else `$XDG_CACHE_HOME/interactive_nav/hulls`, else `~/.cache/...`."""
+    """`$INTERACTIVE_NAV_CACHE/converters`, else `$XDG_CACHE_HOME/interactive_nav/converters`, else `~/.cache/...`."""
     own = os.environ.get("INTERACTIVE_NAV_CACHE")
     if own:
-        return Path(own) / "hulls"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav" / "hulls"
+        return Path(own) / "converters"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav" / "converters"
 
 
 def content_key(vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig) -> str:
@@ -76,7 +79,15 @@ def _load(path: Path) -> tuple[Hull, ...] | None:
 
 
 def _store(path: Path, hulls: tuple[Hull, ...]) -> None:
-    """Writes beside and renames, so that two writers of one key leave one whole file."""
+    """Writes beside and renames, so that two writers of one key leave one whole file.
+
+    A cache that cannot be written (full disk, read-only home) costs the next run time and this run nothing.
+    """
+    with contextlib.suppress(OSError):
+        _write(path, hulls)
+
+
+def _write(path: Path, hulls: tuple[Hull, ...]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {f"v{i}": h.vertices for i, h in enumerate(hulls)} | {f"f{i}": h.faces for i, h in enumerate(hulls)}
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
@@ -88,6 +99,16 @@ def _store(path: Path, hulls: tuple[Hull, ...]) -> None:
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         raise
+
+
+@dataclasses.dataclass(frozen=True)
+class Decomposition:
+    """Hulls of every model, and which of them are not coacd's."""
+
+    hulls: dict[str, tuple[Hull, ...]]
+    """Name -> hulls, in the mesh's own frame."""
+    fallbacks: dict[str, str]
+    """Name -> why its one convex hull stands for it."""
 
 
 @dataclasses.dataclass
@@ -106,27 +127,28 @@ def decompose_all(
     cache: Path,
     progress: Callable[[float], None] | None = None,
     overrides: Mapping[str, Mapping[str, float]] | None = None,
-) -> dict[str, tuple[Hull, ...]]:
+    strict: bool = False,
+) -> Decomposition:
     """Decomposes every mesh, `jobs` processes at a time.
 
     Args:
         meshes: name -> (vertices (n, 3), faces (m, 3)).
         config: coacd's parameters.
         jobs: processes side by side.
-        cache: folder of hulls by content.
+        cache: folder of hulls by content; convex hulls that stand in for a failed decomposition are not stored.
         progress: called with the share that is done, 0 to 1.
         overrides: name -> parameters that differ from the config's.
-
-    Returns:
-        name -> hulls, in the meshes' own frame.
+        strict: a model that coacd cannot decompose is an error.
 
     Raises:
-        StageFailed: coacd failed or ran past the time limit; the message names the model.
+        StageFailed: coacd failed or ran past the time limit, with `strict`; the message names the model.
+        OSError: the folder for temporary files is full or cannot be written.
     """
     changes = overrides or {}
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore
     keys = {name: content_key(v, f, configs[name]) for name, (v, f) in meshes.items()}
     done: dict[str, tuple[Hull, ...]] = {}
+    failed: dict[str, str] = {}
     waiting: list[tuple[str, str]] = []
     for name, key in keys.items():
         found = _load(cache / f"{key}.npz")
@@ -145,19 +167,17 @@ def decompose_all(
                     key, name = waiting.pop(0)
                     running.append(_start(key, name, *meshes[name], configs[name], Path(scratch)))
                 for job in list(running):
-                    if job.process.poll() is None:
-                        if time.monotonic() - job.started > config.timeout_s:
-                            raise StageFailed(f"decompose: coacd ran past {config.timeout_s:.0f} s on {job.name}")
+                    late = time.monotonic() - job.started > config.timeout_s
+                    if job.process.poll() is None and not late:
                         continue
+                    hulls, reason = _finish(job, config.timeout_s)
                     running.remove(job)
-                    hulls = _load(job.output) if job.process.returncode == 0 else None
                     if hulls is None:
-                        log = job.output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
-                        last = log[-1] if log else "no message"
-                        raise StageFailed(
-                            f"decompose: coacd failed on {job.name} (exit code {job.process.returncode}: {last})"
-                        )
-                    _store(cache / f"{job.key}.npz", hulls)
+                        if strict:
+                            raise StageFailed(f"decompose: {reason}")
+                        hulls, failed[job.key] = (convex_hull(meshes[job.name][0]),), reason
+                    else:
+                        _store(cache / f"{job.key}.npz", hulls)
                     done[job.key] = hulls
                 if progress is not None:
                     progress(len(done) / max(total, 1))
@@ -167,7 +187,26 @@ def decompose_all(
             for job in running:
                 job.process.kill()
                 job.process.wait()
-    return {name: done[key] for name, key in keys.items()}
+    return Decomposition(
+        {name: done[key] for name, key in keys.items()},
+        {name: failed[key] for name, key in keys.items() if key in failed},
+    )
+
+
+def _finish(job: _Job, timeout_s: float) -> tuple[tuple[Hull, ...] | None, str]:
+    """Hulls of a job that ended or is out of time; None and the reason where there are none."""
+    if job.process.poll() is None:
+        job.process.kill()
+        job.process.wait()
+        return None, f"coacd ran past {timeout_s:g} s on {job.name}"
+    code = job.process.returncode
+    if code == CANNOT_WRITE:
+        raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(job.output.parent))
+    hulls = _load(job.output) if code == 0 else None
+    if hulls is not None:
+        return hulls, ""
+    log = job.output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
+    return None, f"coacd failed on {job.name} (exit code {code}: {log[-1] if log else 'no message'})"
 
 
 def _start(

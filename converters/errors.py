@@ -9,3 +9,7 @@ class SceneRejected(ValueError):
 
 class StageFailed(RuntimeError):
     """A stage broke on input that had passed the readers; the message names stage and object."""
+
+
+CANNOT_WRITE = 74
+"""Exit code of a worker whose result does not fit on the disk: no fault of the model's."""

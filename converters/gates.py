@@ -36,7 +36,7 @@ class Limit:
 
 LIMITS: dict[str, Limit] = {
     "compiles": Limit("bool", least=1, meaning="scene.xml compiles in MuJoCo"),
-    "objects": Limit("count", least=1, meaning="movable bodies, each named in scene.json and in scene.xml"),
+    "objects": Limit("count", least=0, meaning="movable bodies, each named in both files; structure alone has none"),
     "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml"),
     "finite": Limit("bool", least=1, meaning="no non-finite number after 5 s"),
     "drift_hulls": Limit("m", most=0.01, meaning="largest move in 5 s untouched, hulls at the environments' timestep"),

@@ -33,8 +33,13 @@ def make_manifest(
     alignment: list[dict[str, Any]],
     gates: tuple[Gate, ...],
     decompose: DecomposeConfig,
+    fallbacks: dict[str, str] | None = None,
 ) -> SceneManifest:
-    """Collects what a scene is, where it came from and which gates it passed; all paths are relative."""
+    """Collects what a scene is, where it came from and which gates it passed; all paths are relative.
+
+    `fallbacks` names the models whose one convex hull stands for them, and why.
+    """
+    fell = fallbacks or {}
     objects = tuple(
         SceneObject(
             name=placed.name,
@@ -54,8 +59,11 @@ def make_manifest(
         licence=raw.licence,
         floor_area_m2=round(floor_area_m2, 3),
         objects=objects,
-        collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES} | parameters,
+        collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES}
+        | parameters
+        | {"convex_hull_only": sorted(fell), "from_source": sorted(k for k, c in raw.cads.items() if c.pieces)},
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),
+        warnings=(*raw.warnings, *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items()))),
     )

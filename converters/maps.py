@@ -141,6 +141,8 @@ def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> t
     Returns:
         points (k, 3) m, face (k,) the face each lies on.
     """
+    if len(faces) == 0:
+        return np.zeros((0, 3)), np.zeros(0, np.int64)
     corners = vertices[faces]
     longest = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
     steps = np.maximum(np.ceil(longest / spacing_m).astype(int), 1)

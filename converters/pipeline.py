@@ -9,6 +9,8 @@ import functools
 import multiprocessing
 import os
 import shutil
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,8 +19,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from converters import gibson, scan2cad
+from converters import gibson, interactive_gibson, scan2cad
 from converters.alignment import Alignment, compare, upright
+from converters.cache import NOT_HASHED, StageCache
 from converters.cut import cut_furniture, face_areas
 from converters.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
 from converters.emit import SceneParts, write_scene
@@ -28,18 +31,20 @@ from converters.gates import Gate, evaluate
 from converters.holes import fill_holes
 from converters.manifest import make_manifest
 from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
-from converters.objects import PlacedObject, name_objects, place_object, rotation_of, to_world
-from converters.physical import physical_properties
+from converters.objects import Hull, PlacedObject, name_objects, place_object, rotation_of, to_world
+from converters.physical import Physical, physical_properties
 from converters.proposals import propose_instances
 from converters.propose import floor_of
 from converters.raw import RawScene
 from converters.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
 from converters.settle import Settled, settle
+from converters.storeys import split_storeys
 from converters.texture import ColourCloud, VisualMesh, bake_object, bake_structure, colour_cloud
 from converters.walls import wall_boxes
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
 READERS = {
+    "interactive-gibson": (interactive_gibson.looks_like, interactive_gibson.read_interactive_gibson),
     "gibson": (gibson.looks_like, gibson.read_gibson),
     "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
 }
@@ -68,18 +73,22 @@ class ConvertConfig:
     """Choices of one conversion."""
 
     format: str = "auto"
-    split: str = "train"
-    jobs: int = 2
+    split: str = dataclasses.field(default="train", metadata=NOT_HASHED)
+    jobs: int = dataclasses.field(default=2, metadata=NOT_HASHED)
     seed: int = 0
     """Seed of coacd's search."""
-    overwrite: bool = False
+    overwrite: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
+    strict: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
+    """Refuse what would be repaired with a warning."""
+    timeout_s: float = dataclasses.field(default=240.0, metadata=NOT_HASHED)
+    """Of the decomposition of one model."""
     structure_faces: int = 16000
     object_faces: int = 1500
     structure_texture: int = 1024
     object_texture: int = 256
-    auto_align: bool = False
+    auto_align: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
     """Fits library models to labelled furniture that has no annotation."""
-    library: Path | None = None
+    library: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
     """Folder with `cad/` for that; None: the source folder."""
 
 
@@ -87,6 +96,7 @@ class ConvertConfig:
 class Converted:
     """What `convert` made."""
 
+    folder: Path
     manifest: SceneManifest
     gates: tuple[Gate, ...]
     settled: Settled
@@ -101,21 +111,23 @@ class _Clock:
     def __init__(self, report: Report) -> None:
         self.report = report
         self.seconds: dict[str, float] = {}
+        self.floors = 1
         self._before = 0.0
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Callable[[float], None]]:
-        total = sum(STAGES.values())
+        per_floor = sum(STAGES.values()) - STAGES["read"]
+        total = STAGES["read"] + self.floors * per_floor
         start = time.monotonic()
 
         def inner(share: float) -> None:
-            self.report(name, (self._before + STAGES[name] * min(share, 1.0)) / total)
+            self.report(name, min((self._before + STAGES[name] * min(share, 1.0)) / total, 1.0))
 
         inner(0.0)
         yield inner
         inner(1.0)
         self._before += STAGES[name]
-        self.seconds[name] = time.monotonic() - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
 
 def detect_format(source: Path) -> str:
@@ -130,17 +142,18 @@ def detect_format(source: Path) -> str:
     if not source.exists():
         raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
     raise SceneRejected(
-        f"{source}: no known layout; expected {gibson.MESH} (gibson) or {scan2cad.ANNOTATION} (scan2cad) in it"
+        f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
+        f"(interactive-gibson) or {scan2cad.ANNOTATION} (scan2cad) in it"
     )
 
 
-def read_source(source: Path, layout: str = "auto") -> RawScene:
+def read_source(source: Path, layout: str = "auto", strict: bool = False) -> RawScene:
     """Reads a raw folder in the given layout, or in the one that its files show.
 
     Raises:
         SceneRejected: no known layout, or bad input.
     """
-    return READERS[layout if layout != "auto" else detect_format(source)][1](source)
+    return READERS[layout if layout != "auto" else detect_format(source)][1](source, strict)
 
 
 def with_retrieved(
@@ -232,17 +245,34 @@ def _object_visuals(
         return list(pool.map(bake, clouds, annotated))
 
 
+def _with_source(physical: Physical, mass_kg: float | None, friction: float | None) -> Physical:
+    """The source's own mass and friction where it has them; moments scale with the mass."""
+    mass = physical.mass_kg if mass_kg is None else mass_kg
+    return dataclasses.replace(
+        physical,
+        mass_kg=mass,
+        inertia_b=physical.inertia_b * (mass / physical.mass_kg),
+        friction=physical.friction if friction is None else friction,
+        clipped=physical.clipped and mass_kg is None,
+    )
+
+
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
-    """Every stage after reading; writes into `folder`, which exists and is empty."""
+    """Every stage after reading; writes into `folder`, which exists and is empty.
+
+    Args:
+        raw: one floor.
+        folder: of the scene.
+        config: choices.
+        clock: of the stages.
+        cache: folder of hulls and stage results by content.
+    """
+    stages = StageCache(cache)
     with clock.stage("align") as progress:
         retrieved: dict[int, float] = {}
         if config.auto_align and config.library is not None:
             raw, retrieved = with_retrieved(raw, config.library, progress)
         placements, rows = align_objects(raw)
-        if not raw.annotations:
-            raise SceneRejected(
-                f"{raw.name}: no annotated object, expected at least one; annotate the furniture, or try --auto-align"
-            )
         for k, confidence in retrieved.items():
             rows[k]["retrieved_confidence"] = confidence
         floor_height = raw.floor_height_m
@@ -250,38 +280,47 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
             floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)
         vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
         walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
-    decompose_config = DecomposeConfig(seed=config.seed)
+    decompose_config = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)
     with clock.stage("decompose") as progress:
-        hulls = decompose_all(
-            {k: (c.vertices, c.faces) for k, c in sorted(raw.cads.items())},
+        decomposed = decompose_all(
+            {k: (c.vertices, c.faces) for k, c in sorted(raw.cads.items()) if c.pieces is None},
             decompose_config,
             config.jobs,
             cache,
             progress,
-            {k: DOOR_OVERRIDES for k, c in raw.cads.items() if c.category == "door"},
+            {k: DOOR_OVERRIDES for k, c in raw.cads.items() if c.category == "door" and c.pieces is None},
+            config.strict,
         )
+        own = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
+        hulls = decomposed.hulls | own
         annotated = tuple(
             place_object(name, a, raw.cads[a.cad_id], hulls[a.cad_id], pose, floor_height, walls_yaw)
             for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, placements, strict=True)
         )
-        physical = tuple(physical_properties(o.category, o.hulls_b) for o in annotated)
-    with clock.stage("cut"):
-        cut = cut_furniture(vertices_w, raw.scan.faces, raw.scan.labels, annotated)
-    with clock.stage("map"):
-        plan = make_floor_plan(
-            vertices_w, raw.scan.faces[cut.keep], raw.scan.labels, annotated, raw.given_map, walls_yaw
+        physical = tuple(
+            _with_source(
+                physical_properties(o.category, o.hulls_b), raw.cads[o.cad_id].mass_kg, raw.cads[o.cad_id].friction
+            )
+            for o in annotated
         )
-        walls = wall_boxes(plan)
+    with clock.stage("cut"):
+        cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated)
+    with clock.stage("map"):
+        plan = stages.call(
+            make_floor_plan, vertices_w, raw.scan.faces[cut.keep], raw.scan.labels, annotated, raw.given_map, walls_yaw
+        )
+        walls = stages.call(wall_boxes, plan)
         traversable, origin = resample(plan.grid, plan.traversable, plan.grid.resolution_m)
         if not traversable.any():
             raise SceneRejected("scan: the traversable map is empty; the scan needs visible floor")
         maps = SceneMaps(traversable, plan.grid.resolution_m, origin, floor_height)
     with clock.stage("settle"):
-        settled = settle(SceneParts(raw.name, annotated, physical, walls))
+        unsettled = SceneParts(raw.name, annotated, physical, walls)
+        settled = settle(unsettled) if annotated else Settled(unsettled, (), ())
     with clock.stage("texture") as progress:
-        structure, _ = _structure_visual(raw, vertices_w, cut.keep, plan, annotated, config)
+        structure, _ = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
         progress(0.5)
-        baked = _object_visuals(raw, vertices_w, cut.owner, annotated, config)
+        baked = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
         visuals, seen = [v for v, _ in baked], [share for _, share in baked]
     for row, moved, drop, share, placed in zip(
         rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
@@ -297,9 +336,9 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         gates = evaluate(spec, maps, tuple(o.name for o in parts.objects))
         area = float(plan.traversable.sum()) * plan.grid.resolution_m**2
-        manifest = make_manifest(raw, config.split, parts, area, rows, gates, decompose_config)
+        manifest = make_manifest(raw, config.split, parts, area, rows, gates, decompose_config, decomposed.fallbacks)
         save_manifest(manifest, folder)
-    return Converted(manifest, gates, settled, len(walls), clock.seconds)
+    return Converted(folder, manifest, gates, settled, len(walls), clock.seconds)
 
 
 @contextlib.contextmanager
@@ -309,6 +348,15 @@ def fresh_folder(target: Path, overwrite: bool) -> Iterator[Path]:
     Raises:
         SceneRejected: the target exists, or its parent cannot be written.
     """
+    with contextlib.ExitStack() as stack:
+        temporary = stack.enter_context(_part_folder(target, overwrite))
+        yield temporary
+        publish({temporary: target})
+
+
+@contextlib.contextmanager
+def _part_folder(target: Path, overwrite: bool) -> Iterator[Path]:
+    """An empty folder beside `target`; gone at the end unless it was published."""
     if target.exists() and not overwrite:
         raise SceneRejected(f"{target}: exists already; give another OUT or add --overwrite")
     if target.exists() and not target.is_dir():
@@ -321,33 +369,115 @@ def fresh_folder(target: Path, overwrite: bool) -> Iterator[Path]:
         raise SceneRejected(f"{target}: cannot be written ({error.strerror}); give another OUT") from error
     try:
         yield temporary
-        if target.exists():
-            shutil.rmtree(target)
-        temporary.rename(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def publish(folders: dict[Path, Path]) -> None:
+    """Renames finished folders to their targets, all or none; an older target is replaced.
+
+    Signals wait until it is done: a few renames take no time, and half of them would be worse.
+    """
+    with _signals_wait():
+        _publish(folders)
+
+
+@contextlib.contextmanager
+def _signals_wait() -> Iterator[None]:
+    """Holds back SIGINT and SIGTERM; one that came is raised at the end.
+
+    By handlers and not by a mask, which would hold for this thread only: libraries run others.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python runs handlers in the main thread only
+        return
+    came: list[int] = []
+    before = {s: signal.signal(s, lambda number, frame: came.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for number in came[:1]:
+        signal.raise_signal(number)
+
+
+def _publish(folders: dict[Path, Path]) -> None:
+    moved: list[tuple[Path, Path | None]] = []
+    try:
+        for temporary, target in folders.items():
+            old = None
+            if target.exists():
+                old = target.parent / f".{target.name}.old-{os.getpid()}"
+                target.rename(old)
+            moved.append((target, old))
+            temporary.rename(target)
+    except BaseException:
+        for target, old in moved:
+            shutil.rmtree(target, ignore_errors=True)
+            if old is not None:
+                old.rename(target)
+        raise
+    for _, old in moved:
+        if old is not None:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def convert_building(
+    source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
+) -> tuple[Converted, ...]:
+    """Converts one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
+
+    Args:
+        source: folder in one of the layouts of `READERS`.
+        target: scene folder to make; its name becomes the scene's. A building of several floors makes `<target>_0`,
+            `<target>_1` and so on instead, from the lowest floor up.
+        config: choices.
+        report: progress callback.
+        cache: folder of hulls and stage results by content; default `cache_folder()`.
+
+    Raises:
+        SceneRejected: bad input.
+        StageFailed: a stage broke.
+        OSError: the disk is full or gone.
+    """
+    return _convert(source, target, config, report, cache, None)
 
 
 def convert(
     source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
 ) -> Converted:
-    """Converts one raw folder; `target` appears whole or not at all.
-
-    Args:
-        source: folder in one of the layouts of `READERS`.
-        target: scene folder to make; its name becomes the scene's.
-        config: choices.
-        report: progress callback.
-        cache: folder of decomposed hulls; default `cache_folder()`.
+    """Converts a raw folder of one floor; arguments and errors of `convert_building`.
 
     Raises:
-        SceneRejected: bad input.
-        StageFailed: a stage broke.
+        SceneRejected: bad input, or several floors.
     """
+    return _convert(source, target, config, report, cache, 1)[0]
+
+
+def _convert(
+    source: Path, target: Path, config: ConvertConfig, report: Report | None, cache: Path | None, floors: int | None
+) -> tuple[Converted, ...]:
     clock = _Clock(report or (lambda stage, share: None))
-    with fresh_folder(target, config.overwrite) as folder:
+    with contextlib.ExitStack() as stack:
+        # Before reading, which may take a while: an OUT that cannot be written is told at once.
+        first = stack.enter_context(_part_folder(target, config.overwrite))
         with clock.stage("read"):
-            raw = dataclasses.replace(read_source(source, config.format), name=target.name)
+            raw = dataclasses.replace(read_source(source, config.format, config.strict), name=target.name)
+            scenes = split_storeys(raw)
         if config.auto_align and config.library is None:
             config = dataclasses.replace(config, library=source)
-        return convert_raw(raw, folder, config, clock, cache or cache_folder())
+        if floors is not None and len(scenes) != floors:
+            raise SceneRejected(f"{source}: has {len(scenes)} floors, expected {floors}; use convert_building")
+        clock.floors = len(scenes)
+        if len(scenes) == 1:
+            folders = {first: target}
+        else:
+            targets = [target.parent / scene.name for scene in scenes]
+            folders = {stack.enter_context(_part_folder(t, config.overwrite)): t for t in targets}
+        done = []
+        for scene, (folder, final) in zip(scenes, folders.items(), strict=True):
+            result = convert_raw(scene, folder, config, clock, cache or cache_folder())
+            done.append(dataclasses.replace(result, folder=final, stage_s=clock.seconds))
+        publish(folders)
+    return tuple(done)

@@ -11,6 +11,8 @@ import dataclasses
 
 import numpy as np
 
+from converters.cache import NOT_HASHED
+
 # ShapeNet synset -> category. 02747177 is ShapeNet's trash bin, which the benchmark calls a basket.
 SYNSETS = {
     "03001627": "chair",
@@ -68,6 +70,12 @@ class CadModel:
     """(m, 3) int64."""
     face_colours: np.ndarray
     """(m, 3) uint8: diffuse colour of the material, or of the texture at the face."""
+    pieces: tuple[tuple[np.ndarray, np.ndarray], ...] | None = None
+    """Convex pieces (vertices (n, 3), faces (m, 3)) that came with the model; None: they are to be computed."""
+    mass_kg: float | None = None
+    """The source's own mass; None: density times volume."""
+    friction: float | None = None
+    """The source's own sliding coefficient; None: the category's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,18 +120,31 @@ class GivenMap:
 
 
 @dataclasses.dataclass(frozen=True)
+class Storey:
+    """One floor of a building with several."""
+
+    height_m: float
+    """Of its floor, scan frame."""
+    given_map: GivenMap | None
+
+
+@dataclasses.dataclass(frozen=True)
 class RawScene:
     """Everything that a reader hands to the pipeline."""
 
-    name: str
-    source_format: str
+    name: str = dataclasses.field(metadata=NOT_HASHED)
+    source_format: str = dataclasses.field(metadata=NOT_HASHED)
     scan: ScanMesh
     cads: dict[str, CadModel]
     """By `cad_id`."""
     annotations: tuple[Annotation, ...]
     floor_height_m: float | None
-    """Of the scan frame; None: the pipeline finds it from the floor labels."""
+    """Of the scan frame, the lowest of several; None: the pipeline finds it from the floor labels."""
     given_map: GivenMap | None
-    licence: str
-    sources: dict[str, str]
+    licence: str = dataclasses.field(metadata=NOT_HASHED)
+    sources: dict[str, str] = dataclasses.field(metadata=NOT_HASHED)
     """Path relative to the source folder -> sha256."""
+    storeys: tuple[Storey, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    """From the lowest up, where there are several; `converters.storeys.split_storeys` takes them apart."""
+    warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    """What the reader repaired or found missing, for scene.json."""

@@ -61,6 +61,8 @@ class SceneManifest:
     """Package versions that wrote the folder."""
     alignment: tuple[dict[str, Any], ...] = ()
     """Per object: residual of the keypoint fit and difference to the annotated pose."""
+    warnings: tuple[str, ...] = ()
+    """What the converter repaired, left out or found missing in the source."""
     schema_version: int = SCHEMA_VERSION
 
 
@@ -131,6 +133,7 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
         raise SceneError(f"{where}: split is {data['split']!r}, expected one of {', '.join(SPLITS)}")
     data["objects"] = tuple(objects)
     data["alignment"] = tuple(data.get("alignment", ()))
+    data["warnings"] = tuple(data.get("warnings", ()))
     return SceneManifest(**data)
 
 

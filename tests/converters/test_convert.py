@@ -158,13 +158,6 @@ def test_a_failure_half_way_leaves_nothing_and_keeps_the_old_scene(gibson_raw, t
     assert [p.name for p in out.parent.iterdir()] == ["out"] and contents(out) == {"old.txt": b"old"}
 
 
-def test_no_annotation_at_all(gibson_raw, tmp_path, hull_cache):
-    empty = [tiny_raw.annotation()[0] | {"aligned_models": []}]
-    (gibson_raw / "alignments.json").write_text(json.dumps(empty))
-    with pytest.raises(SceneRejected, match="no annotated object"):
-        convert(gibson_raw, tmp_path / "out", SMALL, cache=hull_cache)
-
-
 def test_auto_align_adds_the_object_that_nobody_annotated(gibson_raw, tmp_path, hull_cache):
     data = tiny_raw.annotation()
     data[0]["aligned_models"] = data[0]["aligned_models"][:1]

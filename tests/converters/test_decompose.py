@@ -22,7 +22,7 @@ def table() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_table_becomes_a_top_and_four_legs(hull_cache):
-    hulls = decompose_all({"table": table()}, CONFIG, 1, hull_cache)["table"]
+    hulls = decompose_all({"table": table()}, CONFIG, 1, hull_cache).hulls["table"]
     assert 5 <= len(hulls) <= CONFIG.max_convex_hull
     low = np.min([h.vertices.min(axis=0) for h in hulls], axis=0)
     high = np.max([h.vertices.max(axis=0) for h in hulls], axis=0)
@@ -35,11 +35,11 @@ def test_a_table_becomes_a_top_and_four_legs(hull_cache):
 
 def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cache, monkeypatch):
     vertices, faces = table()
-    first = decompose_all({"a": (vertices, faces)}, CONFIG, 1, hull_cache)["a"]
+    first = decompose_all({"a": (vertices, faces)}, CONFIG, 1, hull_cache).hulls["a"]
     entry = hull_cache / f"{content_key(vertices, faces, CONFIG)}.npz"
     own = tmp_path / entry.name
     own.write_bytes(entry.read_bytes()[:100])  # cut short
-    again = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path)["a"]
+    again = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path).hulls["a"]
     assert own.read_bytes() == entry.read_bytes()
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.vertices, other.vertices)
@@ -48,7 +48,7 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
         raise AssertionError("a cached mesh must not be decomposed")
 
     monkeypatch.setattr(decompose, "_start", no_process)
-    cached = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path)
+    cached = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path).hulls
     assert len(cached["a"]) == len(cached["b"]) == len(first)
 
 
@@ -60,17 +60,61 @@ def test_the_key_follows_content_and_parameters_only():
     assert key != content_key(vertices, faces, dataclasses.replace(CONFIG, threshold=0.2))
 
 
-def test_a_failing_and_a_slow_model_are_named(tmp_path):
+def test_a_failing_and_a_slow_model_get_their_convex_hull(tmp_path):
+    late = decompose_all({"table": table()}, dataclasses.replace(CONFIG, timeout_s=0.0), 1, tmp_path)
+    assert late.fallbacks == {"table": "coacd ran past 0 s on table"}
+    (hull,) = late.hulls["table"]
+    # The top, 1.0 x 0.6 x 0.1, and under it a prismatoid of 0.6 that narrows to the legs' 0.98 x 0.58.
+    want = 0.06 + 0.6 / 6 * (1.0 * 0.6 + 4 * 0.99 * 0.59 + 0.98 * 0.58)
+    assert trimesh.Trimesh(hull.vertices, hull.faces).volume == pytest.approx(want)
+    assert list(tmp_path.iterdir()) == []  # tried again the next time
+
+
+def test_a_crash_of_coacd_gets_the_convex_hull(tmp_path, monkeypatch):
+    start = decompose._start
+
+    def crash(key, name, vertices, faces, config, scratch):
+        return start(key, name, vertices, faces + 10**6 * (name == "broken"), config, scratch)
+
+    monkeypatch.setattr(decompose, "_start", crash)  # faces of vertices that are not there
+    done = decompose_all({"broken": table(), "copy": table()}, CONFIG, 1, tmp_path)
+    assert (
+        list(done.fallbacks) == ["broken", "copy"] and "coacd failed on broken (exit code" in done.fallbacks["broken"]
+    )
+    with pytest.raises(StageFailed, match="decompose: coacd failed on broken"):
+        decompose_all({"broken": table()}, CONFIG, 1, tmp_path, strict=True)
+
+
+def test_strictly_a_slow_model_is_an_error(tmp_path):
     with pytest.raises(StageFailed, match="coacd ran past 0 s on table"):
-        decompose_all({"table": table()}, dataclasses.replace(CONFIG, timeout_s=0.0), 1, tmp_path)
-    with pytest.raises(StageFailed, match="coacd failed on broken"):
-        decompose_all({"broken": (np.zeros((0, 3)), np.zeros((0, 3), np.int64))}, CONFIG, 1, tmp_path)
-    assert list(tmp_path.iterdir()) == []
+        decompose_all({"table": table()}, dataclasses.replace(CONFIG, timeout_s=0.0), 1, tmp_path, strict=True)
+
+
+def test_a_full_disk_is_no_fault_of_the_model(tmp_path, monkeypatch):
+    start = decompose._start
+
+    def elsewhere(*arguments):
+        job = start(*arguments)
+        job.process.kill()
+        job.process.wait()
+        job.process.returncode = decompose.CANNOT_WRITE
+        return job
+
+    monkeypatch.setattr(decompose, "_start", elsewhere)
+    with pytest.raises(OSError, match="cannot be written"):
+        decompose_all({"table": table()}, CONFIG, 1, tmp_path)
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, hull_cache):
+    (tmp_path / "file").write_text("")
+    made = decompose_all({"table": table()}, CONFIG, 1, tmp_path / "file" / "cache")
+    known = decompose_all({"table": table()}, CONFIG, 1, hull_cache)
+    assert made.fallbacks == {} and len(made.hulls["table"]) == len(known.hulls["table"])
 
 
 def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path))
-    assert decompose.cache_folder() == tmp_path / "hulls"
+    assert decompose.cache_folder() == tmp_path / "converters"
     monkeypatch.delenv("INTERACTIVE_NAV_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "x"))
-    assert decompose.cache_folder() == tmp_path / "x" / "interactive_nav" / "hulls"
+    assert decompose.cache_folder() == tmp_path / "x" / "interactive_nav" / "converters"

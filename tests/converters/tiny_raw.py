@@ -206,3 +206,29 @@ def write_gibson(root: Path) -> Path:
     (root / "LICENCE").write_text("CC0: no rights reserved\n")
     _write_cads(root)
     return root
+
+
+def write_two_floors(root: Path, storey_m: float = 3.0) -> Path:
+    """The Gibson folder with the room twice, one above the other; a table and a basket below, a basket above."""
+    write_gibson(root)
+    vertices, faces, labels = scan()
+    order = sorted(COLOURS)
+    both = np.vstack([vertices, vertices + [0, 0, storey_m]])
+    lines = ["mtllib mesh_z_up.mtl", "usemtl scan"]
+    lines += [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in both]
+    lines += [f"vt {(k + 0.5) / len(order):.5f} 0.5" for k in range(len(order))]
+    column = np.array([order.index(int(v)) for v in labels] * 2) + 1
+    twice = np.vstack([faces, faces + len(vertices)])
+    lines += [f"f {a + 1}/{column[a]} {b + 1}/{column[b]} {c + 1}/{column[c]}" for a, b, c in twice]
+    (root / "mesh_z_up.obj").write_text("\n".join(lines) + "\n")
+    np.savez_compressed(root / "mesh_z_up.labels.npz", label=np.tile(labels, 2).astype(np.uint8))
+    (root / "floors.txt").write_text(f"{FLOOR_M + storey_m}\n{FLOOR_M}\n")
+    data = annotation()
+    upper = json.loads(json.dumps(data[0]["aligned_models"][1]))  # a second basket, upstairs
+    upper["trs"]["translation"][1] += storey_m  # the annotation's world is y up
+    for key in ("keypoints_cad", "keypoints_scan"):
+        points = np.array(upper[key]["position"]).reshape(-1, 3) + [0, storey_m, 0]
+        upper[key]["position"] = points.ravel().tolist()
+    data[0]["aligned_models"].append(upper)
+    (root / "alignments.json").write_text(json.dumps(data))
+    return root

@@ -1,0 +1,148 @@
+"""Cost of a conversion: a generated building in, two JSON rows (cold cache, warm cache) out.
+
+    python -m benchmarks.convert --faces 150000 --objects 25
+
+Generates a building of about that many scan faces and exactly so many objects, and converts it twice with one new
+cache folder, each time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident
+memory, and the machine. Memory is the larger of the converter's own peak and its largest child's
+(`resource.getrusage`), and beside it the sum of the converter and `--jobs` such children, which bounds what all hold
+together. Rows are appended to `benchmarks/results/convert.jsonl`; on a machine that others use, times are upper
+bounds: the load is recorded beside them, and `cpu_s`, the processor seconds of the converter and its children, which
+depends on it little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from converters.generate import BuildingConfig, generate_building
+
+PACKAGES = ("mujoco", "coacd", "trimesh", "numpy", "scipy", "xatlas")
+LIMITS = {"cold_s": 600.0, "warm_s": 30.0, "memory_mib": 6 * 1024.0}
+"""What the converter is meant to keep on two cores."""
+
+MEASURE = """
+import json, resource, sys, time
+start = time.perf_counter()
+from pathlib import Path
+from converters.pipeline import ConvertConfig, convert
+done = convert(Path(sys.argv[1]), Path(sys.argv[2]), ConvertConfig(jobs=int(sys.argv[4])), cache=Path(sys.argv[3]))
+usage = {who: resource.getrusage(getattr(resource, f"RUSAGE_{who}")) for who in ("SELF", "CHILDREN")}
+peak = {who: u.ru_maxrss / 1024 for who, u in usage.items()}
+print(json.dumps({
+    "wall_s": round(time.perf_counter() - start, 1),
+    "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in usage.values()), 1),
+    "stage_s": {k: round(v, 2) for k, v in done.stage_s.items()},
+    "peak_mib": round(peak["SELF"]),
+    "peak_child_mib": round(peak["CHILDREN"]),
+    "objects": len(done.manifest.objects),
+    "hulls": sum(o.n_hulls for o in done.manifest.objects),
+    "floor_area_m2": done.manifest.floor_area_m2,
+    "failed_gates": [g.name for g in done.gates if not g.passed],
+}))
+"""
+
+
+def building_config(faces: int, objects: int) -> BuildingConfig:
+    """A building whose scan has about so many faces and that holds exactly so many objects.
+
+    Shares of the categories are an ordinary apartment's: of 25 objects 14 chairs, 3 tables, 3 desks, 2 sofas, 3 doors.
+    """
+    tables = desks = doors = max(1, round(0.12 * objects))
+    sofas = max(1, round(0.08 * objects))
+    chairs = objects - tables - desks - doors - sofas
+    if chairs < 2:
+        raise SystemExit(f"--objects is {objects}, expected at least 6")
+    config = BuildingConfig()
+    area = faces / config.faces_per_m2
+    return BuildingConfig(
+        floor_area_m2=(area, 1.07 * area),
+        n_rooms=(max(3, round(area / 16)), max(4, round(area / 13))),
+        n_chairs=(chairs, chairs),
+        n_tables=(tables, tables),
+        n_desks=(desks, desks),
+        n_sofas=(sofas, sofas),
+        n_doors=(doors, doors),
+        n_static=(3, 5),
+        n_windows=(4, 8),
+        n_bottlenecks=2,
+    )
+
+
+def _commit() -> str:
+    try:
+        out = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return out.stdout.strip()
+
+
+def measure(raw: Path, out: Path, cache: Path, jobs: int) -> dict[str, Any]:
+    """Converts in a fresh process, so that its memory and imports are its own."""
+    command = [sys.executable, "-c", MEASURE, str(raw), str(out), str(cache), str(jobs)]
+    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[-1])
+
+
+def count_faces(raw: Path) -> int:
+    """Triangles of the raw scan."""
+    with (raw / "mesh_z_up.obj").open(encoding="ascii") as lines:
+        return sum(line.startswith("f ") for line in lines)
+
+
+def main() -> None:
+    """Measures and appends two rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--faces", type=int, default=150_000, help="of the raw scan, about")
+    parser.add_argument("--objects", type=int, default=25, help="movable objects, doors included")
+    parser.add_argument("--seed", type=int, default=0, help="of the building")
+    parser.add_argument(
+        "--raw", type=Path, default=None, help="convert this raw Gibson folder instead of generating one"
+    )
+    parser.add_argument("--jobs", type=int, default=2, help="decompositions side by side")
+    parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
+    parser.add_argument("--out", default="benchmarks/results/convert.jsonl")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="convert-") as folder:
+        base = Path(folder)
+        clock = time.perf_counter()
+        if args.raw is None:
+            generate_building(base / "raw", args.seed, config=building_config(args.faces, args.objects))
+        raw = args.raw or base / "raw"
+        generate_s = round(time.perf_counter() - clock, 1)
+        for kind in ("cold", "warm"):
+            load = os.getloadavg()[0]
+            row: dict[str, Any] = {"cache": kind, "faces": count_faces(raw), "seed": args.seed}
+            row["building"] = (
+                "given folder" if args.raw else f"generated: --faces {args.faces} --objects {args.objects}"
+            )
+            row |= measure(raw, base / kind, base / "cache", args.jobs)
+            row |= {
+                "memory_bound_mib": row["peak_mib"] + args.jobs * row["peak_child_mib"],
+                "generate_s": generate_s,
+                "jobs": args.jobs,
+                "device": f"cpu, {os.cpu_count()} cores",
+                "load_before": round(load, 1),
+                "load_after": round(os.getloadavg()[0], 1),
+                "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+                "commit": args.commit or _commit(),
+                "date": datetime.date.today().isoformat(),
+            }
+            with open(args.out, "a", encoding="utf-8") as out:
+                out.write(json.dumps(row) + "\n")
+            print(json.dumps(row), flush=True)
+            kept = row["wall_s"] <= LIMITS[f"{kind}_s"] and row["memory_bound_mib"] <= LIMITS["memory_mib"]
+            print(f"{kind}: {'within' if kept else 'BEYOND'} {LIMITS[f'{kind}_s']:.0f} s and 6 GiB", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""A function of arrays and its arguments in, its result out, computed once for the same content.
+
+The key is a sha256 over the arguments, the converter's own source files and the versions of the libraries that
+compute; a stale entry can therefore not be met, and the folder may be deleted at any time. Results are kept as
+NPZ with a JSON tree inside (no pickles: an entry can be damaged, but cannot run).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+COMPUTING = ("numpy", "scipy", "trimesh", "fast-simplification", "xatlas", "shapely", "mujoco")
+LIMIT_BYTES = 2 * 2**30
+"""The oldest entries go beyond this size."""
+NOT_HASHED = {"hashed": False}
+"""Metadata of dataclass fields that no stage's result depends on (names, reports)."""
+
+
+@functools.cache
+def fingerprint() -> bytes:
+    """Digest of the converter's source files and the computing libraries' versions."""
+    digest = hashlib.sha256(repr([(name, version(name)) for name in COMPUTING]).encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.digest()
+
+
+class StageCache:
+    """Results of stages by content, in one folder; without a folder everything is computed."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self._digests: dict[int, tuple[np.ndarray, bytes]] = {}
+
+    def call(self, function: Callable[..., T], *arguments: Any) -> T:
+        """`function(*arguments)`, from the folder where it is there.
+
+        Args:
+            function: pure and named; of arrays, numbers, strings, None, tuples, lists, dicts and the converter's
+                dataclasses, and returns such.
+            arguments: left unchanged by the function.
+        """
+        if self.folder is None:
+            return function(*arguments)
+        digest = hashlib.sha256(fingerprint() + f"{function.__module__}.{function.__qualname__}".encode())
+        for argument in arguments:
+            self._feed(digest, argument)
+        path = self.folder / f"{function.__name__.strip('_')}-{digest.hexdigest()}.npz"
+        found, value = _load(path)
+        if not found:
+            value = function(*arguments)
+            with contextlib.suppress(OSError):  # a full disk costs the next run time and this run nothing
+                _store(path, value)
+        return value
+
+    def _feed(self, digest: Any, value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            known = self._digests.get(id(value))
+            if known is None:
+                own = hashlib.sha256(f"{value.dtype.str}{value.shape}".encode())
+                own.update(np.ascontiguousarray(value).tobytes())
+                known = self._digests[id(value)] = (value, own.digest())  # the reference keeps the id taken
+            digest.update(b"a" + known[1])
+        elif dataclasses.is_dataclass(value):
+            digest.update(f"d{type(value).__qualname__}(".encode())
+            for field in dataclasses.fields(value):
+                if field.metadata.get("hashed", True):
+                    digest.update(field.name.encode() + b"=")
+                    self._feed(digest, getattr(value, field.name))
+            digest.update(b")")
+        elif isinstance(value, (tuple, list)):
+            digest.update(b"l(")
+            for item in value:
+                self._feed(digest, item)
+            digest.update(b")")
+        elif isinstance(value, dict):
+            digest.update(b"m(")
+            for key in sorted(value):
+                digest.update(repr(key).encode())
+                self._feed(digest, value[key])
+            digest.update(b")")
+        elif value is None or isinstance(value, (bool, int, float, str, Path, np.generic)):
+            digest.update(f"s{type(value).__name__}{value!r};".encode())
+        else:
+            raise TypeError(f"a {type(value).__name__} cannot be hashed by content")
+
+
+def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
+    """JSON tree of a value; arrays go to the list and leave their number."""
+    if isinstance(value, np.ndarray):
+        arrays.append(value)
+        return {"array": len(arrays) - 1}
+    if dataclasses.is_dataclass(value):
+        kind = type(value)
+        fields = {f.name: _encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
+        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": fields}
+    if isinstance(value, tuple):
+        return {"tuple": [_encode(v, arrays) for v in value]}
+    if isinstance(value, list):
+        return {"list": [_encode(v, arrays) for v in value]}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return {"value": value}
+    raise TypeError(f"a {type(value).__name__} cannot be kept in the cache")
+
+
+def _decode(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
+    if "array" in tree:
+        return arrays[f"a{tree['array']}"]
+    if "class" in tree:
+        module, _, name = tree["class"].partition(":")
+        if not module.startswith("converters."):
+            raise ValueError(f"{module} is no module of the converter")
+        kind = getattr(importlib.import_module(module), name)
+        if not dataclasses.is_dataclass(kind):
+            raise ValueError(f"{name} is no record")
+        return kind(**{k: _decode(v, arrays) for k, v in tree["fields"].items()})  # pyright: ignore
+    if "tuple" in tree:
+        return tuple(_decode(v, arrays) for v in tree["tuple"])
+    if "list" in tree:
+        return [_decode(v, arrays) for v in tree["list"]]
+    return tree["value"]
+
+
+def _load(path: Path) -> tuple[bool, Any]:
+    """Whether the entry is there and whole, and its value."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        value = _decode(json.loads(bytes(arrays.pop("tree")).decode()), arrays)
+    except Exception:  # a damaged archive fails in zipfile, zlib, struct or NumPy, each in its own way
+        return False, None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # the oldest unused go first
+    return True, value
+
+
+def _store(path: Path, value: Any) -> None:
+    """Writes beside and renames, so that two writers of one key leave one whole file."""
+    arrays: list[np.ndarray] = []
+    tree = np.frombuffer(json.dumps(_encode(value, arrays)).encode(), np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
+    os.close(handle)
+    try:
+        named = {f"a{i}": a for i, a in enumerate(arrays)}
+        np.savez(temporary, tree=tree, **named)  # pyright: ignore[reportArgumentType]
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+    prune(path.parent, LIMIT_BYTES)
+
+
+def prune(folder: Path, limit_bytes: int) -> None:
+    """Deletes the entries that were not used for longest until the folder is within the limit."""
+    entries = []
+    for path in folder.glob("*.npz"):
+        with contextlib.suppress(OSError):
+            status = path.stat()
+            entries.append((status.st_mtime, status.st_size, path))
+    excess = sum(size for _, size, _ in entries) - limit_bytes
+    for _, size, path in sorted(entries):
+        if excess <= 0:
+            return
+        with contextlib.suppress(OSError):
+            path.unlink()
+        excess -= size

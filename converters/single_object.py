@@ -1,0 +1,321 @@
+"""One mesh or URDF in; a folder with an MJCF body (`object.xml`), its description (`object.json`) and assets out.
+
+The body's frame is a scene object's: origin at the middle of the base, z up. `object.xml` holds the body alone,
+with a free joint, so that it can be attached to any model; it stands as it comes to rest on a level floor.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import trimesh
+
+from converters.cad import Y_UP_TO_Z_UP, clean_surface, merge_vertices
+from converters.decompose import DecomposeConfig, cache_folder, decompose_all
+from converters.emit import SceneParts, build_spec, write_scene
+from converters.errors import SceneRejected
+from converters.files import SourceFolder
+from converters.gates import collide_with, physical_values
+from converters.manifest import PACKAGES
+from converters.obj import TexturedMesh
+from converters.objects import Hull, PlacedObject, convex_hull, fit_box, rotation_of
+from converters.physical import MATERIALS, Physical
+from converters.pipeline import fresh_folder
+from converters.raw import ScanMesh
+from converters.settle import settle
+from converters.texture import VisualMesh, bake_object, colour_cloud
+from converters.urdf import RigidObject, colours_of_faces, read_surface, read_urdf
+from scenes_mjcf.schema import CATEGORIES
+
+WORDS = {
+    "shoe": ("shoe", "sandal", "boot", "sneaker", "loafer", "slipper", "heel"),
+    "pot": ("pot", "planter", "plantcontainer", "flowerpot", "vase"),
+    "basket": ("basket", "bin", "hamper"),
+    "toy": ("toy", "doll", "teddy", "truck", "robot"),
+    "chair": ("chair", "stool"),
+    "sofa": ("sofa", "couch"),
+    "desk": ("desk",),
+    "table": ("table",),
+    "door": ("door",),
+}
+"""Category -> words that tell it in a name."""
+DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0}
+"""Of the hulls, for meshes without a mass: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm
+0.7 kg in 0.8 dm3, a plastic toy is mostly hollow. Furniture has `converters.physical.MATERIALS`."""
+FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4}
+"""Sliding coefficients on a floor: rubber soles, clay, plastic."""
+FOOT_SHARE = 0.03
+"""Of the height: what ends within this above the base is brought down to it. Collision meshes come from voxels, and
+a pot on unequal hulls rests tilted."""
+TEXELS = 256
+FACES = 1500
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectConfig:
+    """Choices of one object."""
+
+    category: str | None = None
+    """One of `CATEGORIES`; None: told from the name."""
+    mass_kg: float | None = None
+    friction: float | None = None
+    scale: float = 1.0
+    up: str = "z"
+    seed: int = 0
+    """Seed of coacd's search."""
+    overwrite: bool = False
+    strict: bool = False
+    """Refuse what would be repaired with a warning."""
+    timeout_s: float = 240.0
+
+
+def guess_category(*names: str) -> str | None:
+    """The category whose word stands in a name, the longest word first; None where there is none."""
+    text = re.sub(r"[^a-z]", "", " ".join(names).lower())
+    found = [(len(word), category) for category, words in WORDS.items() for word in words if word in text]
+    return max(found)[1] if found else None
+
+
+def _category(config: ObjectConfig, names: tuple[str, ...], path: Path) -> str:
+    category = config.category or guess_category(*names)
+    if category is None:
+        raise SceneRejected(f"{path}: its name tells no category; add --category with one of {', '.join(CATEGORIES)}")
+    if category not in CATEGORIES:
+        raise SceneRejected(f"category is '{category}', expected one of {', '.join(CATEGORIES)}")
+    return category
+
+
+def _turned(mesh: TexturedMesh, turn: np.ndarray) -> TexturedMesh:
+    return dataclasses.replace(mesh, vertices=mesh.vertices @ turn.T)
+
+
+def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFolder]:
+    """Reads a URDF or a mesh, in metres and z up.
+
+    Raises:
+        SceneRejected: missing, damaged or empty file, or no rigid object.
+    """
+    source = SourceFolder(path.parent, config.strict)
+    if path.suffix.lower() == ".urdf":
+        item = read_urdf(source, path.name, "give a mesh or a URDF")
+    else:
+        surface = read_surface(source, path.name, "give a mesh or a URDF")
+        item = RigidObject(path.stem, surface, None, (surface.vertices, surface.faces), None, None)
+    turn = config.scale * (Y_UP_TO_Z_UP if config.up == "y" else np.eye(3))
+    pieces = None if item.pieces is None else tuple((v @ turn.T, f) for v, f in item.pieces)
+    solid = (item.collision[0] @ turn.T, item.collision[1])
+    return dataclasses.replace(item, surface=_turned(item.surface, turn), pieces=pieces, collision=solid), source
+
+
+def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
+    """Convex hull of (n, 3) points, body frame, with the lowest ones brought down to the base z = 0.
+
+    A plate that is thickened (`convex_hull`) grows to both sides; what then stands below the base is lifted.
+    """
+    level = points.copy()
+    level[level[:, 2] < foot_m, 2] = 0.0
+    hull = convex_hull(np.vstack([points, level]))
+    return dataclasses.replace(hull, vertices=hull.vertices - [0.0, 0.0, min(float(hull.vertices[:, 2].min()), 0.0)])
+
+
+def _properties(hulls: tuple[Hull, ...], mass_kg: float, friction: float, volume_m3: float) -> Physical:
+    """Centre of mass and inertia of hulls of even density at a given mass."""
+    volumes, centres, inertias = [], [], []
+    for hull in hulls:
+        own = trimesh.triangles.mass_properties(hull.vertices[hull.faces])
+        volumes.append(abs(float(own.volume)))
+        centres.append(np.asarray(own.center_mass, float))
+        inertias.append(np.asarray(own.inertia, float))
+    com = np.average(centres, axis=0, weights=volumes)
+    inertia = np.zeros((3, 3))
+    for volume, centre, own in zip(volumes, centres, inertias, strict=True):
+        r = centre - com
+        inertia += own + volume * (r @ r * np.eye(3) - np.outer(r, r))  # parallel axes
+    return Physical(mass_kg, com, inertia * mass_kg / sum(volumes), friction, volume_m3, False)
+
+
+def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
+    """The surface simplified, with a texture of its own (body frame, as the vertices)."""
+    vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
+    colours = colours_of_faces(surface)[keep]
+    vertices, faces, colours = clean_surface(source, where, vertices, faces, colours)
+    extent = float(np.ptp(vertices, axis=0).max())
+    scan = ScanMesh(
+        surface.vertices,
+        surface.faces,
+        np.zeros(len(surface.vertices), np.int64),
+        np.full((len(surface.vertices), 3), 170, np.uint8) if surface.texture is None else None,
+        surface.corner_uv if surface.texture is not None else None,
+        surface.texture,
+    )
+    # Points twice as dense as the texels of the picture; a grey model has nothing to show but its faces' colour.
+    chosen = np.arange(len(surface.faces)) if surface.texture is not None else np.zeros(0, np.int64)
+    cloud = colour_cloud(scan, surface.vertices, surface.faces, chosen, max(extent / TEXELS, 1e-4))
+    return bake_object(vertices, faces, colours, cloud, FACES, TEXELS)[0]
+
+
+def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path | None = None) -> dict[str, Any]:
+    """Converts one mesh or URDF; `target` appears whole or not at all.
+
+    The URDF's mass, friction and collision mesh are used; its inertia is not (released ones are placeholders): it
+    follows from the hulls at that mass.
+
+    Args:
+        path: of the mesh or URDF.
+        target: folder to make: `object.xml`, `object.json`, `assets/`.
+        config: choices; they win over the URDF's values.
+        cache: folder of hulls by content; default `cache_folder()`.
+
+    Returns:
+        The content of `object.json`.
+
+    Raises:
+        SceneRejected: bad input, or an object without a stable pose near the given one.
+        StageFailed: a stage broke.
+    """
+    if not path.is_file():
+        raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")
+    with fresh_folder(target, config.overwrite) as folder:
+        item, source = read_object(path, config)
+        category = _category(config, (item.name, path.stem), path)
+        low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
+        if not 0.005 < (high - low).max() < 10.0:
+            raise SceneRejected(
+                f"{path}: is {(high - low).max():g} m long, expected 0.5 cm to 10 m; give --scale for another unit"
+            )
+        hulls, hull_source = _hulls(item, path, config, source, cache)
+        base = np.array([*(low + high)[:2] / 2, min(float(h.vertices[:, 2].min()) for h in hulls)])
+        foot = FOOT_SHARE * float(high[2] - low[2])
+        hulls = tuple(_level_feet(h.vertices - base, foot) for h in hulls)
+        visual = _visual(_moved(item.surface, -base), path.name, source)
+        volume = sum(abs(float(trimesh.triangles.mass_properties(h.vertices[h.faces]).volume)) for h in hulls)
+        mass, mass_source = _mass(item, category, volume, config)
+        friction, friction_source = _friction(item, category, config)
+        placed = PlacedObject(
+            name=target.name,
+            category=category,
+            cad_id=item.name,
+            vertices_b=item.surface.vertices - base,
+            faces=item.surface.faces,
+            face_colours=colours_of_faces(item.surface),
+            hulls_b=hulls,
+            boxes_b=tuple(fit_box(h, 0.0) for h in hulls),
+            position_w=np.zeros(3),
+            quaternion_w=np.array([1.0, 0.0, 0.0, 0.0]),
+            hinge=None,
+        )
+        physical = _properties(hulls, mass, friction, volume)
+        settled = settle(SceneParts(target.name, (placed,), (physical,), ()))
+        parts = dataclasses.replace(settled.parts, object_visuals=(visual,))
+        rest = _rest(settled.parts)
+        about = {
+            "name": target.name,
+            "source_name": item.name,
+            "category": category,
+            "mass_kg": round(mass, 5),
+            "mass_source": mass_source,
+            "friction": friction,
+            "friction_source": friction_source,
+            "n_hulls": len(hulls),
+            "hull_source": hull_source,
+            "hull_volume_m3": round(volume, 8),
+            "size_m": [round(float(v), 4) for v in high - low],
+            "rest": rest,
+            "source": {"sha256": dict(sorted(source.sha256.items()))},
+            "warnings": source.warnings,
+            "versions": {name: version(name) for name in PACKAGES},
+        }
+        _write(parts, folder)
+        (folder / "object.json").write_text(
+            json.dumps(about, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8"
+        )
+    return about
+
+
+def _moved(mesh: TexturedMesh, by: np.ndarray) -> TexturedMesh:
+    return dataclasses.replace(mesh, vertices=mesh.vertices + by)
+
+
+def _hulls(
+    item: RigidObject, path: Path, config: ObjectConfig, source: SourceFolder, cache: Path | None
+) -> tuple[tuple[Hull, ...], str]:
+    if item.pieces is not None:
+        return tuple(Hull(*p) for p in item.pieces), "collision mesh"
+    vertices, faces, _ = merge_vertices(*item.collision)
+    made = decompose_all(
+        {path.name: (vertices, faces)},
+        DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s),
+        1,
+        cache or cache_folder(),
+        strict=config.strict,
+    )
+    for why in made.fallbacks.values():
+        source.note(f"{why}; its convex hull stands for it")
+    return made.hulls[path.name], "convex hull" if made.fallbacks else "coacd"
+
+
+def _mass(item: RigidObject, category: str, volume_m3: float, config: ObjectConfig) -> tuple[float, str]:
+    if config.mass_kg is not None:
+        return config.mass_kg, "given"
+    if item.mass_kg is not None:
+        return item.mass_kg, "urdf"
+    if category in MATERIALS:
+        material = MATERIALS[category]
+        return float(np.clip(material.density_kg_m3 * volume_m3, *material.mass_range_kg)), "density"
+    return max(DENSITY_KG_M3[category] * volume_m3, 0.01), "density"
+
+
+def _friction(item: RigidObject, category: str, config: ObjectConfig) -> tuple[float, str]:
+    if config.friction is not None:
+        return config.friction, "given"
+    if item.friction is not None:
+        return item.friction, "urdf"
+    return (MATERIALS[category].friction if category in MATERIALS else FRICTION[category]), "category"
+
+
+def _rest(parts: SceneParts) -> dict[str, Any]:
+    """Pose at rest on a level floor, and how far hulls and boxes drift from it in the gates' time."""
+    (placed,) = parts.objects
+    up = rotation_of(placed.quaternion_w)[:, 2]
+    result: dict[str, Any] = {
+        "position_m": [round(float(v), 6) + 0.0 for v in placed.position_w],
+        "quaternion_wxyz": [round(float(v), 9) + 0.0 for v in placed.quaternion_w],
+        "tilt_deg": round(math.degrees(math.acos(float(np.clip(up[2], -1, 1)))), 3),
+    }
+    for shape, name in (("hull", "hulls"), ("box", "boxes")):
+        values = physical_values(collide_with(build_spec(parts, inline=True), shape))
+        if not values["finite"]:
+            raise SceneRejected(f"{placed.name}: its simulation is not finite with {name}; give another collision mesh")
+        result |= {
+            f"drift_{name}_m": round(values["drift"], 6),
+            f"turn_{name}_deg": round(values["turn"], 4),
+            f"penetration_{name}_m": round(values["penetration"], 6),
+        }
+    return result
+
+
+def _write(parts: SceneParts, folder: Path) -> None:
+    """`assets/` and `object.xml`: the scene writer's file without floor, light and structure."""
+    (placed,) = parts.objects
+    centred = dataclasses.replace(placed, position_w=placed.position_w * [0.0, 0.0, 1.0])
+    write_scene(dataclasses.replace(parts, objects=(centred,)), folder)
+    path = folder / "scene.xml"
+    spec = mujoco.MjSpec.from_file(str(path))
+    for geom in [g for g in spec.worldbody.geoms if g.name == "floor"]:
+        spec.delete(geom)
+    for light in list(spec.lights):
+        spec.delete(light)
+    structure = spec.body("structure")
+    if structure is not None:
+        spec.delete(structure)
+    spec.compile()
+    path.unlink()
+    (folder / "object.xml").write_text(spec.to_xml(), encoding="utf-8")

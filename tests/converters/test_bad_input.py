@@ -1,0 +1,247 @@
+"""Conversions that go wrong: one line, the right exit code, nothing half-written; and those that are mended."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from converters import decompose, pipeline
+from converters.__main__ import main
+from converters.errors import SceneRejected, StageFailed
+from converters.pipeline import ConvertConfig, convert, publish
+from scenes_mjcf.schema import load_manifest
+from tests.converters import tiny_raw
+
+SMALL = ConvertConfig(structure_texture=64, object_texture=32)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def one_line(capsys) -> str:
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("error: ") and "Traceback" not in error
+    return error
+
+
+@pytest.fixture
+def cached(monkeypatch, hull_cache):
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(hull_cache))
+    return hull_cache
+
+
+def write_cad(root: Path, mesh: trimesh.Trimesh) -> None:
+    path = root / "cad/04379243/table-a/models/model_normalized.obj"
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices]
+    path.write_text("\n".join(lines + [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]) + "\n")
+
+
+def test_an_open_non_manifold_model_with_dead_faces_converts(gibson_raw, tmp_path):
+    """Half of the table's top is missing, a fin hangs on an edge, and some faces have no area."""
+    table = tiny_raw.table_cad()
+    faces = np.vstack([table.faces[2:], [[0, 1, 20], [0, 1, 21], [0, 1, 22], [5, 5, 6]]])
+    write_cad(gibson_raw, trimesh.Trimesh(table.vertices, faces, process=False))
+    converted = convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
+    manifest = load_manifest(tmp_path / "out")
+    assert [o.name for o in manifest.objects] == ["table_0", "basket_0"]
+    assert any("is not manifold" in w for w in manifest.warnings)
+    assert manifest.collision["convex_hull_only"] == []
+    assert {g.name for g in converted.gates if not g.passed} == set()
+
+
+def test_coacd_failing_on_one_object(gibson_raw, tmp_path, monkeypatch):
+    start = decompose._start
+
+    def crash(key, name, vertices, faces, config, scratch):
+        return start(key, name, vertices, faces + 10**6 * (name == "table-a"), config, scratch)
+
+    monkeypatch.setattr(decompose, "_start", crash)
+    convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
+    manifest = load_manifest(tmp_path / "out")
+    assert manifest.collision["convex_hull_only"] == ["table-a"]
+    assert {o.name: o.n_hulls for o in manifest.objects} == {"table_0": 1, "basket_0": 1}
+    (warning,) = manifest.warnings
+    assert warning.startswith("coacd failed on table-a") and warning.endswith("its convex hull stands for it")
+    config = ConvertConfig(structure_texture=64, object_texture=32, strict=True)
+    with pytest.raises(StageFailed, match="coacd failed on table-a"):
+        convert(gibson_raw, tmp_path / "strict", config, cache=tmp_path / "cache")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cache", "gibson", "out"]
+
+
+def test_the_timeout_is_an_option(gibson_raw, tmp_path, monkeypatch):
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
+    source, out = str(gibson_raw), tmp_path / "out"
+    assert main(["convert", source, str(out), "--timeout", "0.001", "--strict"]) == 2
+    assert not out.exists()
+    assert main(["convert", source, str(out), "--timeout", "0.001"]) == 0
+    assert load_manifest(out).collision["convex_hull_only"] == ["basket-a", "table-a"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda r: (r / "mesh_z_up.obj").write_bytes(b"\xff\xfe\x00garbage"), "mesh_z_up.obj"),
+        (lambda r: (r / "mesh_z_up.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "not finite"),
+        (lambda r: (r / "floors.txt").write_text("0.3 0.4"), "less than 1 m apart"),
+        (lambda r: (r / "alignments.json").write_text("[" * 100000), "not readable as JSON"),
+        (lambda r: (r / "floor_trav_0.png").write_bytes(b"x"), "not readable as an image"),
+        (lambda r: shutil.rmtree(r / "cad"), "put the model there"),
+        (
+            lambda r: Image.fromarray(np.full((50, 50), 255, np.uint8)).save(r / "floor_trav_0.png"),
+            "covers 0.5 x 0.5 m",
+        ),
+    ],
+)
+def test_one_clear_line_and_nothing_written(gibson_raw, tmp_path, capsys, cached, change, words):
+    change(gibson_raw)
+    out = tmp_path / "scenes" / "out"
+    assert main(["convert", str(gibson_raw), str(out)]) == 2
+    assert words in one_line(capsys)
+    assert list(out.parent.iterdir()) == []
+
+
+def test_strict_refuses_what_would_be_repaired(gibson_raw, tmp_path, capsys, cached):
+    (gibson_raw / "paint.png").unlink()
+    assert main(["convert", str(gibson_raw), str(tmp_path / "out"), "--strict"]) == 2
+    assert "paint.png', which is missing" in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+FILES = ("table_0_visual.obj", "structure.png", "hull_0.obj", "scene.xml", "maps.npz", "scene.json")
+
+
+@pytest.mark.parametrize("suffix", FILES)
+def test_disk_full_at_any_file(pristine, tmp_path, capsys, cached, monkeypatch, suffix):
+    """The write of one file fails half-way: what was there before stays, nothing else is left."""
+    write_text, save, open_zip = Path.write_text, Image.Image.save, np.savez_compressed
+
+    def text(self, data, *args, **kwargs):
+        if self.name.endswith(suffix):
+            write_text(self, data[: len(data) // 2], *args, **kwargs)
+            raise FULL
+        return write_text(self, data, *args, **kwargs)
+
+    def picture(self, target, *args, **kwargs):
+        if str(target).endswith(suffix):
+            Path(target).write_bytes(b"\x89PNG")
+            raise FULL
+        return save(self, target, *args, **kwargs)
+
+    def arrays(target, *args, **kwargs):
+        if str(target).endswith(suffix):
+            Path(target).write_bytes(b"PK")
+            raise FULL
+        return open_zip(target, *args, **kwargs)
+
+    monkeypatch.setattr(Path, "write_text", text)
+    monkeypatch.setattr(Image.Image, "save", picture)
+    monkeypatch.setattr(np, "savez_compressed", arrays)
+    out = tmp_path / "scenes" / "out"
+    out.mkdir(parents=True)
+    (out / "old.bin").write_bytes(b"old")
+    assert main(["convert", str(pristine / "gibson"), str(out), "--overwrite"]) == 2
+    error = one_line(capsys)
+    assert "No space left on device" in error and str(out) in error and "nothing was written" in error
+    assert [p.name for p in out.parent.iterdir()] == ["out"] and contents(out) == {"old.bin": b"old"}
+
+
+def test_a_stage_cache_on_a_full_disk_costs_nothing(gibson_raw, tmp_path, monkeypatch, hull_cache):
+    def full(*args, **kwargs):
+        raise FULL
+
+    monkeypatch.setattr("converters.cache.tempfile.mkstemp", full)
+    convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
+    assert load_manifest(tmp_path / "out").warnings == ()
+
+
+@pytest.mark.parametrize("stage", ["cut_furniture", "settle", "write_scene", "save_manifest"])
+@pytest.mark.parametrize(
+    ("sent", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_a_signal_in_any_stage_leaves_nothing(pristine, tmp_path, capsys, cached, monkeypatch, stage, sent, code, word):
+    """The signal arrives while a stage works; the decomposition has a test with a process of its own."""
+    work = getattr(pipeline, stage)
+
+    def interrupted(*args, **kwargs):
+        result = work(*args, **kwargs)
+        os.kill(os.getpid(), sent)
+        return result
+
+    interrupted.__module__, interrupted.__qualname__, interrupted.__name__ = "tests", f"{stage}{tmp_path}", stage
+    monkeypatch.setattr(pipeline, stage, interrupted)
+    before = signal.getsignal(signal.SIGTERM)
+    out = tmp_path / "scenes" / "out"
+    try:
+        assert main(["convert", str(pristine / "gibson"), str(out)]) == code
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == f"{word}; nothing was written\n"
+    assert list(out.parent.iterdir()) == []
+
+
+def test_publishing_is_all_or_nothing(tmp_path, monkeypatch):
+    parts, targets = [tmp_path / "p0", tmp_path / "p1"], [tmp_path / "t0", tmp_path / "t1"]
+    for k, folder in enumerate((*parts, targets[1])):
+        folder.mkdir()
+        (folder / "file").write_text(f"{k}")
+    rename = Path.rename
+
+    def failing(self, target):
+        if self == parts[1]:
+            raise FULL
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="No space left"):
+        publish(dict(zip(parts, targets, strict=True)))
+    assert not targets[0].exists() and (targets[1] / "file").read_text() == "2"
+    monkeypatch.setattr(Path, "rename", rename)
+    shutil.rmtree(parts[0], ignore_errors=True)
+    parts[0].mkdir()
+    publish(dict(zip(parts, targets, strict=True)))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["t0", "t1"] and (targets[1] / "file").read_text() == "1"
+
+
+def test_a_signal_waits_for_the_renames(tmp_path, monkeypatch):
+    (tmp_path / "part").mkdir()
+    rename = Path.rename
+
+    def signalled(self, target):
+        os.kill(os.getpid(), signal.SIGINT)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", signalled)
+    with pytest.raises(KeyboardInterrupt):
+        publish({tmp_path / "part": tmp_path / "whole"})
+    assert [p.name for p in tmp_path.iterdir()] == ["whole"]
+
+
+def test_a_map_of_the_wrong_place_names_both_extents(gibson_raw):
+    from converters.gibson import read_gibson
+
+    free = np.zeros((800, 800), np.uint8)
+    free[:200, :200] = 255  # x and y from -4 to -2 m; the room is at 0 to 3
+    Image.fromarray(free).save(gibson_raw / "floor_trav_0.png")
+    with pytest.raises(SceneRejected, match=r"0% of the map's free area lies inside the mesh"):
+        read_gibson(gibson_raw)
+
+
+def test_warnings_are_printed_and_kept(gibson_raw, tmp_path, capsys, cached):
+    (gibson_raw / "paint.png").unlink()
+    assert main(["convert", str(gibson_raw), str(tmp_path / "out")]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    (kept,) = json.loads((tmp_path / "out" / "scene.json").read_text())["warnings"]
+    assert f"warning: {kept}" in out
