@@ -70,7 +70,7 @@ def test_the_tiny_room_is_proposed_and_its_models_are_found(scan2cad_raw):
     assert without_annotation(proposals, raw.annotations, raw.cads) == []
     assert without_annotation(proposals, (), raw.cads) == [0, 1]
     library = read_library(scan2cad_raw)
-    for k, proposal in enumerate(proposals):
+    for proposal in proposals:
         found = retrieve(proposal, library, 0.3)
         assert found is not None and found.cad.category == proposal.category
         annotation = next(a for a in raw.annotations if a.category == proposal.category)
@@ -78,8 +78,8 @@ def test_the_tiny_room_is_proposed_and_its_models_are_found(scan2cad_raw):
         assert box_iou(bounds(apply_alignment(found.pose, found.cad.vertices)), bounds(true)) > 0.85
         assert found.confidence > 0.5
         # The JSON reads back as an annotation of that model at that pose.
-        _, records = parse_annotations(as_scan2cad("tiny", proposals, {k: found}), scan2cad_raw)
-        back = records[k][1]
+        _, records = parse_annotations(as_scan2cad("tiny", (proposal,), {0: found}), scan2cad_raw)
+        back = records[0][1]
         assert back.cad_id == found.cad.cad_id
         moved = found.cad.vertices @ back.pose[:3, :3].T + back.pose[:3, 3]
         np.testing.assert_allclose(moved, apply_alignment(found.pose, found.cad.vertices), atol=1e-4)
