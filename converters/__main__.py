@@ -1,12 +1,14 @@
-"""`python -m converters convert|object|check|generate|preview`: parses, prints, sets exit codes.
+"""`python -m converters convert|object|propose|check|generate|preview`: parses, prints, sets exit codes.
 
-Exit codes: 0 done, 1 a gate failed, 2 unusable input (one line on stderr), 130 or 143 interrupted.
+Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
+line on stderr), 130 or 143 interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import signal
 import sys
@@ -30,6 +32,7 @@ from scenes_mjcf.schema import CATEGORIES
 
 if TYPE_CHECKING:
     from converters.gates import Gate
+    from converters.propose import Proposed
 
 
 class Interrupted(BaseException):
@@ -112,6 +115,8 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         jobs=arguments.jobs,
         seed=arguments.seed,
         overwrite=arguments.overwrite,
+        auto_align=arguments.auto_align or arguments.library is not None,
+        library=arguments.library,
         strict=arguments.strict,
         timeout_s=arguments.timeout,
     )
@@ -126,6 +131,9 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
     times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
     console.print(f"Seconds: {times}", soft_wrap=True)
     for result in results:
+        for row in result.manifest.alignment:
+            if "note" in row:
+                console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
         failed = [g.name for g in result.gates if not g.passed]
         console.print(
             f"{result.folder}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
@@ -133,7 +141,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
             + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
             soft_wrap=True,
         )
-    return 0
+    return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 
 def _object(arguments: argparse.Namespace, console: Console) -> int:
@@ -200,6 +208,63 @@ def _preview(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _proposal_tables(found: Proposed) -> Iterator[Table]:
+    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
+    for k, proposal in enumerate(found.proposals):
+        model = found.retrieved.get(k)
+        table.add_row(
+            proposal.category,
+            f"{proposal.confidence:.2f}",
+            " ".join(f"{v:.2f}" for v in proposal.centre),
+            " ".join(f"{v:.2f}" for v in proposal.extent_m),
+            model.cad.cad_id[:8] if model else "-",
+            f"{model.confidence:.2f}" if model else "-",
+        )
+    yield table
+    if not found.comparisons:
+        return
+    table = Table(
+        "class",
+        "annotated",
+        "chosen",
+        "rank",
+        "cm",
+        "yaw °",
+        "scale x y z",
+        "IoU",
+        "sure",
+        title="Retrieved models against the annotation",
+        caption="cm, yaw and scale: the annotated model's own best fit against its annotated pose",
+    )
+    for row in found.comparisons:
+        table.add_row(
+            row.category,
+            row.true_cad[:6],
+            row.chosen_cad[:6],
+            f"{row.rank}/{row.n_tried}",
+            f"{100 * row.difference.translation_m:.1f}",
+            f"{math.degrees(row.difference.yaw_rad):.1f}",
+            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
+            f"{row.iou:.2f}",
+            f"{row.confidence:.2f}",
+        )
+    yield table
+
+
+def _propose(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.pipeline import read_source
+    from converters.propose import propose
+
+    library = (arguments.library or arguments.source) if arguments.auto_align or arguments.library else None
+    with _progress(console) as report:
+        raw = read_source(arguments.source, arguments.format)
+        found = propose(raw, arguments.output, library, report)
+    for table in _proposal_tables(found):
+        console.print(table)
+    console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
+    return 0
+
+
 def _positive(text: str) -> int:
     value = int(text)
     if value < 1:
@@ -254,6 +319,21 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_decompose_options(convert)
     convert.set_defaults(run=_convert)
+    convert.add_argument(
+        "--auto-align",
+        action="store_true",
+        help="also fit library models to labelled furniture that has no annotation",
+    )
+    convert.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ for --auto-align (default: SRC)")
+    propose = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
+    propose.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
+    propose.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
+    propose.add_argument("--format", choices=("auto", "gibson", "interactive-gibson", "scan2cad"), default="auto")
+    propose.add_argument(
+        "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
+    )
+    propose.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
+    propose.set_defaults(run=_propose)
     single = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
     single.add_argument(
         "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"

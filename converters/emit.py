@@ -19,7 +19,7 @@ TIMESTEP_S = 0.005
 DOOR_DAMPING = 2.0
 """N m s/rad: a pushed interior door stops after about a second."""
 DOOR_FRICTION = 0.4
-"""N m: keeps a door where it was left, small beside a push at the handle."""
+"""N m: no latch, only this dry friction: keeps a door where it was left, half a newton at the handle."""
 CATEGORY_COLOURS = {
     "chair": (0.90, 0.50, 0.15, 1.0),
     "sofa": (0.30, 0.60, 0.30, 1.0),
@@ -191,6 +191,9 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
             quat=np.round(_quaternion(wall.rotation), 9),
             friction=[0.6, 0.005, 0.0001],
         )
+    # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
+    for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
+        spec.add_text(name=f"class_{body}", data=category)
     visuals = parts.object_visuals or (None,) * len(parts.objects)
     for placed, physical, visual in zip(parts.objects, parts.physical, visuals, strict=True):
         _add_movable(spec, placed, physical, visual, inline)

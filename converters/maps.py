@@ -36,6 +36,8 @@ MAX_CORNER_M2 = 0.5
 MIN_OBSTACLE_CELLS = 3
 MIN_FREE_M2 = 0.25
 PAD_M = 0.4
+HEIGHT_STEP_M = 0.1
+"""Heights of low static furniture are rounded up to this: few boxes."""
 LEAF_MARGIN_M = 0.04
 """Kept free around the space that a door's leaf sweeps."""
 
@@ -88,6 +90,9 @@ class FloorPlan:
     traversable: np.ndarray
     """(rows, columns) bool: floor, nothing static in the band, in a piece worth standing on."""
     wall_height_m: float
+    height_m: np.ndarray | None = None
+    """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing is known.
+    None: the wall's height everywhere."""
 
 
 def find_floor_height(vertices: np.ndarray, labels: np.ndarray) -> float:
@@ -272,7 +277,29 @@ def make_floor_plan(
         )
     heights = points[np.isin(label, STRUCTURE_LABELS) & (label != FLOOR) & (label != CEILING), 2]
     tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
-    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, round(tall, 3))
+    tall = round(tall, 3)
+    height = _heights(grid, points, label, occupied, tall)
+    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, tall, height)
+
+
+def _heights(grid: Grid, points: np.ndarray, label: np.ndarray, occupied: np.ndarray, tall_m: float) -> np.ndarray:
+    """(rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
+
+    A cell is low where no wall, window or the like is labelled in the robot's band and the highest point lies
+    within it; the highest of its neighbours counts, so that a ragged edge does not lower a cabinet.
+    """
+    z = points[:, 2]
+    solid = (z > NOISE_M) & ~np.isin(label, (FLOOR, CEILING))
+    structural = np.isin(label, STRUCTURE_LABELS)
+    wall = grid.count(points[solid & structural & (z < BAND_M[1])]) >= 3
+    row, column, inside = grid.cells(points[solid & ~structural])
+    top = np.zeros(grid.shape)
+    np.maximum.at(top, (row[inside], column[inside]), z[solid & ~structural][inside])
+    low = occupied & ~wall & (top < BAND_M[1])
+    around = ndimage.maximum_filter(np.where(low, top, 0.0), 5)
+    low &= around > 0
+    rounded = np.ceil(around / HEIGHT_STEP_M - 1e-9) * HEIGHT_STEP_M
+    return np.where(low, np.minimum(rounded, tall_m), tall_m).round(3)
 
 
 def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:

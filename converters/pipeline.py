@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
+import functools
+import multiprocessing
 import os
 import shutil
 import signal
@@ -19,17 +22,21 @@ import numpy as np
 from converters import gibson, interactive_gibson, scan2cad
 from converters.alignment import Alignment, compare, upright
 from converters.cache import NOT_HASHED, StageCache
-from converters.cut import cut_furniture
+from converters.cut import cut_furniture, face_areas
 from converters.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
 from converters.emit import SceneParts, write_scene
 from converters.errors import SceneRejected
-from converters.floor import floor_patch, level_floor
+from converters.floor import level_floor
 from converters.gates import Gate, evaluate
+from converters.holes import fill_holes
 from converters.manifest import make_manifest
 from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
 from converters.objects import Hull, PlacedObject, name_objects, place_object, rotation_of, to_world
 from converters.physical import Physical, physical_properties
+from converters.proposals import propose_instances
+from converters.propose import floor_of
 from converters.raw import RawScene
+from converters.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
 from converters.settle import Settled, settle
 from converters.storeys import split_storeys
 from converters.texture import ColourCloud, VisualMesh, bake_object, bake_structure, colour_cloud
@@ -54,6 +61,9 @@ STAGES = {
 }
 """Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
 
+PARALLEL_OBJECTS = 8
+"""From so many objects on, starting processes for their textures pays."""
+
 Report = Callable[[str, float], None]
 """Called with the stage's name and the share of the whole work that is done, 0 to 1."""
 
@@ -76,6 +86,10 @@ class ConvertConfig:
     object_faces: int = 1500
     structure_texture: int = 1024
     object_texture: int = 256
+    auto_align: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
+    """Fits library models to labelled furniture that has no annotation."""
+    library: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
+    """Folder with `cad/` for that; None: the source folder."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,6 +147,36 @@ def detect_format(source: Path) -> str:
     )
 
 
+def read_source(source: Path, layout: str = "auto", strict: bool = False) -> RawScene:
+    """Reads a raw folder in the given layout, or in the one that its files show.
+
+    Raises:
+        SceneRejected: no known layout, or bad input.
+    """
+    return READERS[layout if layout != "auto" else detect_format(source)][1](source, strict)
+
+
+def with_retrieved(
+    raw: RawScene, library_root: Path, progress: Callable[[float], None]
+) -> tuple[RawScene, dict[int, float]]:
+    """Adds what `--auto-align` finds to the annotations.
+
+    Returns:
+        The scene, and index of an added annotation -> its confidence.
+    """
+    proposals = propose_instances(raw.scan)
+    proposals = tuple(proposals[k] for k in without_annotation(proposals, raw.annotations, raw.cads))
+    found = auto_align(proposals, read_library(library_root), floor_of(raw), progress) if proposals else {}
+    sure = [found[k] for k in sorted(found) if found[k].confidence >= MIN_CONFIDENCE]
+    first = len(raw.annotations)
+    added = dataclasses.replace(
+        raw,
+        annotations=raw.annotations + tuple(as_annotation(r) for r in sure),
+        cads=raw.cads | {r.cad.cad_id: r.cad for r in sure},
+    )
+    return added, {first + k: r.confidence for k, r in enumerate(sure)}
+
+
 def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
     """Upright placements from the annotations, and the report that compares them with re-solved ones."""
     placements, rows = [], []
@@ -146,43 +190,59 @@ def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]
 
 
 def _structure_visual(
-    raw: RawScene, vertices_w: np.ndarray, keep: np.ndarray, plan: FloorPlan, config: ConvertConfig
-) -> VisualMesh:
-    """The cleaned scan with a level floor, patched where furniture hid it, simplified and textured."""
+    raw: RawScene,
+    vertices_w: np.ndarray,
+    keep: np.ndarray,
+    plan: FloorPlan,
+    annotated: tuple[PlacedObject, ...],
+    config: ConvertConfig,
+) -> tuple[VisualMesh, float]:
+    """The cleaned scan, levelled, filled, simplified and textured; and the area of the patches, m2."""
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
-    seen_floor = np.flatnonzero((np.abs(cloud.points[:, 2]) < 0.02) & (np.abs(cloud.normals[:, 2]) > 0.7))
-    patch_vertices, patch_faces, patch_cloud = floor_patch(plan, cloud, seen_floor)
+    filled, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
     both = ColourCloud(
         *(np.vstack([getattr(cloud, f), getattr(patch_cloud, f)]) for f in ("points", "normals", "colours"))
     )
-    return bake_structure(
-        level,
-        raw.scan.faces[kept],
-        patch_vertices,
-        patch_faces,
-        both,
-        config.structure_faces,
-        config.structure_texture,
-    )
+    area = float(face_areas(filled.vertices, filled.faces[filled.patch_plane >= 0]).sum())
+    visual = bake_structure(filled.vertices, filled.faces, both, config.structure_faces, config.structure_texture)
+    return visual, area
 
 
-def _object_visual(
-    raw: RawScene, vertices_w: np.ndarray, removed: np.ndarray, annotated: PlacedObject, config: ConvertConfig
-) -> tuple[VisualMesh, float]:
+def _object_visual(cloud: ColourCloud, annotated: PlacedObject, max_faces: int, size: int) -> tuple[VisualMesh, float]:
     """The CAD model retextured at its annotated pose (where the scan showed it), in the body frame."""
-    cloud = colour_cloud(raw.scan, vertices_w, raw.scan.faces, removed)
     visual, seen = bake_object(
         to_world(annotated, annotated.vertices_b),
         annotated.faces,
         annotated.face_colours,
         cloud,
-        config.object_faces,
-        config.object_texture,
+        max_faces,
+        size,
     )
     back = (visual.vertices - annotated.position_w) @ rotation_of(annotated.quaternion_w)
     return dataclasses.replace(visual, vertices=back), seen
+
+
+def _object_visuals(
+    raw: RawScene,
+    vertices_w: np.ndarray,
+    owner: np.ndarray,
+    annotated: tuple[PlacedObject, ...],
+    config: ConvertConfig,
+) -> list[tuple[VisualMesh, float]]:
+    """Every object's visual and the share of it that the scan showed, side by side in processes."""
+    clouds = [
+        colour_cloud(raw.scan, vertices_w, raw.scan.faces, np.flatnonzero(owner == k)) for k in range(len(annotated))
+    ]
+    count = len(annotated)
+    bake = functools.partial(_object_visual, max_faces=config.object_faces, size=config.object_texture)
+    if config.jobs < 2 or count < PARALLEL_OBJECTS:
+        return [bake(c, o) for c, o in zip(clouds, annotated, strict=True)]
+    # Not forked: the caller may hold threads.
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(min(config.jobs, count), mp_context=context) as pool:
+        return list(pool.map(bake, clouds, annotated))
 
 
 def _with_source(physical: Physical, mass_kg: float | None, friction: float | None) -> Physical:
@@ -208,8 +268,13 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         cache: folder of hulls and stage results by content.
     """
     stages = StageCache(cache)
-    with clock.stage("align"):
+    with clock.stage("align") as progress:
+        retrieved: dict[int, float] = {}
+        if config.auto_align and config.library is not None:
+            raw, retrieved = with_retrieved(raw, config.library, progress)
         placements, rows = align_objects(raw)
+        for k, confidence in retrieved.items():
+            rows[k]["retrieved_confidence"] = confidence
         floor_height = raw.floor_height_m
         if floor_height is None:
             floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)
@@ -253,14 +318,10 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         unsettled = SceneParts(raw.name, annotated, physical, walls)
         settled = settle(unsettled) if annotated else Settled(unsettled, (), ())
     with clock.stage("texture") as progress:
-        structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, config)
-        visuals, seen = [], []
-        for k, placed in enumerate(annotated):
-            progress(0.5 + 0.5 * k / len(annotated))
-            removed = np.flatnonzero(cut.owner == k)
-            visual, share = stages.call(_object_visual, raw, vertices_w, removed, placed, config)
-            visuals.append(visual)
-            seen.append(share)
+        structure, _ = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
+        progress(0.5)
+        baked = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
+        visuals, seen = [v for v, _ in baked], [share for _, share in baked]
     for row, moved, drop, share, placed in zip(
         rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
     ):
@@ -402,9 +463,10 @@ def _convert(
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(_part_folder(target, config.overwrite))
         with clock.stage("read"):
-            name = config.format if config.format != "auto" else detect_format(source)
-            raw = dataclasses.replace(READERS[name][1](source, config.strict), name=target.name)
+            raw = dataclasses.replace(read_source(source, config.format, config.strict), name=target.name)
             scenes = split_storeys(raw)
+        if config.auto_align and config.library is None:
+            config = dataclasses.replace(config, library=source)
         if floors is not None and len(scenes) != floors:
             raise SceneRejected(f"{source}: has {len(scenes)} floors, expected {floors}; use convert_building")
         clock.floors = len(scenes)

@@ -197,8 +197,6 @@ def quantise(image: np.ndarray, colours: int) -> Image.Image:
 def bake_structure(
     vertices: np.ndarray,
     faces: np.ndarray,
-    patch_vertices: np.ndarray,
-    patch_faces: np.ndarray,
     cloud: ColourCloud,
     max_faces: int,
     size: int,
@@ -206,17 +204,13 @@ def bake_structure(
     """Simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
 
     Args:
-        vertices: (n, 3) of the scan, m.
-        faces: (m, 3) of the scan that stay.
-        patch_vertices: (k, 3) of the floor patches; not simplified, loose rectangles would collapse.
-        patch_faces: (l, 3) into `patch_vertices`.
+        vertices: (n, 3) of the scan with its patches, m.
+        faces: (m, 3) that stay.
         cloud: coloured points of scan and patches.
         max_faces: of the simplified scan.
         size: of the texture, pixels.
     """
     vertices, faces = simplify(vertices, faces, max_faces)
-    faces = np.vstack([faces, patch_faces + len(vertices)])
-    vertices = np.vstack([vertices, patch_vertices])
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, _ = texel_surface(vertices, faces, uv, uv_faces, size)
     distance, index = KDTree(cloud.points).query(point, k=min(3, len(cloud.points)))

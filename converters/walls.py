@@ -86,15 +86,21 @@ def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[i
 
 
 def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
-    """Boxes from the floor up to the wall height around everything traversable."""
+    """Boxes from the floor up around everything traversable, each as high as what stands there.
+
+    A box may reach over what is higher than itself (that has boxes of its own), never over what is lower.
+    """
     needed = border_cells(plan.traversable)
     allowed = ~plan.traversable & ndimage.binary_dilation(needed, np.ones((3, 3)), iterations=DEPTH_CELLS)
+    height = np.full(needed.shape, plan.wall_height_m) if plan.height_m is None else plan.height_m
     turn = yaw_matrix(plan.grid.yaw)
     side = plan.grid.resolution_m
     boxes = []
-    for r0, r1, c0, c1 in cover_rectangles(needed, allowed | needed):
-        middle = np.array([(c0 + c1) / 2 * side + plan.grid.origin[0], (r0 + r1) / 2 * side + plan.grid.origin[1], 0.0])
-        centre = turn @ middle
-        centre[2] = plan.wall_height_m / 2
-        boxes.append(Box(centre, turn, np.array([(c1 - c0) * side, (r1 - r0) * side, plan.wall_height_m]) / 2))
+    for level in np.unique(height[needed])[::-1]:
+        reach = (allowed | needed) & (height >= level)
+        for r0, r1, c0, c1 in cover_rectangles(needed & (height == level), reach):
+            middle = np.array([(c0 + c1) / 2, (r0 + r1) / 2, 0.0]) * side + [*plan.grid.origin, 0.0]
+            centre = turn @ middle
+            centre[2] = level / 2
+            boxes.append(Box(centre, turn, np.array([(c1 - c0) * side, (r1 - r0) * side, level]) / 2))
     return tuple(boxes)

@@ -9,10 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.alignment import AlignmentError, compare, solve_alignment, upright, wrap_angle, yaw_matrix
+from converters.alignment import (
+    Alignment,
+    AlignmentError,
+    compare,
+    gross_outliers,
+    pose_difference,
+    solve_alignment,
+    upright,
+    wrap_angle,
+    yaw_matrix,
+)
 from converters.raw import Annotation
 
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.3, 0.3) for z in (0.0, 0.8)])
+FLAT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.3, 0.6, 0], [0.7, 0.1, 0.0]])
 
 
 def pose(scale, yaw: float, translation, tilt: float = 0.0) -> np.ndarray:
@@ -85,9 +96,13 @@ def test_a_thin_axis_that_noise_mirrors_still_gets_positive_scales():
 @pytest.mark.parametrize(
     ("points", "reason"),
     [
-        (CORNERS[:3], "3 keypoint pairs, expected at least 4"),
-        (CORNERS[CORNERS[:, 2] == 0], "no extent along the model's z axis"),
-        (CORNERS[CORNERS[:, 0] > 0], "no extent along the model's x axis"),
+        (CORNERS[:5], "5 keypoint pairs, expected at least 6"),
+        (FLAT, "no extent along the model's z axis: they are coplanar and the z scale is unobservable"),
+        (FLAT[:, [2, 0, 1]], "no extent along the model's x axis"),
+        (FLAT[:, [0, 2, 1]] + FLAT[:, [2, 0, 2]], "lie in one upright plane"),
+        (np.outer(np.arange(7), [1.0, 2.0, 3.0]), "collinear"),
+        (np.zeros((6, 3)), "coincide"),
+        (np.full((6, 3), np.nan), "not a finite number"),
     ],
 )
 def test_undetermined_keypoints_are_refused(points, reason):
@@ -122,3 +137,100 @@ def test_too_few_keypoints_are_reported_not_fatal():
     row = compare(annotation, *upright(annotation.pose, np.zeros(3)), np.zeros(3), "chair_0")
     assert row["solved"] is False and "2 keypoint pairs" in row["reason"]
     assert row["annotated_rms_m"] == pytest.approx(0.1)
+
+
+def made_pairs(seed: int, count: int, noise: float):
+    """Random pairs under a known pose: CAD points, scan points, scale, yaw, translation."""
+    rng = np.random.default_rng(seed)
+    cad = rng.uniform(-0.5, 0.5, (count, 3))
+    scale, yaw, shift = rng.uniform(0.5, 1.5, 3), rng.uniform(-math.pi, math.pi), rng.uniform(-3, 3, 3)
+    scan = cad * scale @ yaw_matrix(yaw).T + shift + rng.normal(0, noise, cad.shape)
+    return cad, scan, scale, yaw, shift
+
+
+@pytest.mark.parametrize("count", [6, 8, 12, 16])
+def test_one_gross_outlier_in_eight_is_left_out(count):
+    for seed in range(10):
+        cad, scan, *_ = made_pairs(seed, count, 0.01)
+        rng = np.random.default_rng(100 + seed)
+        wrong = rng.choice(count, max(count // 8, 1), replace=False)
+        expected = solve_alignment(np.delete(cad, wrong, 0), np.delete(scan, wrong, 0)) if count > 6 else None
+        scan[wrong] += rng.choice([-1.0, 1.0], (len(wrong), 3)) * 0.4
+        np.testing.assert_array_equal(np.flatnonzero(gross_outliers(cad, scan)), np.sort(wrong))
+        found = solve_alignment(cad, scan)
+        if expected is not None:
+            np.testing.assert_allclose(found.scale, expected.scale, atol=1e-9)
+            assert found.rms_m == pytest.approx(expected.rms_m)
+        assert found.rms_m < 0.03
+
+
+def test_one_swapped_pair_does_not_move_an_exact_fit():
+    # A click on the opposite corner: exact answer known, seven of eight pairs exact.
+    scan = CORNERS * [1.2, 0.9, 1.1] @ yaw_matrix(0.7).T + [1.0, 2.0, 0.5]
+    scan[0] = scan[7]
+    found = solve_alignment(CORNERS, scan)
+    np.testing.assert_allclose(found.scale, [1.2, 0.9, 1.1], atol=1e-9)
+    np.testing.assert_allclose(found.translation, [1.0, 2.0, 0.5], atol=1e-9)
+    assert found.yaw == pytest.approx(0.7) and found.rms_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_sound_noisy_pairs_are_all_kept():
+    # OUTLIER_P is a chance of 1 in 1,000 a set: none in 60 sets.
+    for seed in range(60):
+        cad, scan, *_ = made_pairs(seed, 6 + seed % 6, 0.03)
+        assert not gross_outliers(cad, scan).any()
+
+
+def test_eight_outliers_among_sixty_four():
+    cad, scan, scale, yaw, _ = made_pairs(3, 64, 0.01)
+    scan[5:13] += np.random.default_rng(9).normal(0, 1.0, (8, 3))
+    np.testing.assert_array_equal(np.flatnonzero(gross_outliers(cad, scan)), np.arange(5, 13))
+    found = solve_alignment(cad, scan)
+    np.testing.assert_allclose(found.scale, scale, rtol=0.03)
+    assert abs(wrap_angle(found.yaw - yaw)) < 0.03
+
+
+@pytest.mark.parametrize(("symmetry", "folds"), [("__SYM_ROTATE_UP_2", 2), ("__SYM_ROTATE_UP_4", 4)])
+def test_pairs_clicked_on_equivalent_points_of_a_symmetric_model(symmetry, folds):
+    cad = np.vstack([CORNERS, [[0.5, 0.0, 0.4], [0.0, 0.3, 0.4]]])
+    scale = np.array([1.2, 1.2 if folds == 4 else 0.8, 1.1])
+    scan = cad * scale @ yaw_matrix(0.3).T + [1.0, 2.0, 0.0]
+    clicked = cad.copy()
+    clicked[[1, 6]] = clicked[[1, 6]] @ yaw_matrix(2 * math.pi / folds).T  # two pairs name an equivalent point
+    found = solve_alignment(clicked, scan, symmetry)
+    np.testing.assert_allclose(found.scale, scale, atol=1e-9)
+    assert found.yaw == pytest.approx(0.3) and found.rms_m == pytest.approx(0.0, abs=1e-9)
+    # Clicked consistently one symmetric turn off: the same pose comes back, with the smallest yaw.
+    turned = solve_alignment(cad @ yaw_matrix(2 * math.pi / folds).T, scan, symmetry)
+    assert turned.yaw == pytest.approx(0.3) and turned.rms_m == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(turned.scale, scale, atol=1e-9)
+
+
+def test_a_round_model_stays_round():
+    cad, scan, *_ = made_pairs(4, 8, 0.03)
+    found = solve_alignment(cad, scan, "__SYM_ROTATE_UP_INF")
+    assert found.scale[0] == found.scale[1]
+    exact = cad * [1.3, 1.3, 0.7] @ yaw_matrix(2.0).T + [1, 0, 0]
+    found = solve_alignment(cad, exact, "__SYM_ROTATE_UP_INF")
+    np.testing.assert_allclose(found.scale, [1.3, 1.3, 0.7])
+    np.testing.assert_allclose(found.translation, [1, 0, 0], atol=1e-9)
+
+
+def test_a_quarter_turn_of_a_four_fold_model_swaps_the_scales_compared():
+    one = Alignment(np.array([1.0, 2.0, 3.0]), np.zeros(3), math.pi / 2 + 0.1, 0.0)
+    other = Alignment(np.array([2.0, 1.0, 3.0]), np.zeros(3), 0.0, 0.0)
+    difference = pose_difference(one, other, np.zeros(3), "__SYM_ROTATE_UP_4")
+    assert difference.yaw_rad == pytest.approx(0.1)
+    np.testing.assert_allclose(difference.scale_ratio, 1.0)
+
+
+def test_unknown_symmetry_is_refused():
+    with pytest.raises(AlignmentError, match="symmetry is 'round', expected one of __SYM_NONE"):
+        solve_alignment(CORNERS, CORNERS, "round")
+
+
+@pytest.mark.parametrize(("tilt", "noted"), [(0.1, False), (math.pi / 2 - 0.01, True)])
+def test_an_object_annotated_lying_is_reported_as_stood_upright(tilt, noted):
+    annotation = Annotation("chair", "c", pose((1, 1, 1), 0.0, (0, 0, 0), tilt), "__SYM_NONE", CORNERS, CORNERS)
+    row = compare(annotation, *upright(annotation.pose, np.zeros(3)), np.zeros(3), "chair_0")
+    assert ("placed upright" in row.get("note", "")) is noted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 import signal
@@ -18,6 +19,7 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.errors import SceneRejected
+from converters.gates import LIMITS, Limit
 from converters.objects import rotation_of
 from converters.pipeline import STAGES, ConvertConfig, convert
 from converters.settle import settle
@@ -54,6 +56,15 @@ def test_names_classes_and_joints_are_as_promised(tiny_scene):
     wall = model.geom("wall_0")
     assert (wall.contype[0], wall.group[0]) == (1, 3)
     assert "/" not in manifest.name and str(Path.home()) not in (folder / "scene.xml").read_text()
+
+
+def test_the_model_names_each_bodys_semantic_class(tiny_scene):
+    spec = mujoco.MjSpec.from_file(str(tiny_scene[0] / "scene.xml"))
+    assert {t.name: t.data for t in spec.texts} == {
+        "class_structure": "structure",
+        "class_table_0": "table",
+        "class_basket_0": "basket",
+    }
 
 
 def test_objects_stand_where_they_were_annotated(tiny_scene):
@@ -145,6 +156,28 @@ def test_a_failure_half_way_leaves_nothing_and_keeps_the_old_scene(gibson_raw, t
     with pytest.raises(SceneRejected, match="no traversable floor"):
         convert(gibson_raw, out, dataclasses.replace(SMALL, overwrite=True), cache=hull_cache)
     assert [p.name for p in out.parent.iterdir()] == ["out"] and contents(out) == {"old.txt": b"old"}
+
+
+def test_auto_align_adds_the_object_that_nobody_annotated(gibson_raw, tmp_path, hull_cache):
+    data = tiny_raw.annotation()
+    data[0]["aligned_models"] = data[0]["aligned_models"][:1]
+    (gibson_raw / "alignments.json").write_text(json.dumps(data))
+    config = dataclasses.replace(SMALL, auto_align=True)
+    done = convert(gibson_raw, tmp_path / "out", config, cache=hull_cache)
+    assert [o.name for o in done.manifest.objects] == ["table_0", "basket_0"]
+    rows = {r["name"]: r for r in done.manifest.alignment}
+    assert "retrieved_confidence" not in rows["table_0"] and rows["basket_0"]["retrieved_confidence"] > 0.5
+    basket = next(o for o in done.settled.parts.objects if o.name == "basket_0")
+    np.testing.assert_allclose(basket.position_w[:2], tiny_raw.ITEMS[1].position[:2], atol=0.03)
+    assert all(g.passed for g in done.gates)
+
+
+def test_convert_exits_one_when_a_gate_fails_and_keeps_the_scene(pristine, tmp_path, hull_cache, monkeypatch, capsys):
+    monkeypatch.setitem(LIMITS, "walls", Limit("count", most=0))
+    monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
+    assert main(["convert", str(pristine / "gibson"), str(tmp_path / "out")]) == 1
+    assert "gates that fail: walls" in capsys.readouterr().out
+    assert load_manifest(tmp_path / "out").gates["walls"]["passed"] is False
 
 
 def test_settling_parts_two_objects_that_overlap(tiny_scene):

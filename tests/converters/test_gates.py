@@ -117,6 +117,49 @@ def test_an_object_in_a_wall_penetrates(tiny_scene):
     assert {"penetration_hulls", "penetration_boxes"} <= change(tiny_scene[0], push)
 
 
+def test_an_object_that_tips_over_turns(tiny_scene):
+    def tilt(spec):
+        spec.body("basket_0").quat = np.array([np.cos(0.1), np.sin(0.1), 0, 0])  # 11 degrees: falls back upright
+        spec.body("basket_0").pos = np.array(spec.body("basket_0").pos) + [0, 0, 0.06]
+
+    assert {"turn_hulls", "turn_boxes"} <= change(tiny_scene[0], tilt)
+
+
+def test_three_millimetres_in_a_wall_are_too_much_and_one_is_not(tiny_scene):
+    def push(depth):
+        def edit(spec):
+            body = spec.body("basket_0")
+            reach = max(g.pos[0] + g.size[0] for g in body.geoms if "_box_" in g.name)
+            inner = min(g.pos[0] - g.size[0] for g in spec.geoms if g.name.startswith("wall_") and g.pos[0] > 2.5)
+            body.pos = np.array([inner - reach + depth, 0.6, 0.0])
+            body.quat = np.array([1.0, 0, 0, 0])
+
+        return edit
+
+    assert "penetration_boxes" in change(tiny_scene[0], push(0.003))
+    assert "penetration_boxes" not in change(tiny_scene[0], push(0.001))
+
+
+def test_a_model_that_diverges_is_not_finite(tiny_scene):
+    def fling(spec):
+        spec.option.gravity = np.array([0.0, 0.0, 1e12])
+
+    assert "finite" in change(tiny_scene[0], fling)
+
+
+@pytest.mark.parametrize(("name", "value"), [("hulls_per_object", 17), ("hulls", 401), ("walls", 201), ("objects", -1)])
+def test_the_counting_gates_fail_above_their_limits(name, value):
+    assert not judge(name, value).passed
+
+
+def test_split_free_space_fails_its_gate(tiny_scene):
+    folder, _ = tiny_scene
+    halves = load_maps(folder).traversable.copy()
+    halves[:, halves.shape[1] // 2 - 2 : halves.shape[1] // 2 + 2] = False
+    maps = dataclasses.replace(load_maps(folder), traversable=halves)
+    assert failed(evaluate(spec_of(folder), maps, ("table_0", "basket_0"))) == {"connected_share"}
+
+
 def test_a_missing_object_is_counted(tiny_scene):
     def drop(spec):
         spec.delete(spec.body("basket_0"))
@@ -146,5 +189,5 @@ def test_physical_values_of_a_ball_in_free_fall():
     body.add_freejoint()
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0, 0])
     values = physical_values(spec.compile())
-    assert values["drift"] == pytest.approx(0.5 * 9.81 * 2.0**2, rel=0.01)  # g t^2 / 2
+    assert values["drift"] == pytest.approx(0.5 * 9.81 * 5.0**2, rel=0.01)  # g t^2 / 2
     assert values["turn"] == pytest.approx(0.0, abs=1e-6) and values["penetration"] == 0.0 and values["finite"] == 1.0

@@ -114,6 +114,22 @@ def test_unannotated_furniture_is_static():
     assert 0.25**2 <= gone.sum() * 0.05**2 <= 0.4**2
 
 
+def test_low_furniture_keeps_its_height_and_walls_theirs():
+    plan = room_plan(keep=lambda label: np.isin(label, (1, 2, 39)))
+    basket = max(tiny_raw.ITEMS, key=lambda i: i.position[0])  # at (2.4, 0.6), 0.4 m high
+    boxes = wall_boxes(plan)
+    low = [b for b in boxes if 2 * b.half[2] < 1.0]
+    tall = [b for b in boxes if 2 * b.half[2] >= 1.0]
+    assert low and len(tall) >= 4
+    for box in low:
+        assert 2 * box.half[2] == pytest.approx(0.4, abs=0.101)
+        np.testing.assert_allclose(box.centre[:2], basket.position[:2], atol=0.3)
+        assert box.centre[2] == pytest.approx(box.half[2])  # stands on the floor
+    for box in tall:
+        assert 2 * box.half[2] == pytest.approx(plan.wall_height_m)
+        assert np.linalg.norm(box.centre[:2] - basket.position[:2]) > 0.3
+
+
 def test_the_sources_map_adds_floor_that_the_scan_missed():
     vertices, faces, labels = tiny_raw.scan()
     middle = vertices[faces].mean(axis=1)

@@ -1,0 +1,268 @@
+"""Labelled scan in, furniture instances with class, box and confidence out (section III-B's region proposals).
+
+The labels are put into a voxel grid; connected voxels of one class are an instance. What a scan tears apart
+(the seat of a swivel chair above its base: the thin column is missing) or names twice (table and desk) is
+merged by footprint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from converters.alignment import yaw_matrix
+from converters.cad import Y_UP_TO_Z_UP
+from converters.cut import face_labels
+from converters.maps import sample_faces
+from converters.objects import upright_box
+from converters.raw import SYNSETS, UNLABELLED, WALL, ScanMesh
+
+VOXEL_M = 0.03
+"""Chairs that touch at 0.05 m stay apart at 0.03 m in the sample scan."""
+MIN_VOXELS = 60
+"""A component of 0.05 m2 of surface; what is smaller and lies on no other is noise."""
+STACKED_SHARE = 0.5
+"""Components of one class are one thing when their footprints share this much of the smaller."""
+SAME_BOX_SHARE = 0.5
+"""Instances of two classes are one thing when their boxes share this much of the smaller."""
+NEAR_M = 0.05
+
+LABEL_CATEGORIES = {5: "chair", 6: "sofa", 7: "table", 8: "door", 14: "desk", 39: "basket"}
+"""NYU40 id -> category. 39 is 'otherfurniture', where ScanNet's waste baskets are."""
+
+SIZES_M = {
+    "chair": ((0.35, 1.0), (0.5, 1.4)),
+    "sofa": ((0.7, 3.2), (0.5, 1.2)),
+    "table": ((0.4, 3.0), (0.3, 1.1)),
+    "desk": ((0.6, 2.6), (0.6, 1.4)),
+    "door": ((0.6, 1.3), (1.7, 2.4)),
+    "basket": ((0.15, 0.6), (0.15, 0.8)),
+}
+"""Category -> usual ranges of the longer horizontal side and of the height."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposal:
+    """One instance that an annotator, or retrieval, should find a CAD model for."""
+
+    category: str
+    label: int
+    """NYU40 id that most of its voxels carry."""
+    points: np.ndarray
+    """(n, 3) samples of its surface, scan frame, m."""
+    centre: np.ndarray
+    """(3,) of the upright box, scan frame, m."""
+    extent_m: np.ndarray
+    """(3,) full sizes along the box's own axes."""
+    yaw: float
+    """rad, of the box's x axis; modulo 90 degrees."""
+    n_voxels: int
+    confidence: float
+    """In [0, 1], see `_confidence`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Piece:
+    label: int
+    points: np.ndarray
+    voxels: np.ndarray
+    """(n, 3) int."""
+
+
+def _components(points: np.ndarray, label: int, origin: np.ndarray, voxel_m: float) -> list[_Piece]:
+    """26-connected pieces of one class."""
+    index = np.floor((points - origin) / voxel_m).astype(np.int64)
+    low = index.min(axis=0)
+    grid = np.zeros(index.max(axis=0) - low + 1, bool)
+    grid[tuple((index - low).T)] = True
+    pieces, count = ndimage.label(grid, np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+    piece = pieces[tuple((index - low).T)]
+    result = []
+    for k in range(1, count + 1):
+        members = np.flatnonzero(piece == k)
+        result.append(_Piece(label, points[members], np.unique(index[members], axis=0)))
+    return result
+
+
+def _footprint(voxels: np.ndarray) -> set[tuple[int, int]]:
+    """Columns of voxels, one voxel wider on each side."""
+    cells = np.unique(voxels[:, :2], axis=0)
+    around = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    return set(map(tuple, (cells[:, None] + around).reshape(-1, 2).tolist()))
+
+
+def _join(pieces: list[_Piece]) -> _Piece:
+    labels = np.concatenate([np.full(len(p.voxels), p.label) for p in pieces])
+    voxels = np.unique(np.concatenate([p.voxels for p in pieces]), axis=0)
+    return _Piece(int(np.bincount(labels).argmax()), np.concatenate([p.points for p in pieces]), voxels)
+
+
+def _merge(pieces: list[_Piece], same: Any) -> list[_Piece]:
+    """Joins pieces for which `same` holds, the largest first, until none is left to join."""
+    pieces = sorted(pieces, key=lambda p: (-len(p.voxels), p.voxels[0].tolist()))
+    merged = True
+    while merged:
+        merged = False
+        for i in range(len(pieces)):
+            for j in range(i + 1, len(pieces)):
+                if same(pieces[i], pieces[j]):
+                    pieces[i] = _join([pieces[i], pieces[j]])
+                    del pieces[j]
+                    merged = True
+                    break
+            if merged:
+                break
+    return pieces
+
+
+def _stacked(one: _Piece, other: _Piece) -> bool:
+    a, b = _footprint(one.voxels), _footprint(other.voxels)
+    return len(a & b) > STACKED_SHARE * min(len(a), len(b))
+
+
+def _same_box(one: _Piece, other: _Piece) -> bool:
+    low = np.maximum(one.voxels.min(axis=0), other.voxels.min(axis=0))
+    high = np.minimum(one.voxels.max(axis=0), other.voxels.max(axis=0)) + 1
+    shared = np.prod(np.maximum(high - low, 0))
+    size = min(np.prod(np.ptp(p.voxels, axis=0) + 1) for p in (one, other))
+    return bool(shared > SAME_BOX_SHARE * size)
+
+
+def _inside_range(value: float, limits: tuple[float, float]) -> float:
+    """1 inside the range, falling with the ratio outside: half the lower limit gives 0.5."""
+    return min(1.0, value / limits[0], limits[1] / max(value, 1e-9))
+
+
+def _confidence(category: str, extent: np.ndarray, purity: float, n_voxels: int, voxel_m: float) -> float:
+    """Product of three shares: size usual for the class, labels in the box that agree, and surface seen.
+
+    `purity` is the class's share of the box's furniture voxels. Surface counts as enough when the voxels cover
+    half of one side and the top of the box.
+    """
+    wide, high = SIZES_M[category]
+    size = _inside_range(float(max(extent[:2])), wide) * _inside_range(float(extent[2]), high)
+    surface = extent[0] * extent[1] + max(extent[0], extent[1]) * extent[2]
+    seen = min(1.0, n_voxels * voxel_m**2 / max(0.5 * surface, 1e-9))
+    return float(size * purity * seen)
+
+
+def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposal, ...]:
+    """Instances of every furniture class, the most certain first.
+
+    Args:
+        scan: with NYU40 labels.
+        voxel_m: side of a voxel; gaps narrower than one do not part two things.
+    """
+    points, face = sample_faces(scan.vertices, scan.faces, voxel_m / 2)
+    label = face_labels(scan.labels, scan.faces)[face]
+    origin = scan.vertices.min(axis=0)
+    pieces: list[_Piece] = []
+    for wanted in LABEL_CATEGORIES:
+        if (label == wanted).any():
+            found = _merge(_components(points[label == wanted], wanted, origin, voxel_m), _stacked)
+            pieces += [p for p in found if len(p.voxels) >= MIN_VOXELS]
+    pieces = _merge(pieces, _same_box)
+    other = ~np.isin(label, (UNLABELLED, WALL, 2, 22))
+    other_voxels = np.unique(np.floor((points[other] - origin) / voxel_m).astype(np.int64), axis=0)
+    proposals = []
+    for piece in pieces:
+        category = LABEL_CATEGORIES[piece.label]
+        box = upright_box(piece.points)
+        inside = (other_voxels >= piece.voxels.min(axis=0)) & (other_voxels <= piece.voxels.max(axis=0))
+        purity = min(1.0, len(piece.voxels) / max(int(inside.all(axis=1).sum()), 1))
+        extent = 2 * box.half
+        yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
+        confidence = _confidence(category, extent, purity, len(piece.voxels), voxel_m)
+        proposals.append(
+            Proposal(
+                category, piece.label, piece.points, box.centre, extent, yaw, len(piece.voxels), round(confidence, 4)
+            )
+        )
+    return tuple(sorted(proposals, key=lambda p: (-p.confidence, p.centre.tolist())))
+
+
+def box_iou(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
+    """Intersection over union of two axis-aligned boxes, each (low (3,), high (3,))."""
+    shared = np.prod(np.maximum(np.minimum(one[1], other[1]) - np.maximum(one[0], other[0]), 0.0))
+    total = np.prod(one[1] - one[0]) + np.prod(other[1] - other[0]) - shared
+    return float(shared / total) if total > 0 else 0.0
+
+
+def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(low (3,), high (3,)) of (n, 3) points."""
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _trs(scale: np.ndarray, yaw: float, translation: np.ndarray) -> dict[str, list[float]]:
+    """Scan2CAD's scale, quaternion (w x y z) and translation in a y-up world; arguments are z up."""
+    return {
+        "scale": np.round([scale[0], scale[2], scale[1]], 6).tolist(),
+        "rotation": np.round([math.cos(yaw / 2), 0.0, math.sin(yaw / 2), 0.0], 9).tolist(),
+        "translation": np.round(Y_UP_TO_Z_UP.T @ translation, 6).tolist(),
+    }
+
+
+def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int, Any] | None = None) -> list[dict]:
+    """The proposals in the shape of Scan2CAD's annotation list, for an annotation tool to take further.
+
+    A proposal without a model is a unit cube with `id_cad` "" and the box as its pose; keypoints are empty. Each
+    has one key more, `proposal`, with what was measured.
+
+    Args:
+        scan_id: name of the scan.
+        proposals: of it.
+        chosen: proposal's index -> `Retrieval` (model and pose), where one was found.
+    """
+    synset = {category: key for key, category in SYNSETS.items()}
+    models = []
+    empty = {"n_keypoints": 0, "position": []}
+    for k, proposal in enumerate(proposals):
+        found = (chosen or {}).get(k)
+        entry: dict[str, Any] = {
+            "catid_cad": synset[proposal.category],
+            "id_cad": "",
+            "sym": "__SYM_NONE",
+            "trs": _trs(proposal.extent_m, proposal.yaw, proposal.centre),
+            "bbox": [0.5, 0.5, 0.5],
+            "center": [0.0, 0.0, 0.0],
+            "keypoints_cad": empty,
+            "keypoints_scan": empty,
+            "proposal": {
+                "category": proposal.category,
+                "confidence": proposal.confidence,
+                "label": proposal.label,
+                "n_voxels": proposal.n_voxels,
+                "extent_m": np.round(proposal.extent_m, 4).tolist(),
+            },
+        }
+        if found is not None:
+            low, high = bounds(found.cad.vertices @ Y_UP_TO_Z_UP)
+            entry |= {
+                "catid_cad": synset[found.cad.category],
+                "id_cad": found.cad.cad_id,
+                "trs": _trs(found.pose.scale, found.pose.yaw, found.pose.translation),
+                "bbox": np.round((high - low) / 2, 6).tolist(),
+                "center": np.round((high + low) / 2, 6).tolist(),
+            }
+            entry["proposal"] |= {"retrieval_confidence": found.confidence, "residual_m": found.residual_m}
+        models.append(entry)
+    half = math.sqrt(0.5)
+    return [
+        {
+            "id_scan": scan_id,
+            "trs": {"scale": [1.0, 1.0, 1.0], "rotation": [half, -half, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]},
+            "n_aligned_models": len(models),
+            "aligned_models": models,
+        }
+    ]
+
+
+def box_corners(proposal: Proposal) -> np.ndarray:
+    """(4, 2) corners of the box seen from above, counter-clockwise, m."""
+    half = proposal.extent_m[:2] / 2
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
+    return square @ yaw_matrix(proposal.yaw)[:2, :2].T + proposal.centre[:2]

@@ -1,0 +1,133 @@
+"""Proposals and retrieval: instances from labels, what is merged, JSON that reads back, models that are found."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from converters.__main__ import main
+from converters.alignment import apply_alignment, wrap_angle, yaw_matrix
+from converters.annotations import parse_annotations
+from converters.proposals import Proposal, as_scan2cad, bounds, box_iou, propose_instances
+from converters.raw import CadModel, ScanMesh
+from converters.retrieval import fit_model, read_library, retrieve, without_annotation
+from converters.scan2cad import read_scan2cad
+
+
+def scan_of(*parts: tuple[trimesh.Trimesh, int]) -> ScanMesh:
+    vertices = np.vstack([m.vertices for m, _ in parts])
+    offsets = np.cumsum([0] + [len(m.vertices) for m, _ in parts[:-1]])
+    faces = np.vstack([m.faces + o for (m, _), o in zip(parts, offsets, strict=True)])
+    labels = np.concatenate([np.full(len(m.vertices), label) for m, label in parts])
+    return ScanMesh(vertices, faces, labels, np.full((len(vertices), 3), 128, np.uint8))
+
+
+def box(size, centre) -> trimesh.Trimesh:
+    return trimesh.creation.box(size).apply_translation(centre)
+
+
+def test_two_chairs_a_hand_apart_are_two_and_extents_are_right():
+    scan = scan_of((box((0.5, 0.5, 0.9), (0, 0, 0.45)), 5), (box((0.5, 0.5, 0.9), (0.6, 0, 0.45)), 5))
+    found = propose_instances(scan)
+    assert [p.category for p in found] == ["chair", "chair"]
+    for proposal in found:
+        np.testing.assert_allclose(np.sort(proposal.extent_m), [0.5, 0.5, 0.9], atol=0.02)
+        assert proposal.centre[2] == pytest.approx(0.45, abs=0.02) and abs(proposal.centre[1]) < 0.02
+        assert proposal.confidence == pytest.approx(1.0)
+    assert sorted(round(float(p.centre[0]), 1) for p in found) == [0.0, 0.6]
+
+
+def test_a_seat_above_its_base_is_one_chair_and_a_table_named_desk_in_part_is_one_table():
+    seat, base = box((0.5, 0.5, 0.5), (0, 0, 0.8)), box((0.5, 0.5, 0.1), (0, 0, 0.05))
+    top, drawer = box((1.2, 0.8, 0.3), (3, 0, 0.6)), box((0.4, 0.7, 0.25), (3, 0, 0.6))
+    found = propose_instances(scan_of((seat, 5), (base, 5), (top, 7), (drawer, 14)))
+    assert sorted(p.category for p in found) == ["chair", "table"]
+    chair = next(p for p in found if p.category == "chair")
+    assert chair.extent_m[2] == pytest.approx(1.05, abs=0.02)
+
+
+def test_noise_is_dropped_and_an_odd_size_lowers_the_confidence():
+    crumb, giant = box((0.05, 0.05, 0.05), (5, 0, 0)), box((2.0, 0.5, 0.9), (0, 0, 0.45))
+    (only,) = propose_instances(scan_of((crumb, 5), (giant, 5)))
+    assert only.confidence == pytest.approx(0.5, abs=0.01)  # twice as wide as chairs are
+
+
+def test_box_iou_by_hand():
+    one = (np.zeros(3), np.ones(3))
+    assert box_iou(one, (np.array([0.5, 0, 0]), np.array([1.5, 1, 1]))) == pytest.approx(1 / 3)
+    assert box_iou(one, (np.array([2.0, 0, 0]), np.array([3.0, 1, 1]))) == 0.0
+
+
+def test_the_tiny_room_is_proposed_and_its_models_are_found(scan2cad_raw):
+    raw = read_scan2cad(scan2cad_raw)
+    proposals = propose_instances(raw.scan)
+    assert sorted(p.category for p in proposals) == ["basket", "table"]
+    assert without_annotation(proposals, raw.annotations, raw.cads) == []
+    assert without_annotation(proposals, (), raw.cads) == [0, 1]
+    library = read_library(scan2cad_raw)
+    for proposal in proposals:
+        found = retrieve(proposal, library, 0.3)
+        assert found is not None and found.cad.category == proposal.category
+        annotation = next(a for a in raw.annotations if a.category == proposal.category)
+        true = raw.cads[annotation.cad_id].vertices @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+        assert box_iou(bounds(apply_alignment(found.pose, found.cad.vertices)), bounds(true)) > 0.85
+        assert found.confidence > 0.5
+        # The JSON reads back as an annotation of that model at that pose.
+        _, records = parse_annotations(as_scan2cad("tiny", (proposal,), {0: found}), scan2cad_raw)
+        back = records[0][1]
+        assert back.cad_id == found.cad.cad_id
+        moved = found.cad.vertices @ back.pose[:3, :3].T + back.pose[:3, 3]
+        np.testing.assert_allclose(moved, apply_alignment(found.pose, found.cad.vertices), atol=1e-4)
+
+
+def l_shape() -> CadModel:
+    """A chair without any symmetry: seat, back at -y, one arm at +x."""
+    parts = [box((1, 1, 0.2), (0, 0, 0.1)), box((1, 0.2, 1), (0, -0.4, 0.7)), box((0.2, 0.8, 0.3), (0.4, 0.1, 0.35))]
+    mesh = trimesh.util.concatenate(parts)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return CadModel("chair", "l", np.asarray(mesh.vertices), np.asarray(mesh.faces), np.zeros((36, 3), np.uint8))
+
+
+@pytest.mark.parametrize("yaw", [0.4, 2.0, -1.2])
+def test_a_known_pose_is_found_again(yaw):
+    cad = l_shape()
+    scale, shift = np.array([0.6, 0.5, 0.55]), np.array([1.0, 2.0, 0.1])
+    mesh = trimesh.Trimesh(cad.vertices, cad.faces, process=False)
+    surface = np.asarray(trimesh.sample.sample_surface(mesh, 3000, seed=1)[0])
+    points = surface * scale @ yaw_matrix(yaw).T + shift + np.random.default_rng(0).normal(0, 0.005, surface.shape)
+    proposal = Proposal("chair", 5, points, points.mean(axis=0), np.ptp(points, axis=0), 0.0, 1000, 1.0)
+    fit = fit_model(proposal, cad, 0.1)
+    assert abs(math.degrees(wrap_angle(fit.pose.yaw - yaw))) < 3
+    np.testing.assert_allclose(fit.pose.scale, scale, rtol=0.06)
+    np.testing.assert_allclose(fit.pose.translation, shift, atol=0.02)
+    assert fit.residual_m < 0.03 and fit.explained > 0.95
+
+
+def test_nothing_of_the_class_in_the_library(scan2cad_raw):
+    library = {k: c for k, c in read_library(scan2cad_raw).items() if c.category == "basket"}
+    table = next(p for p in propose_instances(read_scan2cad(scan2cad_raw).scan) if p.category == "table")
+    assert retrieve(table, library, 0.3) is None
+
+
+def test_propose_writes_json_and_picture_and_prints_the_comparison(scan2cad_raw, tmp_path, capsys):
+    assert main(["propose", str(scan2cad_raw), "-o", str(tmp_path / "p"), "--auto-align"]) == 0
+    printed = capsys.readouterr().out
+    assert "Retrieved models against the annotation" in printed and "1/1" in printed
+    data = json.loads((tmp_path / "p" / "proposals.json").read_text())
+    assert data[0]["n_aligned_models"] == len(data[0]["aligned_models"]) == 2
+    assert all(0 < m["proposal"]["confidence"] <= 1 and m["id_cad"] for m in data[0]["aligned_models"])
+    assert min(Image.open(tmp_path / "p" / "proposals.png").size) > 500
+
+
+def test_propose_refuses_a_scan_without_furniture_labels(gibson_raw, tmp_path, capsys):
+    path = gibson_raw / "mesh_z_up.labels.npz"
+    labels = np.load(path)["label"]
+    np.savez(path, label=np.where(labels == 2, 2, 1).astype(np.uint8))
+    assert main(["propose", str(gibson_raw), "-o", str(tmp_path / "p")]) == 2
+    assert "no furniture label" in capsys.readouterr().err
+    assert not (tmp_path / "p").exists()
