@@ -1,0 +1,221 @@
+"""Humanoid: nothing in, its `RobotSpec` out.
+
+Shape, masses (42.1 kg), joints and their springs are those of the MuJoCo and GibsonEnv `humanoid.xml`; torque
+limits are iGibson's gains times 0.41. Two things are ours. The feet: the original's are spheres, on which no
+stance without steps exists; here each is a capsule, 0.24 m long, of the same mass and the same sole height. And
+limbs do not collide with each other.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import mujoco
+
+from interactive_nav.robots.gait import (
+    Gait,
+    Servo,
+    add_servos,
+    attach,
+    check_mode,
+    joint_command_range,
+    joint_units,
+    learned_gait,
+)
+from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
+
+_MODES = ("native", "position", "velocity", "twist")
+MAX_LINEAR_M_S = 0.6
+MAX_ANGULAR_RAD_S = 1.0
+_THIGH_RAD, _SHIN_RAD = 0.2, 0.24
+"""Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
+
+# name: (range in degrees, torque in N m, home in rad)
+_TABLE: dict[str, tuple[tuple[float, float], float, float]] = {
+    "abdomen_z": ((-45, 45), 41.0, 0.0),
+    "abdomen_y": ((-75, 30), 41.0, 0.0),
+    "abdomen_x": ((-35, 35), 41.0, 0.0),
+    "right_hip_x": ((-25, 5), 41.0, 0.0),
+    "right_hip_z": ((-60, 35), 41.0, 0.0),
+    "right_hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
+    "right_knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+    "left_hip_x": ((-25, 5), 41.0, 0.0),
+    "left_hip_z": ((-60, 35), 41.0, 0.0),
+    "left_hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
+    "left_knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+    "right_shoulder1": ((-85, 60), 30.75, 0.67),
+    "right_shoulder2": ((-85, 60), 30.75, -0.51),
+    "right_elbow": ((-90, 50), 30.75, -1.47),
+    "left_shoulder1": ((-60, 85), 30.75, -0.67),
+    "left_shoulder2": ((-60, 85), 30.75, 0.51),
+    "left_elbow": ((-90, 50), 30.75, -1.47),
+}
+JOINTS = tuple(f"humanoid_{name}" for name in _TABLE)
+_RANGES = tuple((math.radians(low), math.radians(high)) for (low, high), _, _ in _TABLE.values())
+_TORQUE_NM = tuple(torque for _, torque, _ in _TABLE.values())
+_HOME = tuple(home for _, _, home in _TABLE.values())
+
+
+def _joint(name: str, axis: str, pos: str = "0 0 0", kind: str = "humanoid") -> str:
+    (low, high), torque, _ = _TABLE[name]
+    return (
+        f'<joint name="{name}" class="{kind}" axis="{axis}" pos="{pos}" '
+        f'range="{math.radians(low)} {math.radians(high)}" actuatorfrcrange="{-torque} {torque}"/>'
+    )
+
+
+def _leg(side: str, y: int) -> str:
+    """`y` is -1 on the right; hips mirror their axes there, so that equal angles are mirror images."""
+    return f"""
+          <body name="{side}_thigh" pos="0 {y * 0.1} -0.04">
+            {_joint(f"{side}_hip_x", f"{-y} 0 0", kind="humanoid_hip")}
+            {_joint(f"{side}_hip_z", f"0 0 {-y}", kind="humanoid_hip")}
+            {_joint(f"{side}_hip_y", "0 1 0", kind="humanoid_hip_y")}
+            <geom name="{side}_thigh" fromto="0 0 0 0 {-y * 0.01} -0.34" size="0.06"/>
+            <body name="{side}_shin" pos="0 {-y * 0.01} -0.403">
+              {_joint(f"{side}_knee", "0 -1 0", "0 0 0.02", "humanoid_knee")}
+              <geom name="{side}_shin" fromto="0 0 0 0 0 -0.3" size="0.049"/>
+              <body name="{side}_foot" pos="0 0 -0.35" euler="0 {-_SHIN_RAD} 0">
+                <geom name="{side}_foot" fromto="-0.05 0 -0.03 0.1 0 -0.03" size="0.045" mass="1.767"/>
+              </body>
+            </body>
+          </body>"""
+
+
+def _arm(side: str, y: int) -> str:
+    return f"""
+      <body name="{side}_upper_arm" pos="0 {y * 0.17} 0.06">
+        {_joint(f"{side}_shoulder1", f"2 {-y} 1", kind="humanoid_shoulder1")}
+        {_joint(f"{side}_shoulder2", f"0 {y} 1", kind="humanoid_shoulder2")}
+        <geom name="{side}_upper_arm" fromto="0 0 0 0.16 {y * 0.16} -0.16" size="0.04"/>
+        <body name="{side}_lower_arm" pos="0.18 {y * 0.18} -0.18">
+          {_joint(f"{side}_elbow", f"0 -1 {-y}", kind="humanoid_elbow")}
+          <geom name="{side}_lower_arm" fromto="0.01 {-y * 0.01} 0.01 0.17 {-y * 0.17} 0.17" size="0.031"/>
+          <geom name="{side}_hand" type="sphere" pos="0.18 {-y * 0.18} 0.18" size="0.04"/>
+        </body>
+      </body>"""
+
+
+MJCF = f"""
+<mujoco model="humanoid">
+  <compiler angle="radian"/>
+  <default>
+    <default class="humanoid">
+      <joint type="hinge" stiffness="10" damping="5" armature="0.02"/>
+      <geom type="capsule" contype="0" conaffinity="1" density="1000" friction="1 0.005 0.0001" group="3"/>
+      <default class="humanoid_hip"><joint armature="0.01"/></default>
+      <default class="humanoid_hip_y"><joint stiffness="20" armature="0.01"/></default>
+      <default class="humanoid_knee"><joint stiffness="1" damping="1" armature="0.006"/></default>
+      <default class="humanoid_shoulder1"><joint stiffness="1" damping="1" armature="0.0068"/></default>
+      <default class="humanoid_shoulder2"><joint stiffness="1" damping="1" armature="0.0051"/></default>
+      <default class="humanoid_elbow"><joint stiffness="0" damping="1" armature="0.0028"/></default>
+    </default>
+  </default>
+  <worldbody>
+    <body name="torso" childclass="humanoid">
+      <freejoint name="free"/>
+      <geom name="torso" fromto="0 -0.07 0 0 0.07 0" size="0.07"/>
+      <geom name="head" type="sphere" pos="0 0 0.19" size="0.09"/>
+      <geom name="upper_waist" fromto="-0.01 -0.06 -0.12 -0.01 0.06 -0.12" size="0.06"/>
+      <site name="eyes" pos="0 0 0.19" size="0.01"/>
+      <body name="lower_waist" pos="-0.01 0 -0.26">
+        {_joint("abdomen_z", "0 0 1", "0 0 0.065").replace("/>", ' stiffness="20"/>')}
+        {_joint("abdomen_y", "0 1 0", "0 0 0.065")}
+        <geom name="lower_waist" fromto="0 -0.06 0 0 0.06 0" size="0.06"/>
+        <body name="pelvis" pos="0 0 -0.165">
+          {_joint("abdomen_x", "1 0 0", "0 0 0.1")}
+          <geom name="pelvis" fromto="-0.02 -0.07 0 -0.02 0.07 0" size="0.09"/>
+          {_leg("right", -1)}
+          {_leg("left", 1)}
+        </body>
+      </body>
+      {_arm("right", -1)}
+      {_arm("left", 1)}
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+_SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=15.0)
+_LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in name)
+
+
+def _reference(phase, command, xp):
+    """Walking: the legs half a cycle apart; the one in swing bends its knee. Offsets from home, [..., 17]."""
+    forward, turn = command[..., 0], command[..., 1]
+    going = xp.clip(4.0 * (xp.abs(forward) + 0.3 * xp.abs(turn)), 0.0, 1.0)
+    zero = xp.zeros_like(forward)
+    out = {name: zero for name in _TABLE}
+    for side, shift in (("right", 0.0), ("left", math.pi)):
+        lift = going * xp.maximum(xp.sin(phase + shift), 0.0)
+        # Step length v / (2 f): half of it before and half behind the hip, 0.75 m above the floor.
+        stride = forward / (4.0 * 1.5) / 0.75
+        out[f"{side}_hip_y"] = stride * xp.cos(phase + shift) - 0.35 * lift
+        out[f"{side}_knee"] = -0.7 * lift
+    return xp.stack([out[name] for name in _TABLE], -1)
+
+
+GAIT = Gait(
+    robot="humanoid",
+    joints=JOINTS,
+    home=_HOME,
+    ranges=_RANGES,
+    action_scale=tuple(0.4 if i in _LEGS else 0.2 for i in range(17)),
+    frequency_hz=1.5,
+    reference=_reference,
+    tracked=tuple(i for i, name in enumerate(_TABLE) if "hip_y" in name or "knee" in name),
+    max_linear_m_s=MAX_LINEAR_M_S,
+    max_angular_rad_s=MAX_ANGULAR_RAD_S,
+    servo=_SERVO,
+    torque_nm=_TORQUE_NM,
+    fall_height_m=0.85,
+)
+
+
+def _spawn_height_m() -> float:
+    thigh, shin = 0.383, 0.02 + 0.35
+    return 0.26 + 0.165 + 0.04 + thigh * math.cos(_THIGH_RAD) + shin * math.cos(_SHIN_RAD) + 0.075
+
+
+def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
+    attach(spec, MJCF, "humanoid_")
+    add_servos(spec, JOINTS, mode, _SERVO, _TORQUE_NM, _RANGES)
+
+
+def humanoid(control_mode: str = "native") -> RobotSpec:
+    """The Humanoid's spec.
+
+    Args:
+        control_mode: `native`, seventeen joint torques; `position` or `velocity` of each joint; or `twist`,
+            linear and angular velocity of the base through its learned gait, which also balances it.
+
+    Raises:
+        ValueError: unknown mode.
+    """
+    check_mode("humanoid", control_mode, _MODES)
+    twist = control_mode == "twist"
+    low, high = joint_command_range(control_mode, _TORQUE_NM, _RANGES, 8.0)
+    if twist:
+        low, high = GAIT.command_range()
+    return RobotSpec(
+        name="humanoid",
+        add_to=functools.partial(_add_to, mode=control_mode),
+        base_body="humanoid_torso",
+        base_joint="humanoid_free",
+        actuators=JOINTS,
+        action_low=low,
+        action_high=high,
+        action_names=joint_units(JOINTS, control_mode),
+        body_width_m=0.42,
+        footprint_radius_m=0.4,
+        height_m=1.57,
+        spawn_height_m=_spawn_height_m(),
+        camera=Camera("humanoid_torso", (0.0, 0.0, 0.19)),
+        home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
+        control_mode=control_mode,
+        control_modes=_MODES,
+        control=learned_gait(GAIT) if twist else None,
+        control_every_substep=twist,
+        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
+    )
