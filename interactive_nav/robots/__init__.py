@@ -7,12 +7,14 @@ from collections.abc import Callable
 
 from interactive_nav.robots.ant import ant
 from interactive_nav.robots.humanoid import humanoid
+from interactive_nav.robots.minitaur import minitaur
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.robots.turtlebot import turtlebot
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "ant": ant,
     "humanoid": humanoid,
+    "minitaur": minitaur,
     "turtlebot": turtlebot,
 }
 """Name -> control mode -> spec."""
