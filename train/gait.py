@@ -29,7 +29,16 @@ from brax.envs.base import Env, State
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot
-from interactive_nav.robots.gait import Gait, Network, observe, rotate_to_body, save_network, targets
+from interactive_nav.robots.gait import (
+    Gait,
+    Network,
+    base_motion,
+    observe,
+    phase_at,
+    rotate_to_body,
+    save_network,
+    targets,
+)
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scene import Scene
 from interactive_nav.world import build_world
@@ -67,13 +76,15 @@ class GaitTask:
     """Share of commands that turn on the spot."""
     backward: float = 0.3
     """Fastest backward command over the fastest forward one."""
+    average_s: float = 0.4
+    """Time constant over which velocities are averaged before they are compared with the command."""
     push_s: float = 4.0
     """Mean time between two pushes."""
     push_share: float = 0.6
     """Largest change of the base's horizontal velocity by a push over the fastest forward command."""
     forward_weight: float = 2.0
     turn_weight: float = 1.0
-    reference_weight: float = 0.5
+    reference_weight: float = 0.2
     upright_weight: float = 0.5
     alive_weight: float = 0.5
     vertical_weight: float = 0.5
@@ -151,6 +162,7 @@ class GaitEnv(Env):
             "time_s": time_s,
             "steps": zero,
             "last_action": jnp.zeros((n, self.action_size)),
+            "twist": jnp.zeros((n, 3)),
             "truncation": zero,
             "running": {name: zero for name in METRICS},
             "episode_done": zero,
@@ -169,7 +181,10 @@ class GaitEnv(Env):
         rng, command_key, start_key, push_key, draw_key = jax.random.split(info["rng"], 5)
         action = jnp.clip(action, -1.0, 1.0)
         before: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        wanted = jnp.asarray(targets(gait, info["command"], action, info["time_s"], jnp), jnp.float32)
+        wanted = jnp.asarray(
+            targets(gait, info["command"], action, RobotState(before.qpos, before.qvel, info["time_s"]), jnp),
+            jnp.float32,
+        )
         after, signals = self.physics.step_batch(jnp.zeros(n, jnp.int32), before, wanted, info["time_s"])
         broken = signals.nonfinite > 0
         qpos = jnp.where(broken[:, None], self._start, after.qpos)
@@ -179,7 +194,11 @@ class GaitEnv(Env):
 
         down_b = rotate_to_body(qpos[:, 3:7], jnp.array([0.0, 0.0, -1.0]) + jnp.zeros((n, 3)), jnp)
         fallen = broken | (qpos[:, 2] < gait.fall_height_m) | (down_b[:, 2] > -0.5)
-        reward, errors = self._reward(qpos, qvel, down_b, wanted, action, info)
+        now = RobotState(qpos, qvel, time_s)
+        base = base_motion(now, jnp)
+        share = self._dt / task.average_s
+        twist = (1 - share) * info["twist"] + share * jnp.stack([base.forward, base.left, qvel[:, 5]], -1)
+        reward, errors = self._reward(now, base, twist, down_b, wanted, action, info)
         reward = jnp.where(fallen, -1.0, reward)
 
         steps = info["steps"] + 1
@@ -215,6 +234,7 @@ class GaitEnv(Env):
             "time_s": time_s,
             "steps": jnp.where(done, 0.0, steps),
             "last_action": jnp.where(done[:, None], 0.0, action),
+            "twist": jnp.where(done[:, None], 0.0, twist),
             "truncation": timed_out.astype(jnp.float32),
             "running": {name: jnp.where(done, 0.0, value) for name, value in running.items()},
             "episode_done": done.astype(jnp.float32),
@@ -230,24 +250,19 @@ class GaitEnv(Env):
             info=info,
         )
 
-    def _reward(self, qpos, qvel, down_b, wanted, action, info) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """[N] reward of a step, and the tracking errors [N] that are logged."""
+    def _reward(self, now, base, twist, down_b, wanted, action, info) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """[N] reward of a step, and the tracking errors [N] that are logged; the twist counts as averaged."""
         gait, task, command = self.gait, self.task, info["command"]
-        w, z = qpos[:, 3], qpos[:, 6]
-        norm = jnp.sqrt(w**2 + z**2) + 1e-6
-        cos, sin = (w**2 - z**2) / norm**2, 2 * w * z / norm**2
-        forward = cos * qvel[:, 0] + sin * qvel[:, 1]
-        left = -sin * qvel[:, 0] + cos * qvel[:, 1]
-        turn = qvel[:, 5]
+        qpos, qvel = now.qpos, now.qvel
+        forward, left, turn = twist[:, 0], twist[:, 1], twist[:, 2]
         scale_v, scale_w = 0.5 * gait.max_linear_m_s, 0.5 * gait.max_angular_rad_s
         off = ((forward - command[:, 0]) ** 2 + left**2) / scale_v**2
         spin = ((turn - command[:, 1]) / scale_w) ** 2
         joints = qpos[:, 7 + gait.joint_index]
         speeds = qvel[:, 6 + gait.joint_index]
         offsets = joints - jnp.asarray(gait.home)
-        reference = gait.reference(2 * jnp.pi * gait.frequency_hz * info["time_s"], command, jnp)
-        tracked = np.asarray(gait.tracked)
-        follow = jnp.exp(-10.0 * jnp.mean((offsets - reference)[:, tracked] ** 2, -1))
+        reference = gait.reference(phase_at(gait, now.time_s), command, base, jnp)
+        follow = jnp.exp(-10.0 * jnp.mean((offsets - reference)[:, np.asarray(gait.tracked)] ** 2, -1))
         limits = jnp.asarray(gait.torque_nm)
         torque = gait.servo.stiffness * (wanted - joints) - gait.servo.damping * speeds
         standing = (jnp.abs(command).sum(-1) == 0).astype(jnp.float32)
@@ -262,7 +277,10 @@ class GaitEnv(Env):
             - task.torque_weight * jnp.mean((jnp.clip(torque, -limits, limits) / limits) ** 2, -1)
             - task.still_weight * standing * jnp.mean(offsets**2, -1)
         )
-        errors = {"forward_error_m_s": jnp.abs(forward - command[:, 0]), "turn_error_rad_s": jnp.abs(turn - command[:, 1])}
+        errors = {
+            "forward_error_m_s": jnp.abs(forward - command[:, 0]),
+            "turn_error_rad_s": jnp.abs(turn - command[:, 1]),
+        }
         return reward * self._dt * 10.0, errors
 
 
@@ -349,9 +367,7 @@ def train_config(backend: str, num_envs: int | None, seed: int, num_timesteps: i
         policy_hidden_layer_sizes=(256, 128),
         value_hidden_layer_sizes=(256, 256),
     )
-    run = RunConfig(
-        seed=seed, num_timesteps=num_timesteps, log_every_steps=log_every, checkpoint_every_steps=log_every
-    )
+    run = RunConfig(seed=seed, num_timesteps=num_timesteps, log_every_steps=log_every, checkpoint_every_steps=log_every)
     return TrainConfig(ppo=settings, run=run)
 
 

@@ -22,7 +22,7 @@ from interactive_nav.robots.gait import (
     check_mode,
     joint_command_range,
     joint_units,
-    learned_gait,
+    scripted_gait,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
@@ -77,6 +77,7 @@ MJCF = f"""
       <freejoint name="free"/>
       <geom name="torso" type="sphere" size="{0.25 * SCALE}"/>
       <site name="eyes" size="0.005"/>
+      <camera name="eyes" xyaxes="0 -1 0 0 0 1" fovy="120"/>
       {_leg(1, 1, 1)}
       {_leg(2, -1, 1)}
       {_leg(3, -1, -1)}
@@ -92,8 +93,9 @@ _HOME = tuple(v for sign in _ANKLE_SIGN for v in (0.0, sign * HOME_ANKLE_RAD))
 _RANGES = tuple(r for sign in _ANKLE_SIGN for r in (_HIP_RANGE, _ankle_range(sign)))
 
 
-def _reference(phase, command, xp):
+def _reference(phase, command, base, xp):
     """Trot: diagonal pairs swing half a cycle apart; a leg in swing lifts its ankle. Offsets from home, [..., 8]."""
+    del base
     forward, turn = command[..., 0] / MAX_LINEAR_M_S, command[..., 1] / MAX_ANGULAR_RAD_S
     effort = xp.clip(2.0 * (xp.abs(forward) + xp.abs(turn)), 0.0, 1.0)
     offsets = []
@@ -159,9 +161,14 @@ def ant(control_mode: str = "native") -> RobotSpec:
         spawn_height_m=(0.4 * math.sqrt(2.0) * math.sin(HOME_ANKLE_RAD) + 0.08) * SCALE,
         camera=Camera("ant_torso", (0.0, 0.0, 0.0)),
         home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
+        kind="legged",
+        mass_kg=182.2 * SCALE**3,
+        size_m=(1.39 * SCALE, 1.39 * SCALE, 0.81 * SCALE),
+        drive_type="4 legs, 8 hinges",
+        source="MuJoCo and GibsonEnv ant.xml at scale 0.25, PyBullet's density",
         control_mode=control_mode,
         control_modes=_MODES,
-        control=learned_gait(GAIT) if twist else None,
+        control=scripted_gait(GAIT) if twist else None,
         control_every_substep=twist,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

@@ -12,7 +12,7 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -93,6 +93,38 @@ def joint_units(joints: tuple[str, ...], mode: str) -> tuple[str, ...]:
     return tuple(f"{joint.split('_', 1)[1]} {unit}" for joint in joints)
 
 
+class BaseMotion(NamedTuple):
+    """How the base leans and moves, in the frame that has its heading; each [...]."""
+
+    pitch: Any
+    """Forward lean, rad."""
+    roll: Any
+    """Lean to the right, rad."""
+    pitch_rate: Any
+    roll_rate: Any
+    forward: Any
+    """m/s"""
+    left: Any
+    """m/s"""
+
+
+def base_motion(state: RobotState, xp: Any) -> BaseMotion:
+    """The base's lean and velocity in its heading frame."""
+    w, x, y, z = (state.qpos[..., 3 + k] for k in range(4))
+    up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    heading = xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    cos, sin = xp.cos(heading), xp.sin(heading)
+    vx, vy = state.qvel[..., 0], state.qvel[..., 1]
+    return BaseMotion(
+        pitch=xp.arctan2(-up_x, up_z),
+        roll=xp.arctan2(up_y, up_z),
+        pitch_rate=state.qvel[..., 4],
+        roll_rate=state.qvel[..., 3],
+        forward=cos * vx + sin * vy,
+        left=-sin * vx + cos * vy,
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Gait:
     """A robot's gait: its scripted motion, and all that training a correction needs to know."""
@@ -108,8 +140,8 @@ class Gait:
     """[J] largest correction of each target by the network, rad."""
     frequency_hz: float
     """Cycles a second."""
-    reference: Callable[[Any, Any, Any], Any]
-    """(phase [...], command [..., 2], numpy or jax.numpy) -> target offsets from home [..., J], rad."""
+    reference: Callable[[Any, Any, BaseMotion, Any], Any]
+    """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
     tracked: tuple[int, ...]
     """Joints whose reference training rewards following."""
     max_linear_m_s: float
@@ -177,10 +209,10 @@ def observe(gait: Gait, command: Any, state: RobotState, xp: Any) -> Any:
     )
 
 
-def targets(gait: Gait, command: Any, correction: Any, time_s: Any, xp: Any) -> Any:
+def targets(gait: Gait, command: Any, correction: Any, state: RobotState, xp: Any) -> Any:
     """Joint targets [..., J], rad, within the joints' ranges; `correction` [..., J] is in [-1, 1]."""
     low, high = xp.asarray(gait.ranges).T
-    wanted = xp.asarray(gait.home) + gait.reference(phase_at(gait, time_s), command, xp)
+    wanted = xp.asarray(gait.home) + gait.reference(phase_at(gait, state.time_s), command, base_motion(state, xp), xp)
     return xp.clip(wanted + xp.asarray(gait.action_scale) * correction, low, high)
 
 
@@ -228,7 +260,7 @@ def scripted_gait(gait: Gait) -> ControlLaw:
     """Twist to joint targets by the reference motion alone."""
 
     def law(command, state, xp):
-        return targets(gait, command, 0.0, state.time_s, xp)
+        return targets(gait, command, 0.0, state, xp)
 
     return law
 
@@ -243,6 +275,6 @@ def learned_gait(gait: Gait, network: Network | None = None) -> ControlLaw:
 
     def law(command, state, xp):
         correct = network or load_network(GAITS / f"{gait.robot}.npz")
-        return targets(gait, command, correct(observe(gait, command, state, xp), xp), state.time_s, xp)
+        return targets(gait, command, correct(observe(gait, command, state, xp), xp), state, xp)
 
     return law

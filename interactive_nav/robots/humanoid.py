@@ -8,6 +8,7 @@ limbs do not collide with each other.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 
@@ -21,13 +22,13 @@ from interactive_nav.robots.gait import (
     check_mode,
     joint_command_range,
     joint_units,
-    learned_gait,
+    scripted_gait,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
 _MODES = ("native", "position", "velocity", "twist")
-MAX_LINEAR_M_S = 0.6
-MAX_ANGULAR_RAD_S = 1.0
+MAX_LINEAR_M_S = 0.4
+MAX_ANGULAR_RAD_S = 0.6
 _THIGH_RAD, _SHIN_RAD = 0.2, 0.24
 """Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
 
@@ -119,6 +120,7 @@ MJCF = f"""
       <geom name="head" type="sphere" pos="0 0 0.19" size="0.09"/>
       <geom name="upper_waist" fromto="-0.01 -0.06 -0.12 -0.01 0.06 -0.12" size="0.06"/>
       <site name="eyes" pos="0 0 0.19" size="0.01"/>
+      <camera name="eyes" pos="0 0 0.19" xyaxes="0 -1 0 0 0 1" fovy="120"/>
       <body name="lower_waist" pos="-0.01 0 -0.26">
         {_joint("abdomen_z", "0 0 1", "0 0 0.065").replace("/>", ' stiffness="20"/>')}
         {_joint("abdomen_y", "0 1 0", "0 0 0.065")}
@@ -141,19 +143,83 @@ _SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=15.0)
 _LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in name)
 
 
-def _reference(phase, command, xp):
-    """Walking: the legs half a cycle apart; the one in swing bends its knee. Offsets from home, [..., 17]."""
+@dataclasses.dataclass(frozen=True)
+class Stepping:
+    """A walk with feedback, after SIMBICON (Yin et al. 2007): the leg in swing steps to where the body falls, the
+    leg in stance holds the torso upright. Figures from a random search (cross-entropy method) over walks."""
+
+    frequency_hz: float
+    hip_lift: float
+    knee_lift: float
+    sway: float
+    """Of the hips towards the leg in stance, rad."""
+    sway_phase: float
+    waist: float
+    """Of the waist against the sway, rad."""
+    stride: float
+    """Hip swing over that of a step of v / (2 f)."""
+    lean: float
+    """Of the thighs, rad per m/s."""
+    width: float
+    """Outward hips, rad."""
+    bend: float
+    """Of the waist forward, rad per m/s."""
+    place_forward: float
+    """Hip of the swing leg, rad per m/s of velocity error."""
+    place_side: float
+    """The same sideways, rad per m/s."""
+    pitch: float
+    pitch_rate: float
+    roll: float
+    roll_rate: float
+    """Hips of the stance leg, rad per rad and per rad/s."""
+    swing_pitch: float
+    """Hip of the swing leg against the torso's lean, rad per rad."""
+    waist_roll: float
+    turn: float
+    """Hip yaw over that of a turn of w / (2 f) a step."""
+    slip: float
+    """Velocity by which the walk lags behind, m/s."""
+
+
+STEPPING = Stepping(2.1502, 0.1949, 0.4475, 0.173, 0.3622, -0.1659, 0.8213, 0.4195, 0.0345, 0.1604, 0.4287, 0.9019,
+                    0.6716, 0.083, 0.8361, 0.2582, 1.2989, -0.3066, 0.7638, 0.28)  # fmt: skip
+
+
+def step_targets(p, phase, command, base, xp):
+    """The walk of `Stepping` p as offsets from home, [..., 17]; it stands when neither told nor forced to step."""
     forward, turn = command[..., 0], command[..., 1]
-    going = xp.clip(4.0 * (xp.abs(forward) + 0.3 * xp.abs(turn)), 0.0, 1.0)
-    zero = xp.zeros_like(forward)
-    out = {name: zero for name in _TABLE}
-    for side, shift in (("right", 0.0), ("left", math.pi)):
-        lift = going * xp.maximum(xp.sin(phase + shift), 0.0)
-        # Step length v / (2 f): half of it before and half behind the hip, 0.75 m above the floor.
-        stride = forward / (4.0 * 1.5) / 0.75
-        out[f"{side}_hip_y"] = stride * xp.cos(phase + shift) - 0.35 * lift
-        out[f"{side}_knee"] = -0.7 * lift
+    wanted = 10.0 * xp.abs(forward) + 5.0 * xp.abs(turn)
+    moving = 4.0 * xp.sqrt(base.forward**2 + base.left**2 + 1e-6) + 6.0 * (xp.abs(base.pitch) + xp.abs(base.roll)) - 0.6
+    going = xp.clip(xp.maximum(wanted, moving), 0.0, 1.0)
+    forward = forward + p.slip * going
+    sway = going * xp.cos(phase - p.sway_phase)
+    out = {name: 0.0 * forward for name in _TABLE}
+    for side, shift, left in (("right", 0.0, -1.0), ("left", math.pi, 1.0)):
+        swing = going * xp.maximum(xp.sin(phase + shift), 0.0)
+        stance = 1.0 - swing
+        stride = p.stride * forward / (4.0 * p.frequency_hz) / 0.75 * xp.cos(phase + shift)
+        out[f"{side}_hip_y"] = (
+            stride
+            - p.hip_lift * swing
+            - p.lean * forward
+            - swing * (p.place_forward * (base.forward - forward) + p.swing_pitch * base.pitch)
+            + stance * (p.pitch * base.pitch + p.pitch_rate * base.pitch_rate)
+        )
+        out[f"{side}_knee"] = -p.knee_lift * swing
+        out[f"{side}_hip_x"] = -p.width * going - left * (
+            p.sway * sway
+            + swing * p.place_side * base.left
+            + stance * (p.roll * base.roll + p.roll_rate * base.roll_rate)
+        )
+        out[f"{side}_hip_z"] = left * p.turn * turn / (4.0 * p.frequency_hz) * xp.cos(phase + shift)
+    out["abdomen_x"] = p.waist * sway + p.waist_roll * base.roll
+    out["abdomen_y"] = p.bend * forward
     return xp.stack([out[name] for name in _TABLE], -1)
+
+
+def _reference(phase, command, base, xp):
+    return step_targets(STEPPING, phase, command, base, xp)
 
 
 GAIT = Gait(
@@ -162,7 +228,7 @@ GAIT = Gait(
     home=_HOME,
     ranges=_RANGES,
     action_scale=tuple(0.4 if i in _LEGS else 0.2 for i in range(17)),
-    frequency_hz=1.5,
+    frequency_hz=STEPPING.frequency_hz,
     reference=_reference,
     tracked=tuple(i for i, name in enumerate(_TABLE) if "hip_y" in name or "knee" in name),
     max_linear_m_s=MAX_LINEAR_M_S,
@@ -188,7 +254,7 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
 
     Args:
         control_mode: `native`, seventeen joint torques; `position` or `velocity` of each joint; or `twist`,
-            linear and angular velocity of the base through its learned gait, which also balances it.
+            linear and angular velocity of the base through its gait, which also balances it.
 
     Raises:
         ValueError: unknown mode.
@@ -213,9 +279,14 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
         spawn_height_m=_spawn_height_m(),
         camera=Camera("humanoid_torso", (0.0, 0.0, 0.19)),
         home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
+        kind="legged",
+        mass_kg=42.116,
+        size_m=(0.3, 0.6, 1.56),
+        drive_type="2 legs, 17 hinges",
+        source="MuJoCo and GibsonEnv humanoid.xml; feet are ours",
         control_mode=control_mode,
         control_modes=_MODES,
-        control=learned_gait(GAIT) if twist else None,
+        control=scripted_gait(GAIT) if twist else None,
         control_every_substep=twist,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

@@ -109,6 +109,7 @@ MJCF = f"""
       <geom name="rail_left" type="box" size="0.17 0.04 0.02" pos="0 0.1 0" mass="0.1"/>
       <geom name="rail_right" type="box" size="0.17 0.04 0.02" pos="0 -0.1 0" mass="0.1"/>
       <site name="eyes" pos="0.3 0 0.05" size="0.005"/>
+      <camera name="eyes" pos="0.3 0 0.05" xyaxes="0 -1 0 0 0 1" fovy="120"/>
       {"".join(_leg(*leg) for leg in _LEGS)}
     </body>
   </worldbody>
@@ -123,8 +124,9 @@ _FREQUENCY_HZ = 2.5
 _LIFT_RAD = 0.3
 
 
-def _reference(phase, command, xp):
+def _reference(phase, command, base, xp):
     """Trot: diagonal legs together; strides of left and right differ in a turn. Offsets from home, [..., 8]."""
+    del base
     forward, turn = command[..., 0], command[..., 1]
     effort = xp.clip(8.0 * (xp.abs(forward) + 0.3 * xp.abs(turn)), 0.0, 1.0)
     out = []
@@ -212,6 +214,11 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
         spawn_height_m=_DROP_M + TOE_RADIUS_M,
         camera=Camera("minitaur_chassis", (0.3, 0.0, 0.05)),
         home_qpos=tuple(home),
+        kind="legged",
+        mass_kg=6.0,
+        size_m=(0.65, 0.28, 0.21),
+        drive_type="4 closed-chain legs, 8 motors",
+        source="GibsonEnv minitaur.urdf; iGibson's motor model",
         control_mode=control_mode,
         control_modes=_MODES,
         control=control,

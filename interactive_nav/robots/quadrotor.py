@@ -77,6 +77,7 @@ def _body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
         base.add_site(name=name, pos=[x, y, 0.03], size=[0.01] * 3)
     base.add_site(name="quadrotor_centre", size=[0.01] * 3)
     base.add_site(name="quadrotor_eyes", pos=[0.0, 0.05, -0.05], size=[0.005] * 3)
+    base.add_camera(name="quadrotor_eyes", pos=[0.0, 0.05, -0.05], quat=[0.5, 0.5, -0.5, -0.5], fovy=120.0)
     return base
 
 
@@ -227,6 +228,11 @@ def quadrotor(control_mode: str = "native") -> RobotSpec:
         height_m=HOVER_HEIGHT_M + 0.1,
         spawn_height_m=HOVER_HEIGHT_M,
         camera=Camera("quadrotor", (0.0, 0.05, -0.05)),
+        kind="flying",
+        mass_kg=MASS_KG,
+        size_m=(0.592, 0.592, 0.09),
+        drive_type="4 rotors",
+        source="GibsonEnv quadrotor.urdf",
         control_mode=control_mode,
         control_modes=_MODES,
         control=law,
