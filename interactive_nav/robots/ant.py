@@ -22,7 +22,7 @@ from interactive_nav.robots.gait import (
     check_mode,
     joint_command_range,
     joint_units,
-    scripted_gait,
+    gait_law,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
@@ -34,8 +34,8 @@ _ANKLE_SIGN = (1.0, -1.0, -1.0, 1.0)
 _HIP_RANGE = (-math.radians(40.0), math.radians(40.0))
 _ANKLE_RANGE = (math.radians(30.0), math.radians(100.0))
 _MODES = ("native", "position", "velocity", "twist")
-MAX_LINEAR_M_S = 0.3
-MAX_ANGULAR_RAD_S = 1.0
+MAX_LINEAR_M_S = 0.2
+MAX_ANGULAR_RAD_S = 0.8
 
 
 def _ankle_range(sign: float) -> tuple[float, float]:
@@ -88,23 +88,33 @@ MJCF = f"""
 """
 """Limbs collide with everything but each other."""
 
-_SERVO = Servo(stiffness=8.0, damping=0.3, velocity_gain=0.2)
+_SERVO = Servo(stiffness=9.0, damping=0.4, velocity_gain=0.2)
 _HOME = tuple(v for sign in _ANKLE_SIGN for v in (0.0, sign * HOME_ANKLE_RAD))
 _RANGES = tuple(r for sign in _ANKLE_SIGN for r in (_HIP_RANGE, _ankle_range(sign)))
+
+
+_FREQUENCY_HZ = 2.3
+_LIFT_RAD = 0.325
+_PRESS = 0.1
+"""Legs on the ground push down by this share of the lift."""
+_STRIDE_GAIN, _TURN_GAIN = 1.07, 1.16
+"""Over the kinematic sweep: for servos that lag and feet that slip. All five by a random search for tracking."""
+_REACH_M = 0.104
+"""Forward travel of a foot per radian of its hip, at home."""
 
 
 def _reference(phase, command, base, xp):
     """Trot: diagonal pairs swing half a cycle apart; a leg in swing lifts its ankle. Offsets from home, [..., 8]."""
     del base
-    forward, turn = command[..., 0] / MAX_LINEAR_M_S, command[..., 1] / MAX_ANGULAR_RAD_S
-    effort = xp.clip(2.0 * (xp.abs(forward) + xp.abs(turn)), 0.0, 1.0)
+    forward, turn = command[..., 0], command[..., 1]
+    effort = xp.clip(8.0 * xp.abs(forward) + 2.0 * xp.abs(turn), 0.0, 1.0)
     offsets = []
-    for i, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
-        at = phase + (0.0 if i % 2 == 0 else math.pi)
+    for sign, (x, y) in zip(_ANKLE_SIGN, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True):
+        at = phase + (0.0 if x * y > 0 else math.pi)
         # A foot on the left (y > 0) goes forward when its hip turns clockwise, one on the right the other way.
-        swing = -y * 0.4 * forward + 0.15 * turn
-        offsets.append(-swing * xp.cos(at))
-        offsets.append(-0.35 * _ANKLE_SIGN[i] * effort * xp.maximum(xp.sin(at), 0.0))
+        sweep = (_TURN_GAIN * turn - y * _STRIDE_GAIN * forward / _REACH_M) / (4.0 * _FREQUENCY_HZ)
+        offsets.append(-sweep * xp.cos(at))
+        offsets.append(-sign * _LIFT_RAD * effort * (xp.maximum(xp.sin(at), 0.0) - _PRESS))
     return xp.stack(offsets, -1)
 
 
@@ -114,7 +124,7 @@ GAIT = Gait(
     home=_HOME,
     ranges=_RANGES,
     action_scale=(0.5,) * 8,
-    frequency_hz=2.0,
+    frequency_hz=_FREQUENCY_HZ,
     reference=_reference,
     tracked=tuple(range(8)),
     max_linear_m_s=MAX_LINEAR_M_S,
@@ -168,7 +178,7 @@ def ant(control_mode: str = "native") -> RobotSpec:
         source="MuJoCo and GibsonEnv ant.xml at scale 0.25, PyBullet's density",
         control_mode=control_mode,
         control_modes=_MODES,
-        control=scripted_gait(GAIT) if twist else None,
+        control=gait_law(GAIT) if twist else None,
         control_every_substep=twist,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

@@ -265,16 +265,16 @@ def scripted_gait(gait: Gait) -> ControlLaw:
     return law
 
 
-def learned_gait(gait: Gait, network: Network | None = None) -> ControlLaw:
-    """Twist to joint targets with the network's corrections.
-
-    Args:
-        gait: the robot's.
-        network: by default the one in `gaits/<robot>.npz`.
-    """
+def learned_gait(gait: Gait, network: Network) -> ControlLaw:
+    """Twist to joint targets with the network's corrections."""
 
     def law(command, state, xp):
-        correct = network or load_network(GAITS / f"{gait.robot}.npz")
-        return targets(gait, command, correct(observe(gait, command, state, xp), xp), state, xp)
+        return targets(gait, command, network(observe(gait, command, state, xp), xp), state, xp)
 
     return law
+
+
+def gait_law(gait: Gait) -> ControlLaw:
+    """Twist to joint targets: corrected by the network in `gaits/<robot>.npz` where there is one."""
+    path = GAITS / f"{gait.robot}.npz"
+    return learned_gait(gait, load_network(path)) if path.is_file() else scripted_gait(gait)

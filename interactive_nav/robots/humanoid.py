@@ -22,7 +22,7 @@ from interactive_nav.robots.gait import (
     check_mode,
     joint_command_range,
     joint_units,
-    scripted_gait,
+    gait_law,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
@@ -286,7 +286,7 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
         source="MuJoCo and GibsonEnv humanoid.xml; feet are ours",
         control_mode=control_mode,
         control_modes=_MODES,
-        control=scripted_gait(GAIT) if twist else None,
+        control=gait_law(GAIT) if twist else None,
         control_every_substep=twist,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

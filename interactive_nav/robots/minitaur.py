@@ -25,7 +25,7 @@ from interactive_nav.robots.gait import (
     check_mode,
     joint_command_range,
     joint_units,
-    scripted_gait,
+    gait_law,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
@@ -196,7 +196,7 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
         names = tuple(f"{leg} {what}" for what in ("swing", "extension") for leg, _, _ in _LEGS)
     if twist:
         low, high = GAIT.command_range()
-        control = scripted_gait(GAIT)
+        control = gait_law(GAIT)
     home = [(f"minitaur_{part}_{leg}_{link}", value) for leg, _, _ in _LEGS for link in ("fore", "aft")
             for part, value in (("motor", HOME_RAD), ("knee", _KNEE_HOME_RAD))]  # fmt: skip
     return RobotSpec(
