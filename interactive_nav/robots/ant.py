@@ -20,9 +20,9 @@ from interactive_nav.robots.gait import (
     add_servos,
     attach,
     check_mode,
+    gait_law,
     joint_command_range,
     joint_units,
-    gait_law,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 

@@ -8,9 +8,9 @@ limbs do not collide with each other.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
+from typing import NamedTuple
 
 import mujoco
 
@@ -20,9 +20,9 @@ from interactive_nav.robots.gait import (
     add_servos,
     attach,
     check_mode,
+    gait_law,
     joint_command_range,
     joint_units,
-    gait_law,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
@@ -139,12 +139,11 @@ MJCF = f"""
 </mujoco>
 """
 
-_SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=15.0)
+_SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0)
 _LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in name)
 
 
-@dataclasses.dataclass(frozen=True)
-class Stepping:
+class Stepping(NamedTuple):
     """A walk with feedback, after SIMBICON (Yin et al. 2007): the leg in swing steps to where the body falls, the
     leg in stance holds the torso upright. Figures from a random search (cross-entropy method) over walks."""
 
@@ -180,18 +179,27 @@ class Stepping:
     """Hip yaw over that of a turn of w / (2 f) a step."""
     slip: float
     """Velocity by which the walk lags behind, m/s."""
+    step_speed: float
+    step_lean: float
+    step_threshold: float
+    """Untold, it steps in so far as step_speed * speed + step_lean * (|pitch| + |roll|) exceeds the threshold."""
 
 
-STEPPING = Stepping(2.1502, 0.1949, 0.4475, 0.173, 0.3622, -0.1659, 0.8213, 0.4195, 0.0345, 0.1604, 0.4287, 0.9019,
-                    0.6716, 0.083, 0.8361, 0.2582, 1.2989, -0.3066, 0.7638, 0.28)  # fmt: skip
+WALK = Stepping(2.1502, 0.1949, 0.4475, 0.173, 0.3622, -0.1659, 0.8213, 0.4195, 0.0345, 0.1604, 0.4287, 0.9019,
+                    0.6716, 0.083, 0.8361, 0.2582, 1.2989, -0.3066, 0.7638, 0.28, 4.0, 6.0, 0.6)  # fmt: skip
 
 
-def step_targets(p, phase, command, base, xp):
+STAND = WALK
+
+
+def step_targets(walk, stand, phase, command, base, xp):
     """The walk of `Stepping` p as offsets from home, [..., 17]; it stands when neither told nor forced to step."""
     forward, turn = command[..., 0], command[..., 1]
-    wanted = 10.0 * xp.abs(forward) + 5.0 * xp.abs(turn)
-    moving = 4.0 * xp.sqrt(base.forward**2 + base.left**2 + 1e-6) + 6.0 * (xp.abs(base.pitch) + xp.abs(base.roll)) - 0.6
-    going = xp.clip(xp.maximum(wanted, moving), 0.0, 1.0)
+    told = xp.clip(10.0 * xp.abs(forward) + 5.0 * xp.abs(turn), 0.0, 1.0)
+    p = Stepping(*(told * a + (1.0 - told) * b for a, b in zip(walk, stand, strict=True)))
+    speed = xp.sqrt(base.forward**2 + base.left**2 + 1e-6)
+    forced = p.step_speed * speed + p.step_lean * (xp.abs(base.pitch) + xp.abs(base.roll)) - p.step_threshold
+    going = xp.clip(xp.maximum(told, forced), 0.0, 1.0)
     forward = forward + p.slip * going
     sway = going * xp.cos(phase - p.sway_phase)
     out = {name: 0.0 * forward for name in _TABLE}
@@ -219,7 +227,7 @@ def step_targets(p, phase, command, base, xp):
 
 
 def _reference(phase, command, base, xp):
-    return step_targets(STEPPING, phase, command, base, xp)
+    return step_targets(WALK, STAND, phase, command, base, xp)
 
 
 GAIT = Gait(
@@ -228,7 +236,7 @@ GAIT = Gait(
     home=_HOME,
     ranges=_RANGES,
     action_scale=tuple(0.4 if i in _LEGS else 0.2 for i in range(17)),
-    frequency_hz=STEPPING.frequency_hz,
+    frequency_hz=WALK.frequency_hz,
     reference=_reference,
     tracked=tuple(i for i, name in enumerate(_TABLE) if "hip_y" in name or "knee" in name),
     max_linear_m_s=MAX_LINEAR_M_S,
@@ -274,14 +282,14 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
         action_high=high,
         action_names=joint_units(JOINTS, control_mode),
         body_width_m=0.42,
-        footprint_radius_m=0.4,
+        footprint_radius_m=0.35,
         height_m=1.57,
         spawn_height_m=_spawn_height_m(),
         camera=Camera("humanoid_torso", (0.0, 0.0, 0.19)),
         home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
         kind="legged",
         mass_kg=42.116,
-        size_m=(0.3, 0.6, 1.56),
+        size_m=(0.28, 0.58, 1.56),
         drive_type="2 legs, 17 hinges",
         source="MuJoCo and GibsonEnv humanoid.xml; feet are ours",
         control_mode=control_mode,

@@ -23,9 +23,9 @@ from interactive_nav.robots.gait import (
     add_servos,
     attach,
     check_mode,
+    gait_law,
     joint_command_range,
     joint_units,
-    gait_law,
 )
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
@@ -119,28 +119,32 @@ MJCF = f"""
 </mujoco>
 """
 
-_SERVO = Servo(stiffness=20.0, damping=0.5, velocity_gain=0.5)
-_FREQUENCY_HZ = 2.5
-_LIFT_RAD = 0.3
+_SERVO = Servo(stiffness=20.0, damping=0.35, velocity_gain=0.5)
+_FREQUENCY_HZ = 3.24
+_LIFT_RAD = 0.285
+_PRESS = 0.17
+"""Legs on the ground push down by this share of the lift."""
+_LAG_RAD = 0.47
+"""Of the phase by which the sweep leads the lift."""
+_STRIDE_GAIN, _TURN_GAIN = 0.615, 4.63
+"""Over the kinematic sweep: for servos that lag and feet that slip. All six by a random search for tracking."""
 
 
 def _reference(phase, command, base, xp):
     """Trot: diagonal legs together; strides of left and right differ in a turn. Offsets from home, [..., 8]."""
     del base
     forward, turn = command[..., 0], command[..., 1]
-    effort = xp.clip(8.0 * (xp.abs(forward) + 0.3 * xp.abs(turn)), 0.0, 1.0)
+    effort = xp.clip(8.0 * xp.abs(forward) + 3.0 * xp.abs(turn), 0.0, 1.0)
     out = []
     for _, x, y in _LEGS:
         at = phase + (0.0 if x * y > 0 else math.pi)
-        # A foot on the ground sweeps v / (2 f), at most 0.164 m below the hip; slip of turning feet is made up for.
+        # A foot on the ground sweeps v / (2 f), 0.164 m below its hip.
         speed = _STRIDE_GAIN * forward - y * _TURN_GAIN * FOOT_Y_M * turn
-        swing = -speed / (4.0 * _FREQUENCY_HZ) / _DROP_M * xp.cos(at)
-        lift = _LIFT_RAD * effort * xp.maximum(xp.sin(at), 0.0)
+        swing = -speed / (4.0 * _FREQUENCY_HZ) / _DROP_M * xp.cos(at + _LAG_RAD)
+        lift = _LIFT_RAD * effort * (xp.maximum(xp.sin(at), 0.0) - _PRESS)
         out += [swing + lift, -swing + lift]
     return xp.stack(out, -1)
 
-
-_STRIDE_GAIN, _TURN_GAIN = 1.0, 5.5
 
 GAIT = Gait(
     robot="minitaur",
