@@ -5,9 +5,10 @@ few seconds, under the navigation task's own physics (0.02 s steps, its solver, 
 correction of the joint targets at every physics step; observation and action are those of
 `interactive_nav.robots.gait`, so that what is learned is what the robot's `twist` mode runs. PPO is the same as
 for navigation. The network is exported to OUT/<robot>.npz after every log interval; copy it to
-`interactive_nav/robots/gaits/` to use it.
+`interactive_nav/robots/gaits/` to use it, if it is better than the script alone:
 
     python -m train.gait --robot humanoid --max-seconds 240 --out runs/gait
+    python -m train.gait --robot humanoid --evaluate runs/gait
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +33,7 @@ from interactive_nav.robots.gait import (
     Gait,
     Network,
     base_motion,
+    load_network,
     observe,
     phase_at,
     rotate_to_body,
@@ -384,9 +385,30 @@ def train_gait(
     return ppo.train(env, config, callbacks).metrics
 
 
+def evaluate(robot: str, backend: str, network: Network | None, num_envs: int, seed: int) -> dict[str, float]:
+    """Means over the first episode of every environment, with a network's corrections or with none."""
+    env = GaitEnv(get_gait(robot), backend)
+
+    def correct(observation: jax.Array) -> jax.Array:
+        return jnp.zeros((num_envs, env.action_size)) if network is None else network(observation, jnp)
+
+    reset, step = jax.jit(env.reset), jax.jit(lambda state: env.step(state, correct(state.obs)))
+    state = reset(jax.random.split(jax.random.PRNGKey(seed), num_envs))
+    first = {name: np.full(num_envs, np.nan) for name in METRICS}
+    for _ in range(round(env.task.episode_s / 0.02)):
+        state = step(state)
+        ended = np.asarray(state.done) > 0
+        for name, values in first.items():
+            new = ended & np.isnan(values)
+            values[new] = np.asarray(state.info["episode_metrics"][name])[new]
+    return {name: float(values.mean()) for name, values in first.items()}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line."""
-    made = argparse.ArgumentParser(prog="python -m train.gait", description=__doc__.split("\n")[0])
+    made = argparse.ArgumentParser(
+        prog="python -m train.gait", description="Trains the network that corrects a legged robot's scripted gait."
+    )
     made.add_argument("--robot", nargs="+", choices=ROBOTS, required=True, help="one after the other")
     made.add_argument("--backend", default="auto", help="physics: warp, jax, native, auto")
     made.add_argument("--num-envs", type=int, help="environments stepped together (default: by backend)")
@@ -395,8 +417,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     made.add_argument("--steps", type=int, default=1_000_000_000, help="environment steps at most")
     made.add_argument("--log-every", type=int, help="environment steps between two lines and exports")
     made.add_argument("--out", type=Path, default=Path("runs/gait"))
+    made.add_argument(
+        "--evaluate", type=Path, help="train nothing: compare the script with OUT/<robot>.npz of this OUT"
+    )
     args = made.parse_args(argv)
     backend = resolve_backend(args.backend)
+    if args.evaluate:
+        for robot in args.robot:
+            networks = {"script": None, "network": load_network(args.evaluate / f"{robot}.npz")}
+            for label, network in networks.items():
+                means = evaluate(robot, backend, network, args.num_envs or 64, args.seed)
+                print(f"{robot}, {label}: " + "  ".join(f"{name} {value:.3f}" for name, value in means.items()))
+        return 0
     log_every = args.log_every or (2_000_000 if backend == "warp" else 50_000)
     seconds = args.max_seconds * len(args.robot) if len(args.max_seconds) == 1 else args.max_seconds
     if len(seconds) != len(args.robot):

@@ -72,3 +72,8 @@ def test_the_command_trains_and_writes_a_network(tmp_path, capsys):
     state = RobotState(np.zeros((1, 15)), np.zeros((1, 14)), np.zeros(1))
     assert scripted_gait(gait)(np.zeros((1, 2)), state, np).shape == (1, 8)
     assert network(np.zeros((1, gait.observation_size)), np).shape == (1, 8)
+    assert main(["--robot", "ant", "--backend", "native", "--num-envs", "4", "--evaluate", str(tmp_path)]) == 0
+    script, corrected = capsys.readouterr().out.splitlines()
+    assert script.startswith("ant, script: ") and corrected.startswith("ant, network: ")
+    # The script does not fall, nor does it after two updates that began at it.
+    assert "fallen 0.000  length 500.000" in script

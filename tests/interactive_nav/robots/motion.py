@@ -105,7 +105,7 @@ def home_data(model: mujoco.MjModel, robot: RobotSpec, height_m: float | None = 
 
 
 def extents(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
-    """Length, width and height of all geoms but the floor, m; and the radius of the disc about the base that holds them."""
+    """Length, width, height of all geoms but the floor, m; radius of the disc about the base that holds them."""
     corners, radius = [], 0.0
     for g in range(model.ngeom):
         kind, size = model.geom_type[g], model.geom_size[g]

@@ -1,4 +1,4 @@
-"""The quadrotor's rotors by hand; hover, speeds, stop and turn under its controllers; kinematic flight without gravity."""
+"""The quadrotor's rotors by hand; hover, speeds, stop, turn under its controllers; flight without gravity."""
 
 import jax.numpy as jnp
 import mujoco
