@@ -27,8 +27,8 @@ from interactive_nav.robots.gait import (
 from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
 
 _MODES = ("native", "position", "velocity", "twist")
-MAX_LINEAR_M_S = 0.4
-MAX_ANGULAR_RAD_S = 0.6
+MAX_LINEAR_M_S = 0.35
+MAX_ANGULAR_RAD_S = 0.5
 _THIGH_RAD, _SHIN_RAD = 0.2, 0.24
 """Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
 
@@ -145,7 +145,7 @@ _LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in n
 
 class Stepping(NamedTuple):
     """A walk with feedback, after SIMBICON (Yin et al. 2007): the leg in swing steps to where the body falls, the
-    leg in stance holds the torso upright. Figures from a random search (cross-entropy method) over walks."""
+    leg in stance holds the torso upright. Figures by the cross-entropy method over random twist sequences and pushes."""
 
     frequency_hz: float
     hip_lift: float
@@ -185,11 +185,59 @@ class Stepping(NamedTuple):
     """Untold, it steps in so far as step_speed * speed + step_lean * (|pitch| + |roll|) exceeds the threshold."""
 
 
-WALK = Stepping(2.1502, 0.1949, 0.4475, 0.173, 0.3622, -0.1659, 0.8213, 0.4195, 0.0345, 0.1604, 0.4287, 0.9019,
-                    0.6716, 0.083, 0.8361, 0.2582, 1.2989, -0.3066, 0.7638, 0.28, 4.0, 6.0, 0.6)  # fmt: skip
+WALK = Stepping(
+    frequency_hz=2.15,
+    hip_lift=0.179,
+    knee_lift=0.414,
+    sway=0.141,
+    sway_phase=0.326,
+    waist=-0.16,
+    stride=0.624,
+    lean=0.401,
+    width=0.034,
+    bend=0.145,
+    place_forward=0.427,
+    place_side=0.935,
+    pitch=0.705,
+    pitch_rate=0.067,
+    roll=0.937,
+    roll_rate=0.23,
+    swing_pitch=1.385,
+    waist_roll=-0.357,
+    turn=0.696,
+    slip=0.233,
+    step_speed=4.0,
+    step_lean=6.0,
+    step_threshold=0.6,
+)
+"""Told to go."""
 
-
-STAND = WALK
+STAND = Stepping(
+    frequency_hz=2.15,
+    hip_lift=0.273,
+    knee_lift=0.478,
+    sway=0.201,
+    sway_phase=0.226,
+    waist=-0.18,
+    stride=0.778,
+    lean=0.305,
+    width=0.021,
+    bend=-0.018,
+    place_forward=0.639,
+    place_side=0.77,
+    pitch=0.562,
+    pitch_rate=0.094,
+    roll=1.057,
+    roll_rate=0.194,
+    swing_pitch=1.039,
+    waist_roll=-0.549,
+    turn=0.764,
+    slip=0.224,
+    step_speed=8.327,
+    step_lean=10.492,
+    step_threshold=0.8,
+)
+"""Told to stand: it steps only where it must."""
 
 
 def step_targets(walk, stand, phase, command, base, xp):
