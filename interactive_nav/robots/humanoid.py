@@ -145,7 +145,7 @@ _LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in n
 
 class Stepping(NamedTuple):
     """A walk with feedback, after SIMBICON (Yin et al. 2007): the leg in swing steps to where the body falls, the
-    leg in stance holds the torso upright. Figures by the cross-entropy method over random twist sequences and pushes."""
+    leg in stance holds the torso upright. Figures by the cross-entropy method over random twists and pushes."""
 
     frequency_hz: float
     hip_lift: float
@@ -205,7 +205,7 @@ WALK = Stepping(
     swing_pitch=1.385,
     waist_roll=-0.357,
     turn=0.696,
-    slip=0.233,
+    slip=0.333,
     step_speed=4.0,
     step_lean=6.0,
     step_threshold=0.6,

@@ -101,7 +101,7 @@ def test_joint_limits_and_torque_limits_hold_under_full_torque(name):
             reached.append(data.qpos[address].copy())
         # MuJoCo's limits are soft: a joint that runs into one at full speed overshoots, and is then held.
         over = np.maximum(ranges[:, 0] - reached, reached - ranges[:, 1])[-20:]
-        assert over.max() < 0.1, over.max()
+        assert over.max() < 0.12, over.max()
         assert (over.max(0) > -0.05).any()  # some joint did get to its limit
 
 
@@ -190,20 +190,21 @@ def test_it_stands_walks_a_metre_stops_and_turns(name, folder):
     stood = motion.pos_w[5:56, 0, :2] - motion.pos_w[5, 0, :2]
     assert np.linalg.norm(stood, axis=1).max() < 0.03
     assert np.ptp(motion.yaw_rad[5:56, 0]) < math.radians(1)
-    # Walks a metre and more, less than 45 degrees off, at the commanded speed within 35 %.
+    # Walks a metre and more, less than 45 degrees off, at the commanded speed within 35 % (the Ant and Minitaur within 20 %).
     end = round(walk_s / 0.1)
     x, y = motion.pos_w[end, 1, :2]
     assert x > 1.0 and abs(y) < 0.5 * x
-    assert math.hypot(x, y) / (v * walk_s) == pytest.approx(1.0, abs=0.35)
+    within = 0.35 if name == "humanoid" else 0.2
+    assert math.hypot(x, y) / (v * walk_s) == pytest.approx(1.0, abs=within)
     # Stops; the Humanoid goes on shifting its feet.
     left = np.linalg.norm(motion.pos_w[-1, 1, :2] - motion.pos_w[-11, 1, :2])
     assert left < (0.2 if name == "humanoid" else 0.01)
-    # Turns both ways at the commanded rate within 35 %, without leaving the spot by more than 0.5 m.
+    # Turns both ways at the commanded rate within the same, on the spot; the Humanoid's wanders.
     seconds = 0.1 * (steps - 10)
     for run, sign in ((2, 1.0), (3, -1.0)):
         turned = motion.yaw_rad[-1, run] - motion.yaw_rad[10, run]
-        assert turned / (sign * w * seconds) == pytest.approx(1.0, abs=0.35)
-        assert np.linalg.norm(motion.pos_w[:, run, :2], axis=1).max() < 0.5
+        assert turned / (sign * w * seconds) == pytest.approx(1.0, abs=within)
+        assert np.linalg.norm(motion.pos_w[:, run, :2], axis=1).max() < (0.8 if name == "humanoid" else 0.2)
     # An arc to the left ends on the left.
     assert motion.yaw_rad[-1, 4] > 0.3 and motion.pos_w[30, 4, 0] > 0
 
