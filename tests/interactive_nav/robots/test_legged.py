@@ -190,7 +190,7 @@ def test_it_stands_walks_a_metre_stops_and_turns(name, folder):
     stood = motion.pos_w[5:56, 0, :2] - motion.pos_w[5, 0, :2]
     assert np.linalg.norm(stood, axis=1).max() < 0.03
     assert np.ptp(motion.yaw_rad[5:56, 0]) < math.radians(1)
-    # Walks a metre and more, less than 45 degrees off, at the commanded speed within 35 % (the Ant and Minitaur within 20 %).
+    # Walks a metre and more, less than 45 degrees off, at the commanded speed within 20 % (the Humanoid 35 %).
     end = round(walk_s / 0.1)
     x, y = motion.pos_w[end, 1, :2]
     assert x > 1.0 and abs(y) < 0.5 * x
