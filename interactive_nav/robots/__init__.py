@@ -5,10 +5,20 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 
+from interactive_nav.robots.ant import ant
+from interactive_nav.robots.humanoid import humanoid
+from interactive_nav.robots.minitaur import minitaur
+from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.robots.turtlebot import turtlebot
 
-_FACTORIES: dict[str, Callable[[str], RobotSpec]] = {"turtlebot": turtlebot}
+_FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
+    "ant": ant,
+    "humanoid": humanoid,
+    "minitaur": minitaur,
+    "quadrotor": quadrotor,
+    "turtlebot": turtlebot,
+}
 """Name -> control mode -> spec."""
 
 

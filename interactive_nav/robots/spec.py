@@ -93,6 +93,16 @@ class RobotSpec:
     """The control law runs at every physics step, not once a control period."""
     twist: TwistMap | None = None
     """None: scripted drivers cannot drive this mode."""
+    kind: str = "wheeled"
+    """'wheeled', 'legged' or 'flying': which evidence applies."""
+    mass_kg: float | None = None
+    """Mass by the robot's data sheet or URDF; none: not checked against the model's."""
+    size_m: tuple[float, float, float] | None = None
+    """Length, width, height of the body at its home pose."""
+    drive_type: str = ""
+    """How it moves, in words."""
+    source: str = ""
+    """Where the figures come from."""
 
     @property
     def action_size(self) -> int:

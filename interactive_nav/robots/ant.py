@@ -1,0 +1,184 @@
+"""Ant: nothing in, its `RobotSpec` out.
+
+Shape and joints are those of the MuJoCo and GibsonEnv Ant (`ant.xml`) at GibsonEnv's default scale of 0.25:
+at full size it is 1.39 m wide and passes no door. Two readings of that file's mass exist, 0.911 kg (MuJoCo,
+density 5) and 182 kg (PyBullet, density 1000), both at scale 1. Ours is the second at scale 0.25: 182 / 4^3 =
+2.85 kg. Torques follow gravity's, which goes with the fourth power of the scale: the original's 250 N m become
+250 / 4^4 = 0.98 N m, twice what the ankles need to stand.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import mujoco
+
+from interactive_nav.robots.gait import (
+    Gait,
+    Servo,
+    add_servos,
+    attach,
+    check_mode,
+    gait_law,
+    joint_command_range,
+    joint_units,
+)
+from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
+
+SCALE = 0.25
+TORQUE_NM = 250.0 * SCALE**4
+HOME_ANKLE_RAD = 1.0
+JOINTS = tuple(f"ant_{part}_{i}" for i in range(1, 5) for part in ("hip", "ankle"))
+_ANKLE_SIGN = (1.0, -1.0, -1.0, 1.0)
+_HIP_RANGE = (-math.radians(40.0), math.radians(40.0))
+_ANKLE_RANGE = (math.radians(30.0), math.radians(100.0))
+_MODES = ("native", "position", "velocity", "twist")
+MAX_LINEAR_M_S = 0.2
+MAX_ANGULAR_RAD_S = 0.8
+
+
+def _ankle_range(sign: float) -> tuple[float, float]:
+    low, high = _ANKLE_RANGE
+    return (low, high) if sign > 0 else (-high, -low)
+
+
+def _leg(i: int, x: int, y: int) -> str:
+    stub, reach = 0.2 * SCALE, 0.4 * SCALE
+    low, high = _ankle_range(_ANKLE_SIGN[i - 1])
+    # Legs on one diagonal share an ankle axis, so that the sign of "down" alternates.
+    axis = "-1 1 0" if x == y else "1 1 0"
+    return f"""
+      <geom name="stub_{i}" class="ant_limb" fromto="0 0 0 {x * stub} {y * stub} 0"/>
+      <body name="leg_{i}" pos="{x * stub} {y * stub} 0">
+        <joint name="hip_{i}" class="ant" axis="0 0 1" range="{_HIP_RANGE[0]} {_HIP_RANGE[1]}"/>
+        <geom name="upper_{i}" class="ant_limb" fromto="0 0 0 {x * stub} {y * stub} 0"/>
+        <body name="shin_{i}" pos="{x * stub} {y * stub} 0">
+          <joint name="ankle_{i}" class="ant" axis="{axis}" range="{low} {high}"/>
+          <geom name="lower_{i}" class="ant_limb" fromto="0 0 0 {x * reach} {y * reach} 0"/>
+        </body>
+      </body>"""
+
+
+MJCF = f"""
+<mujoco model="ant">
+  <compiler angle="radian"/>
+  <default>
+    <default class="ant">
+      <joint type="hinge" armature="0.002" damping="0.01" actuatorfrcrange="{-TORQUE_NM} {TORQUE_NM}"/>
+      <geom contype="0" conaffinity="1" density="1000" friction="1.5 0.005 0.0001" group="3"/>
+      <default class="ant_limb">
+        <geom type="capsule" size="{0.08 * SCALE}"/>
+      </default>
+    </default>
+  </default>
+  <worldbody>
+    <body name="torso" childclass="ant">
+      <freejoint name="free"/>
+      <geom name="torso" type="sphere" size="{0.25 * SCALE}"/>
+      <site name="eyes" size="0.005"/>
+      <camera name="eyes" xyaxes="0 -1 0 0 0 1" fovy="120"/>
+      {_leg(1, 1, 1)}
+      {_leg(2, -1, 1)}
+      {_leg(3, -1, -1)}
+      {_leg(4, 1, -1)}
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""Limbs collide with everything but each other."""
+
+_SERVO = Servo(stiffness=9.0, damping=0.4, velocity_gain=0.2)
+_HOME = tuple(v for sign in _ANKLE_SIGN for v in (0.0, sign * HOME_ANKLE_RAD))
+_RANGES = tuple(r for sign in _ANKLE_SIGN for r in (_HIP_RANGE, _ankle_range(sign)))
+
+
+_FREQUENCY_HZ = 2.3
+_LIFT_RAD = 0.325
+_PRESS = 0.1
+"""Legs on the ground push down by this share of the lift."""
+_STRIDE_GAIN, _TURN_GAIN = 1.07, 1.16
+"""Over the kinematic sweep: for servos that lag and feet that slip. All five by a random search for tracking."""
+_REACH_M = 0.104
+"""Forward travel of a foot per radian of its hip, at home."""
+
+
+def _reference(phase, command, base, xp):
+    """Trot: diagonal pairs swing half a cycle apart; a leg in swing lifts its ankle. Offsets from home, [..., 8]."""
+    del base
+    forward, turn = command[..., 0], command[..., 1]
+    effort = xp.clip(8.0 * xp.abs(forward) + 2.0 * xp.abs(turn), 0.0, 1.0)
+    offsets = []
+    for sign, (x, y) in zip(_ANKLE_SIGN, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True):
+        at = phase + (0.0 if x * y > 0 else math.pi)
+        # A foot on the left (y > 0) goes forward when its hip turns clockwise, one on the right the other way.
+        sweep = (_TURN_GAIN * turn - y * _STRIDE_GAIN * forward / _REACH_M) / (4.0 * _FREQUENCY_HZ)
+        offsets.append(-sweep * xp.cos(at))
+        offsets.append(-sign * _LIFT_RAD * effort * (xp.maximum(xp.sin(at), 0.0) - _PRESS))
+    return xp.stack(offsets, -1)
+
+
+GAIT = Gait(
+    robot="ant",
+    joints=JOINTS,
+    home=_HOME,
+    ranges=_RANGES,
+    action_scale=(0.5,) * 8,
+    frequency_hz=_FREQUENCY_HZ,
+    reference=_reference,
+    tracked=tuple(range(8)),
+    max_linear_m_s=MAX_LINEAR_M_S,
+    max_angular_rad_s=MAX_ANGULAR_RAD_S,
+    servo=_SERVO,
+    torque_nm=(TORQUE_NM,) * 8,
+    fall_height_m=0.26 * SCALE,
+)
+
+
+def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
+    attach(spec, MJCF, "ant_")
+    add_servos(spec, JOINTS, mode, _SERVO, (TORQUE_NM,) * 8, _RANGES)
+
+
+def ant(control_mode: str = "native") -> RobotSpec:
+    """The Ant's spec.
+
+    Args:
+        control_mode: `native`, eight joint torques (hip, ankle of legs 1 to 4: front left, back left, back
+            right, front right); `position` or `velocity` of each joint; or `twist`, linear and angular
+            velocity of the base through its gait.
+
+    Raises:
+        ValueError: unknown mode.
+    """
+    check_mode("ant", control_mode, _MODES)
+    twist = control_mode == "twist"
+    low, high = joint_command_range(control_mode, (TORQUE_NM,) * 8, _RANGES, 8.0)
+    if twist:
+        low, high = GAIT.command_range()
+    return RobotSpec(
+        name="ant",
+        add_to=functools.partial(_add_to, mode=control_mode),
+        base_body="ant_torso",
+        base_joint="ant_free",
+        actuators=JOINTS,
+        action_low=low,
+        action_high=high,
+        action_names=joint_units(JOINTS, control_mode),
+        body_width_m=1.39 * SCALE,
+        footprint_radius_m=0.25,
+        height_m=0.21,
+        spawn_height_m=(0.4 * math.sqrt(2.0) * math.sin(HOME_ANKLE_RAD) + 0.08) * SCALE,
+        camera=Camera("ant_torso", (0.0, 0.0, 0.0)),
+        home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
+        kind="legged",
+        mass_kg=182.2 * SCALE**3,
+        size_m=(1.39 * SCALE, 1.39 * SCALE, 0.81 * SCALE),
+        drive_type="4 legs, 8 hinges",
+        source="MuJoCo and GibsonEnv ant.xml at scale 0.25, PyBullet's density",
+        control_mode=control_mode,
+        control_modes=_MODES,
+        control=gait_law(GAIT) if twist else None,
+        control_every_substep=twist,
+        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
+    )

@@ -1,0 +1,241 @@
+"""Quadrotor: nothing in, its `RobotSpec` out.
+
+Mass (0.5 kg), inertia, rotor arms (0.175 m along +x, +y, -x, -y), thrust (0 to 10 N a rotor) and rotor torque
+(+/- 0.0245 N m per N, + on the x rotors) are those of GibsonEnv's `quadrotor.urdf`; rotors follow their command at
+once. The flight controller is ours and runs at every physics step: velocity error -> acceleration -> tilt and total
+thrust -> angular rate -> torque -> four thrusts.
+
+The original moved the base kinematically: gravity off in the whole scene, six base velocities set. Mode `kinematic`
+offers that without touching the scene: the robot alone is weightless, and six velocity servos act on its base.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import mujoco
+import numpy as np
+
+from interactive_nav.robots.gait import GRAVITY_M_S2, check_mode, rotate_to_body
+from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap
+
+MASS_KG = 0.5
+INERTIA = (0.0023, 0.0023, 0.004)
+ARM_M = 0.175
+MAX_THRUST_N = 10.0
+TORQUE_PER_THRUST_M = 0.0245
+HOVER_HEIGHT_M = 0.8
+ROTORS = tuple(f"quadrotor_rotor_{place}" for place in ("front", "left", "back", "right"))
+_ROTOR_POS = ((ARM_M, 0.0), (0.0, ARM_M), (-ARM_M, 0.0), (0.0, -ARM_M))
+_SPIN = (1.0, -1.0, 1.0, -1.0)
+_AXES = tuple(f"quadrotor_{kind}_{axis}" for kind in ("linear", "angular") for axis in "xyz")
+_MODES = ("native", "velocity", "rate", "thrust", "kinematic", "twist")
+
+MAX_SPEED_M_S = 1.0
+MAX_CLIMB_M_S = 0.5
+MAX_YAW_RAD_S = 1.5
+MAX_RATE_RAD_S = 3.0
+MAX_TILT_RAD = 0.4
+_ALTITUDE_GAIN = 1.5
+_VELOCITY_GAIN = 2.0
+_TILT_GAIN = 5.0
+_RATE_GAIN = 16.0
+"""1/s each, ours; a loop is about a third as fast as the one inside it, and the innermost keeps clear of 1 / 0.02 s."""
+
+_MIXER = np.linalg.inv(
+    [
+        [1.0, 1.0, 1.0, 1.0],
+        [y for _, y in _ROTOR_POS],
+        [-x for x, _ in _ROTOR_POS],
+        [spin * TORQUE_PER_THRUST_M for spin in _SPIN],
+    ]
+)
+"""(total thrust, torque about x, y, z) to four thrusts."""
+
+
+def _body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+    base = spec.worldbody.add_body(name="quadrotor", pos=[0.0, 0.0, 0.0])
+    base.add_freejoint(name="quadrotor_free")
+    base.explicitinertial = True
+    base.mass, base.inertia, base.ipos = MASS_KG, list(INERTIA), [0.0, 0.0, 0.0]
+
+    def collide(name: str, **kwargs) -> None:
+        base.add_geom(name=name, group=3, mass=0.0, friction=[0.5, 0.005, 0.0001], contype=0, conaffinity=1, **kwargs)
+
+    collide("quadrotor_hull", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.08, 0.08, 0.04])
+    for axis, tip in (("x", [ARM_M, 0.0, 0.0]), ("y", [0.0, ARM_M, 0.0])):
+        collide(
+            f"quadrotor_arm_{axis}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[-tip[0], -tip[1], 0.0, *tip],
+            size=[0.015, 0.0, 0.0],
+        )
+    for name, (x, y) in zip(ROTORS, _ROTOR_POS, strict=True):
+        # The guard of a rotor: a box of the propeller's sweep, which is half of what the arms leave.
+        collide(f"{name}_guard", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.121, 0.121, 0.02], pos=[x, y, 0.03])
+        base.add_site(name=name, pos=[x, y, 0.03], size=[0.01] * 3)
+    base.add_site(name="quadrotor_centre", size=[0.01] * 3)
+    base.add_site(name="quadrotor_eyes", pos=[0.0, 0.05, -0.05], size=[0.005] * 3)
+    base.add_camera(name="quadrotor_eyes", pos=[0.0, 0.05, -0.05], quat=[0.5, 0.5, -0.5, -0.5], fovy=120.0)
+    return base
+
+
+def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
+    base = _body(spec)
+    if mode == "kinematic":
+        base.gravcomp = 1.0
+        # Servos in the base frame; a velocity error halves within a physics step.
+        for k, name in enumerate(_AXES):
+            gear = [0.0] * 6
+            gear[k] = 1.0
+            gain = 30.0 * (MASS_KG if k < 3 else INERTIA[k - 3])
+            spec.add_actuator(
+                name=name,
+                target="quadrotor_centre",
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                gear=gear,
+                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                gainprm=[gain] + [0.0] * 9,
+                biasprm=[0.0, 0.0, -gain] + [0.0] * 7,
+            )
+        return
+    for name, spin in zip(ROTORS, _SPIN, strict=True):
+        spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_SITE,
+            gear=[0.0, 0.0, 1.0, 0.0, 0.0, spin * TORQUE_PER_THRUST_M],
+            ctrllimited=True,
+            ctrlrange=[0.0, MAX_THRUST_N],
+        )
+
+
+def _thrusts(acceleration_up, angular_acceleration, xp):
+    """Body-frame specific thrust [...] and angular acceleration [..., 3] to four thrusts [..., 4] in 0 .. 10 N."""
+    torque = angular_acceleration * xp.asarray(INERTIA)
+    wrench = xp.concatenate([MASS_KG * acceleration_up[..., None], torque], -1)
+    return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
+
+
+def _fly_rates(rates, thrust_n, state, xp):
+    return _thrusts(thrust_n / MASS_KG, _RATE_GAIN * (rates - state.qvel[..., 3:6]), xp)
+
+
+def _rate_law(command, state, xp):
+    """(roll, pitch, yaw rate rad/s, total thrust N) to thrusts."""
+    return _fly_rates(command[..., :3], command[..., 3], state, xp)
+
+
+def _velocity_law(command, state, xp):
+    """(vx, vy, vz m/s along the heading, yaw rate rad/s) to thrusts."""
+    quat, velocity_w = state.qpos[..., 3:7], state.qvel[..., :3]
+    w, x, y, z = (quat[..., k] for k in range(4))
+    heading = xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    cos, sin = xp.cos(heading), xp.sin(heading)
+    wanted_w = xp.stack(
+        [
+            cos * command[..., 0] - sin * command[..., 1],
+            sin * command[..., 0] + cos * command[..., 1],
+            command[..., 2],
+        ],
+        -1,
+    )
+    lift = _VELOCITY_GAIN * (wanted_w - velocity_w)
+    most = GRAVITY_M_S2 * math.tan(MAX_TILT_RAD)
+    across = xp.clip(lift[..., :2], -most, most)
+    up = xp.clip(lift[..., 2:], -0.5 * GRAVITY_M_S2, GRAVITY_M_S2) + GRAVITY_M_S2
+    thrust_w = xp.concatenate([across, up], -1)
+    size = xp.sqrt((thrust_w**2).sum(-1, keepdims=True))
+    # The thrust axis in the body frame is z; turning it onto the wanted direction d takes z x d.
+    d = rotate_to_body(quat, thrust_w / size, xp)
+    yaw_rate_w = xp.stack([0 * w, 0 * w, command[..., 3]], -1)
+    rates = rotate_to_body(quat, yaw_rate_w, xp) + _TILT_GAIN * xp.stack([-d[..., 1], d[..., 0], 0 * w], -1)
+    thrust = MASS_KG * size[..., 0] * xp.maximum(d[..., 2], 0.0)
+    return _fly_rates(xp.clip(rates, -MAX_RATE_RAD_S, MAX_RATE_RAD_S), thrust, state, xp)
+
+
+def _twist_law(command, state, xp):
+    """(forward m/s, yaw rate rad/s) to thrusts, at the hover height."""
+    climb = xp.clip(_ALTITUDE_GAIN * (HOVER_HEIGHT_M - state.qpos[..., 2]), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
+    zero = xp.zeros_like(climb)
+    return _velocity_law(xp.stack([command[..., 0], zero, climb, command[..., 1]], -1), state, xp)
+
+
+_VELOCITY = ("vx m/s", "vy m/s", "vz m/s", "yaw rate rad/s")
+_TABLE: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...], ControlLaw | None]] = {
+    "velocity": (
+        _VELOCITY,
+        (-MAX_SPEED_M_S, -MAX_SPEED_M_S, -MAX_CLIMB_M_S, -MAX_YAW_RAD_S),
+        (MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_CLIMB_M_S, MAX_YAW_RAD_S),
+        _velocity_law,
+    ),
+    "rate": (
+        ("roll rate rad/s", "pitch rate rad/s", "yaw rate rad/s", "total thrust N"),
+        (-MAX_RATE_RAD_S, -MAX_RATE_RAD_S, -MAX_YAW_RAD_S, 0.0),
+        # Action 0 hovers: the middle of the range is the weight.
+        (MAX_RATE_RAD_S, MAX_RATE_RAD_S, MAX_YAW_RAD_S, 2 * MASS_KG * GRAVITY_M_S2),
+        _rate_law,
+    ),
+    "thrust": (tuple(f"{name[16:]} rotor N" for name in ROTORS), (0.0,) * 4, (MAX_THRUST_N,) * 4, None),
+    "kinematic": (
+        ("vx m/s", "vy m/s", "vz m/s", "roll rate rad/s", "pitch rate rad/s", "yaw rate rad/s"),
+        (-1.0,) * 6,
+        (1.0,) * 6,
+        None,
+    ),
+    "twist": (
+        ("forward m/s", "yaw rate rad/s"),
+        (-MAX_SPEED_M_S, -MAX_YAW_RAD_S),
+        (MAX_SPEED_M_S, MAX_YAW_RAD_S),
+        _twist_law,
+    ),
+}
+"""Mode -> action names, commands at -1 and +1, control law."""
+
+
+def quadrotor(control_mode: str = "native") -> RobotSpec:
+    """The Quadrotor's spec.
+
+    Args:
+        control_mode: `velocity`, also called `native`: velocity along the heading and yaw rate, flown physically;
+            `twist`: forward velocity and yaw rate at a height of 0.8 m; `rate`: angular rates and total thrust;
+            `thrust`: four rotor thrusts; `kinematic`: the original's six base velocities, without gravity.
+
+    Raises:
+        ValueError: unknown mode.
+    """
+    check_mode("quadrotor", control_mode, _MODES)
+    names, low, high, law = _TABLE["velocity" if control_mode == "native" else control_mode]
+    drive = {
+        "velocity": ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 1.0)),
+        "kinematic": ((1.0, 0.0), *((0.0, 0.0),) * 4, (0.0, 1.0)),
+        "twist": ((1.0, 0.0), (0.0, 1.0)),
+    } | {"native": ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 1.0))}
+    matrix = drive.get(control_mode)
+    return RobotSpec(
+        name="quadrotor",
+        add_to=functools.partial(_add_to, mode=control_mode),
+        base_body="quadrotor",
+        base_joint="quadrotor_free",
+        actuators=_AXES if control_mode == "kinematic" else ROTORS,
+        action_low=low,
+        action_high=high,
+        action_names=names,
+        body_width_m=0.592,
+        footprint_radius_m=0.32,
+        height_m=HOVER_HEIGHT_M + 0.1,
+        spawn_height_m=HOVER_HEIGHT_M,
+        camera=Camera("quadrotor", (0.0, 0.05, -0.05)),
+        kind="flying",
+        mass_kg=MASS_KG,
+        size_m=(0.592, 0.592, 0.09),
+        drive_type="4 rotors",
+        source="GibsonEnv quadrotor.urdf",
+        control_mode=control_mode,
+        control_modes=_MODES,
+        control=law,
+        control_every_substep=law is not None,
+        twist=None if matrix is None else TwistMap(matrix, high[0], high[-1]),
+    )
