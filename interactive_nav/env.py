@@ -271,7 +271,7 @@ class InteractiveNav(Env):
         layout, tables = self.world.layout, self.tables
         com = tables.com_m[scene]
         out = jnp.zeros((layout.num_slots, 3))
-        hinged = np.asarray([kind == "hinge" for kind in layout.slot_kind])
+        hinged = np.asarray([kind == "hinge" for kind in layout.slot_kind], bool)
         free = np.flatnonzero(~hinged)
         if len(free):
             pose = physics.qpos[layout.slot_qpos[free][:, None] + np.arange(7)]
