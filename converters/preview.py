@@ -36,7 +36,7 @@ MARGIN_M = 0.3
 SURFACE_PIXELS = 480
 """Longer side of a surface's picture; a panel is about as large on the page."""
 DPI = 100
-PALETTE = 112
+SURFACE_COLOURS = 64
 TRAVERSABLE = (0.85, 0.94, 0.85)
 WALL = (0.75, 0.75, 0.75)
 
@@ -84,6 +84,19 @@ def _view_from_above(
     image = np.full((shape[0] * shape[1], 3), 255, np.uint8)
     image[flat[order]] = colours[inside][order]  # later (higher) points overwrite earlier ones
     return image.reshape(*shape, 3)
+
+
+def _palette(views: list[np.ndarray]) -> Image.Image:
+    """A palette image: the views' own commonest colours beside those that the panels draw with."""
+    surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
+    own = surface.quantize(SURFACE_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    ground, flat = np.array(TRAVERSABLE), np.array(list(CATEGORY_COLOURS.values()))[:, :3]
+    drawn = [np.outer(np.linspace(0, 1, 12), np.ones(3)), ground[None], np.array(WALL)[None]]
+    drawn += [flat * light for light in (0.55, 0.75, 1.0)] + [ground + (flat - ground) * a for a in (0.3, 0.51, 0.66)]
+    chart = np.rint(255 * np.vstack(drawn)).astype(int).ravel().tolist()
+    image = Image.new("P", (1, 1))
+    image.putpalette((own[: 3 * SURFACE_COLOURS] + chart)[: 3 * 256])
+    return image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,8 +243,12 @@ def read_source(source: Path, manifest: SceneManifest) -> RawScene:
     return raw
 
 
-def draw(scene: _Scene, raw: RawScene | None, target: Path) -> None:
-    """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes."""
+def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
+    """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes.
+
+    Returns:
+        A palette that suits the picture.
+    """
     left, right, bottom, top = scene.extent
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
     columns, height = (3, 4.6) if raw is not None else (2, 4.2)
@@ -268,6 +285,7 @@ def draw(scene: _Scene, raw: RawScene | None, target: Path) -> None:
     figure.tight_layout(rect=(0, 0.03, 1, 0.985))
     figure.savefig(target, metadata={"Software": None})
     plt.close(figure)
+    return _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
@@ -295,8 +313,8 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     mujoco.mj_forward(model, data)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".preview-") as scratch:
         picture = Path(scratch) / "preview.png"
-        draw(_Scene(folder, model, data, manifest, maps), raw, picture)
+        palette = draw(_Scene(folder, model, data, manifest, maps), raw, picture)
         with Image.open(picture) as image:
-            few = image.convert("RGB").quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+            few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
             few.save(picture, optimize=True)
         picture.replace(target)

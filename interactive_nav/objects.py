@@ -109,7 +109,7 @@ def _shoe(name: str, length: float, width: float, mass: float, colour: Rgba, upp
         Shape("box", (0, 0, 0.010), (0.40 * length, 0.46 * width, 0.010), sole),
         Shape("cylinder", (0.36 * length, 0, 0.010), (0.46 * width, 0.010), sole),
         Shape("cylinder", (-0.38 * length, 0, 0.010), (0.42 * width, 0.010), sole),
-        Shape("ellipsoid", (0.20 * length, 0, 0.026), (0.29 * length, 0.46 * width, 0.032), colour),
+        Shape("ellipsoid", (0.20 * length, 0, 0.034), (0.29 * length, 0.46 * width, 0.032), colour),
         Shape("ellipsoid", (-0.22 * length, 0, 0.5 * top), (0.27 * length, 0.43 * width, 0.5 * top), colour),
         Shape(
             "ellipsoid", (-0.25 * length, 0, top - 0.012), (0.17 * length, 0.27 * width, 0.014), _darker(colour, 0.3)

@@ -6,6 +6,9 @@ import dataclasses
 
 from converters.generate.cad import LIBRARY, TRAIN_MODELS
 
+NAMES = ("models", "passage_chairs")
+"""Settings that are names of CAD models, not ranges."""
+
 
 class GenerationError(ValueError):
     """A building that cannot be generated; the message says what, where, what was expected and what to do."""
@@ -58,6 +61,8 @@ class BuildingConfig:
     leaf_wall_gap_m: float = 0.08
     """Least room between an open leaf's edge and the wall beside it. The converter takes walls within 0.04 m of
     a leaf's sweep, annotation errors included, for the leaf."""
+    leaf_proud_m: float = 0.0
+    """How far before the wall's face the hinges stand: an open leaf that is annotated 1 cm off clears the wall."""
     leaves_at_walls: bool = False
     """Leaves only where a side wall is close behind the hinge, never into a corridor or before another doorway:
     robots that pass seldom catch them. Needs `corner_doorways` to be found often."""
@@ -70,6 +75,9 @@ class BuildingConfig:
     or go round."""
     blocker_gap_m: tuple[float, float] = (0.05, 0.32)
     """Width of the widest passage left beside such a chair."""
+    passage_chairs: tuple[str, ...] = ()
+    """Names of the chair models that may narrow a doorway; empty: all chairs of `models`. Light ones can be pushed
+    by a small robot."""
     robot_radius_m: float = 0.18
     """A disc of this radius reaches every room with the furniture (but for blockers) where it stands."""
     scale_jitter: float = 0.08
@@ -99,7 +107,7 @@ class BuildingConfig:
         """
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, tuple) and field.name != "models" and not 0 <= value[0] <= value[1]:
+            if isinstance(value, tuple) and field.name not in NAMES and not 0 <= value[0] <= value[1]:
                 raise GenerationError(f"{field.name} is {value}: expected 0 <= lowest <= highest")
             if isinstance(value, int | float) and value < 0:
                 raise GenerationError(f"{field.name} is {value}: expected a number that is not negative")
@@ -116,9 +124,12 @@ class BuildingConfig:
                 f"n_bottlenecks is {self.n_bottlenecks} and n_blockers {self.n_blockers} but n_chairs may be "
                 f"{self.n_chairs[0]}: each bottleneck needs a chair; raise n_chairs"
             )
-        unknown = sorted(set(self.models) - set(LIBRARY))
+        unknown = sorted({*self.models, *self.passage_chairs} - set(LIBRARY))
         if unknown:
             raise GenerationError(f"unknown CAD models {unknown}: known are {sorted(LIBRARY)}")
+        strange = [m for m in self.passage_chairs if m not in self.models or LIBRARY[m].category != "chair"]
+        if strange:
+            raise GenerationError(f"passage_chairs names {strange}: expected chairs that `models` has")
         for category in ("chair", "table", "desk", "sofa", "door"):
             wanted = getattr(self, f"n_{category}s")[1]
             if wanted and not any(LIBRARY[m].category == category for m in self.models):

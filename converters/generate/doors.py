@@ -19,8 +19,17 @@ AJAR_RAD = math.radians(3.0)
 """A leaf stands at least this far from the end of its swing."""
 
 
-def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: bool, open_rad: float,
-              plan: Plan, lift_m: float, wall_gap_m: float = 0.08) -> tuple[Instance, shapely.Polygon]:  # fmt: skip
+def door_leaf(
+    doorway: Doorway,
+    model: CadModel,
+    high_side: bool,
+    high_jamb: bool,
+    open_rad: float,
+    plan: Plan,
+    lift_m: float,
+    wall_gap_m: float = 0.08,
+    proud_m: float = 0.0,
+) -> tuple[Instance, shapely.Polygon]:
     """Hangs an open leaf into a doorway.
 
     The hinge line is the leaf's edge at the jamb, flush with the wall's face on the side it opens to. Closed,
@@ -35,6 +44,7 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
         plan: for the wall that ends its swing.
         lift_m: gap below the leaf.
         wall_gap_m: left between the fully open leaf and the wall beside it; the handle stands in it.
+        proud_m: how far before the wall's face the hinge line stands.
 
     Returns:
         The leaf as it stands, and the floor area that it sweeps from closed to fully open.
@@ -49,6 +59,7 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
     closed[along] = -1.0 if high_jamb else 1.0
     into = np.zeros(2)
     into[axis] = 1.0 if high_side else -1.0
+    hinge += proud_m * into
     # Opening turns `closed` towards `into`; the sign says which way round that is, seen from above.
     sign = float(np.sign(closed[0] * into[1] - closed[1] * into[0]))
     width, height = doorway.width_m - 2 * DOOR_GAP_M, doorway.height_m - 0.02 - lift_m

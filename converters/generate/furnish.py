@@ -37,9 +37,11 @@ class _Room:
         self.room_of: list[int] = []
         self.drawn: Counter[str] = Counter()
 
-    def draw_model(self, category: str, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[CadModel, np.ndarray]:
+    def draw_model(
+        self, category: str, cfg: BuildingConfig, rng: np.random.Generator, among: tuple[str, ...] = ()
+    ) -> tuple[CadModel, np.ndarray]:
         """One of the category's models that were drawn least so far, and its scale (CAD units -> metres)."""
-        names = [m for m in cfg.models if LIBRARY[m].category == category]
+        names = [m for m in among or cfg.models if LIBRARY[m].category == category]
         least = min(self.drawn[m] for m in names)
         names = [m for m in names if self.drawn[m] == least]
         model = cad_model(names[rng.integers(len(names))])
@@ -143,7 +145,7 @@ def _narrow(
         here = masks[0] | masks[1] | room_mask(before, d.rect) if local else np.ones_like(before)
         if int(k) in used or not passes(clearance(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
             continue
-        model, scale = state.draw_model("chair", cfg, rng)
+        model, scale = state.draw_model("chair", cfg, rng, cfg.passage_chairs)
         for _ in range(25):
             side = int(rng.integers(2))
             xy = np.array(d.rect.centre)
@@ -174,7 +176,8 @@ def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generat
             continue
         opened = math.radians(rng.uniform(*cfg.door_open_deg))
         lift_m = rng.uniform(*DOOR_BOTTOM_M)
-        leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, lift_m, cfg.leaf_wall_gap_m)
+        gaps_m = cfg.leaf_wall_gap_m, cfg.leaf_proud_m
+        leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, lift_m, *gaps_m)
         if any(sweep.intersects(t) for t in (*state.taken, *state.kept_free[len(plan.doorways) :])):
             continue
         others = [z for j, z in enumerate(state.kept_free[: len(plan.doorways)]) if j != k]

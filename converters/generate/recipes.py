@@ -18,7 +18,7 @@ import yaml
 
 from converters.generate import generate_building
 from converters.generate.cad import TEST_MODELS, TRAIN_MODELS
-from converters.generate.config import BuildingConfig, GenerationError
+from converters.generate.config import NAMES, BuildingConfig, GenerationError
 from converters.pipeline import ConvertConfig, convert
 from converters.preview import preview
 
@@ -48,7 +48,7 @@ class Recipes:
     """Content of a recipe file."""
 
     scenes: tuple[SceneRecipe, ...]
-    conversion: dict[str, int]
+    conversion: dict[str, Any]
     """Settings of `ConvertConfig` that all scenes share: how large meshes and textures may be."""
 
 
@@ -66,7 +66,11 @@ def _building(settings: dict[str, Any], split: str, where: str) -> BuildingConfi
     _refuse_unknown(settings, fields, where)
     values: dict[str, Any] = {}
     for key, value in settings.items():
-        if isinstance(fields[key], tuple):
+        if key in NAMES:
+            if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+                raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
+            value = tuple(value)
+        elif isinstance(fields[key], tuple):
             pair = value if isinstance(value, list) else [value, value]
             if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
                 raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
@@ -132,7 +136,7 @@ def load_recipes(path: Path) -> Recipes:
     return parse_recipes(data, str(path))
 
 
-def make_scene(recipe: SceneRecipe, conversion: dict[str, int], folder: Path, jobs: int, report: Report) -> list[str]:
+def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report) -> list[str]:
     """Generates, converts and draws one scene; `folder` appears whole or not at all.
 
     Args:
