@@ -252,7 +252,8 @@ def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
     left, right, bottom, top = scene.extent
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
     columns, height = (3, 4.6) if raw is not None else (2, 4.2)
-    figure, grid = plt.subplots(2, columns, figsize=(columns * height * max(ratio, 0.6), 2 * height + 0.7), dpi=DPI)
+    width = max(columns * height * ratio, 7.0)  # the legend's
+    figure, grid = plt.subplots(2, columns, figsize=(width, 2 * height + 0.7), dpi=DPI)
     panels = list(grid.ravel())
 
     if raw is not None:
