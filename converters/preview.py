@@ -25,7 +25,6 @@ from scipy.spatial import ConvexHull
 from converters.cut import cut_furniture
 from converters.emit import CATEGORY_COLOURS
 from converters.files import read_image, read_textured_obj
-from converters.maps import find_floor_height
 from converters.objects import PlacedObject, convex_hull
 from converters.raw import RawScene, ScanMesh
 from converters.texture import ColourCloud, colour_cloud
@@ -225,22 +224,29 @@ def _visual_cloud(scene: _Scene, stem: str, spacing_m: float) -> ColourCloud:
     return ColourCloud(points, np.zeros_like(points), colours)
 
 
-def read_source(source: Path, manifest: SceneManifest) -> RawScene:
+def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
     """Reads the raw folder that a scene was made from.
+
+    Args:
+        source: the raw folder.
+        manifest: of the scene.
+        floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
 
     Raises:
         SceneRejected: no known layout, or unusable files.
         SceneError: another building than the scene's.
     """
     from converters.pipeline import READERS, detect_format
+    from converters.storeys import split_storeys
 
-    raw = READERS[detect_format(source)][1](source)
+    raw = READERS[detect_format(source)][1](source, False)
     expected = manifest.source.get("sha256", {})
     strange = sorted(k for k in raw.sources if k in expected and raw.sources[k] != expected[k])
     if strange or not set(raw.sources) & set(expected):
         what = f"{strange[0]} differs" if strange else "no file is the same"
         raise SceneError(f"{source}: is not what {manifest.name} was made from ({what}); give its own --source")
-    return raw
+    floors = split_storeys(raw)
+    return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
 
 
 def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
@@ -257,10 +263,7 @@ def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
     panels = list(grid.ravel())
 
     if raw is not None:
-        floor_height_m = raw.floor_height_m
-        if floor_height_m is None:
-            floor_height_m = find_floor_height(raw.scan.vertices, raw.scan.labels)
-        vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height_m]
+        vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
         keep = cut_furniture(vertices_w, raw.scan.faces, raw.scan.labels, _placed(scene)).keep
         for axes, chosen, title in (
             (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
@@ -309,7 +312,7 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
     if not target.parent.is_dir():
         raise SceneError(f"{target.parent}: no such folder; give another -o")
-    raw = read_source(source, manifest) if source is not None else None
+    raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".preview-") as scratch:
