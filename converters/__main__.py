@@ -1,4 +1,4 @@
-"""`python -m converters convert|object|propose|check|generate|preview`: parses, prints, sets exit codes.
+"""`python -m converters convert|object|propose|check|generate|generate-scenes|preview`: parse, print, exit.
 
 Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
 line on stderr), 130 or 143 interrupted.
@@ -200,10 +200,27 @@ def _generate(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.generate.recipes import load_recipes, make_scenes
+
+    recipes = load_recipes(arguments.recipes or arguments.out / "recipes.yaml")
+    with _progress(console) as report:
+        failed = make_scenes(
+            recipes,
+            arguments.out,
+            tuple(arguments.only),
+            arguments.overwrite,
+            arguments.jobs,
+            report,
+            lambda line: console.print(line, soft_wrap=True, highlight=False),
+        )
+    return 1 if any(failed.values()) else 0
+
+
 def _preview(arguments: argparse.Namespace, console: Console) -> int:
     from converters.preview import preview
 
-    preview(arguments.scene, arguments.output)
+    preview(arguments.scene, arguments.output, arguments.source)
     console.print(f"{arguments.output}: picture of {arguments.scene}", soft_wrap=True)
     return 0
 
@@ -357,9 +374,19 @@ def _parser() -> argparse.ArgumentParser:
     generate.add_argument("out", type=Path, metavar="OUT", help="folder to make")
     generate.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
     generate.set_defaults(run=_generate)
-    preview = commands.add_parser("preview", help="draw a scene folder from above")
+    scenes = commands.add_parser(
+        "generate-scenes", help="make the scenes of a recipe file: generate, convert, draw; goes on where it stopped"
+    )
+    scenes.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
+    scenes.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
+    scenes.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
+    scenes.add_argument("--overwrite", action="store_true", help="make those again that are there")
+    scenes.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N")
+    scenes.set_defaults(run=_generate_scenes)
+    preview = commands.add_parser("preview", help="draw a conversion's stages from above")
     preview.add_argument("scene", type=Path, metavar="SCENE_DIR")
     preview.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
+    preview.add_argument("--source", type=Path, metavar="SRC", help="raw folder: draws scan and cut too")
     preview.set_defaults(run=_preview)
     return parser
 

@@ -1,8 +1,13 @@
-"""A scene folder in, one top-down PNG out: textured scene beside its collision shapes."""
+"""A scene folder in, and the raw folder it came from; one PNG of the conversion's stages from above out.
+
+Drawn by matplotlib's Agg, which needs neither display nor GPU.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -12,15 +17,27 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.patches import Patch
 from PIL import Image
 from scipy.spatial import ConvexHull
 
+from converters.cut import cut_furniture
 from converters.emit import CATEGORY_COLOURS
 from converters.files import read_image, read_textured_obj
-from converters.raw import ScanMesh
-from converters.texture import colour_cloud
+from converters.objects import PlacedObject, convex_hull
+from converters.raw import RawScene, ScanMesh
+from converters.texture import ColourCloud, colour_cloud
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+
+MARGIN_M = 0.3
+"""Empty border around the map."""
+SURFACE_PIXELS = 480
+"""Longer side of a surface's picture; a panel is about as large on the page."""
+DPI = 100
+SURFACE_COLOURS = 64
+TRAVERSABLE = (0.85, 0.94, 0.85)
+WALL = (0.75, 0.75, 0.75)
 
 
 def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
@@ -68,93 +85,225 @@ def _view_from_above(
     return image.reshape(*shape, 3)
 
 
-def _frame(axes: Axes, maps: SceneMaps, title: str) -> None:
-    rows, columns = maps.traversable.shape
-    x, y = maps.origin_w
-    side = maps.resolution_m
-    axes.set_xlim(x - 0.3, x + columns * side + 0.3)
-    axes.set_ylim(y - 0.5, y + rows * side + 0.3)
+def _palette(views: list[np.ndarray]) -> Image.Image:
+    """A palette image: the views' own commonest colours beside those that the panels draw with."""
+    surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
+    own = surface.quantize(SURFACE_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    ground, flat = np.array(TRAVERSABLE), np.array(list(CATEGORY_COLOURS.values()))[:, :3]
+    drawn = [np.outer(np.linspace(0, 1, 12), np.ones(3)), ground[None], np.array(WALL)[None]]
+    drawn += [flat * light for light in (0.55, 0.75, 1.0)] + [ground + (flat - ground) * a for a in (0.3, 0.51, 0.66)]
+    chart = np.rint(255 * np.vstack(drawn)).astype(int).ravel().tolist()
+    image = Image.new("P", (1, 1))
+    image.putpalette((own[: 3 * SURFACE_COLOURS] + chart)[: 3 * 256])
+    return image
+
+
+@dataclasses.dataclass(frozen=True)
+class _Scene:
+    """A scene at rest, ready to draw."""
+
+    folder: Path
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    manifest: SceneManifest
+    maps: SceneMaps
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom, top of the map, m."""
+        x, y = self.maps.origin_w
+        rows, columns = self.maps.traversable.shape
+        return x, x + columns * self.maps.resolution_m, y, y + rows * self.maps.resolution_m
+
+
+def _frame(axes: Axes, scene: _Scene, title: str) -> None:
+    left, right, bottom, top = scene.extent
+    axes.set_xlim(left - MARGIN_M, right + MARGIN_M)
+    axes.set_ylim(bottom - 0.5, top + MARGIN_M)
     axes.set_aspect("equal")
     axes.set_title(title, fontsize=10)
     axes.axis("off")
-    axes.plot([x, x + 1.0], [y - 0.3, y - 0.3], color="black", linewidth=3, solid_capstyle="butt")
-    axes.text(x + 0.5, y - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
+    axes.plot([left, left + 1.0], [bottom - 0.3] * 2, color="black", linewidth=3, solid_capstyle="butt")
+    axes.text(left + 0.5, bottom - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
 
 
-def draw(folder: Path, model: mujoco.MjModel, manifest: SceneManifest, maps: SceneMaps, target: Path) -> None:
-    """Draws two panels: the textured scene, and its collision shapes over the traversable area."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    rows, columns = maps.traversable.shape
-    ratio = (columns * maps.resolution_m + 0.6) / (rows * maps.resolution_m + 0.8)
-    height = 6.5
-    figure, (left, right) = plt.subplots(1, 2, figsize=(2 * height * ratio, height + 0.6), dpi=110)
-
-    low = np.array(maps.origin_w) - 0.3
-    size_m = np.array([columns, rows]) * maps.resolution_m + 0.6
-    pixel_m = float(size_m.max()) / 700
-    clouds = [_coloured_points(folder, "structure", pixel_m)]
-    for item in manifest.objects:
-        points, colours = _coloured_points(folder, item.name, pixel_m)
-        body = model.body(item.name).id
-        clouds.append((points @ data.xmat[body].reshape(3, 3).T + data.xpos[body], colours))
+def _draw_surface(axes: Axes, scene: _Scene, sample: Callable[[float], list[ColourCloud]], title: str) -> None:
+    """Coloured surfaces from above; `sample` is told how far apart the points may be."""
+    left, right, bottom, top = scene.extent
+    low = np.array([left, bottom]) - MARGIN_M
+    size_m = np.array([right - left, top - bottom]) + 2 * MARGIN_M
+    pixel_m = float(size_m.max()) / SURFACE_PIXELS
+    clouds = sample(0.9 * pixel_m)
     shape = (int(np.ceil(size_m[1] / pixel_m)), int(np.ceil(size_m[0] / pixel_m)))
-    view = _view_from_above(np.vstack([p for p, _ in clouds]), np.vstack([c for _, c in clouds]), low, shape, pixel_m)
-    left.imshow(
-        view,
-        origin="lower",
-        extent=(low[0], low[0] + shape[1] * pixel_m, low[1], low[1] + shape[0] * pixel_m),
-    )
-    _frame(left, maps, f"{manifest.name}: scan and {len(manifest.objects)} movable objects")
+    points, colours = np.vstack([c.points for c in clouds]), np.vstack([c.colours for c in clouds])
+    view = _view_from_above(points, colours.astype(np.uint8), low, shape, pixel_m)
+    extent = (low[0], low[0] + shape[1] * pixel_m, low[1], low[1] + shape[0] * pixel_m)
+    axes.imshow(view, origin="lower", extent=extent, interpolation="nearest")
+    _frame(axes, scene, title)
 
-    extent = (
-        maps.origin_w[0],
-        maps.origin_w[0] + columns * maps.resolution_m,
-        maps.origin_w[1],
-        maps.origin_w[1] + rows * maps.resolution_m,
-    )
-    shade = np.where(maps.traversable[..., None], [0.85, 0.94, 0.85], [1.0, 1.0, 1.0])
-    right.imshow(shade, origin="lower", extent=extent, interpolation="nearest")
-    category = {o.name: o.category for o in manifest.objects}
-    for name, body, geom in _geoms(model):
+
+def _draw_ground(axes: Axes, scene: _Scene) -> None:
+    """Traversable area and wall boxes."""
+    shade = np.where(scene.maps.traversable[..., None], TRAVERSABLE, 1.0)
+    axes.imshow(shade, origin="lower", extent=scene.extent, interpolation="nearest")
+    for name, _, geom in _geoms(scene.model):
         if name.startswith("wall_"):
-            right.fill(*_outline(model, data, geom).T, facecolor="0.75", edgecolor="0.45", linewidth=0.4)
-        elif "_hull_" in name and body in category:
-            colour = CATEGORY_COLOURS[category[body]]
-            right.fill(*_outline(model, data, geom).T, facecolor=(*colour[:3], 0.35), edgecolor=colour, linewidth=0.6)
-        elif "_box_" in name and body in category:
-            corners = _outline(model, data, geom)
-            right.plot(*np.vstack([corners, corners[:1]]).T, color="black", linewidth=0.35, alpha=0.7)
-    for item in manifest.objects:
-        x, y = data.body(item.name).xipos[:2]
-        right.text(
-            x,
-            y,
-            item.name,
-            ha="center",
-            va="center",
-            fontsize=7,
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.7, "linewidth": 0},
+            outline = _outline(scene.model, scene.data, geom)
+            axes.fill(*outline.T, facecolor=WALL, edgecolor="0.45", linewidth=0.4)
+
+
+def _draw_objects(axes: Axes, scene: _Scene) -> None:
+    """Each movable object's CAD surface in its category's colour, lit from above, with its name."""
+    _draw_ground(axes, scene)
+    for item in scene.manifest.objects:
+        vertices, faces, _ = read_textured_obj(scene.folder / "assets" / f"{item.name}_visual.obj")
+        body = scene.model.body(item.name).id
+        corners = (vertices @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body])[faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        light = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+        order = np.argsort(corners[:, :, 2].max(axis=1), kind="stable")
+        colours = np.outer(0.55 + 0.45 * light, CATEGORY_COLOURS[item.category][:3])[order]
+        axes.add_collection(
+            PolyCollection(corners[order, :, :2], facecolors=colours, edgecolors=colours, linewidth=0.2)
         )
-    shown = sorted(set(category.values()))
-    handles = [Patch(facecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
-    handles += [
-        Patch(facecolor=(0.85, 0.94, 0.85), label="traversable"),
-        Patch(facecolor="0.75", label="wall boxes"),
-        Patch(facecolor="white", edgecolor="black", label="object boxes"),
-    ]
-    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
-    _frame(right, maps, f"collision shapes, {manifest.floor_area_m2:.1f} m² traversable")
-    figure.tight_layout(rect=(0, 0.03, 1, 1))
-    figure.savefig(target, metadata={"Software": None})
-    plt.close(figure)
+    for item in scene.manifest.objects:
+        x, y = scene.data.body(item.name).xipos[:2]
+        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.75, "linewidth": 0}
+        axes.text(x, y, item.name, ha="center", va="center", fontsize=6, bbox=box)
+    area = f"{scene.manifest.floor_area_m2:.1f} m² traversable"
+    _frame(axes, scene, f"{len(scene.manifest.objects)} objects, {area}")
 
 
-def preview(folder: Path, target: Path) -> None:
-    """Draws a scene folder into a PNG of few colours, whole or not at all.
+def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
+    """Outlines of one kind of collision shape, 'hull' or 'box', in the category's colour."""
+    _draw_ground(axes, scene)
+    category = {o.name: o.category for o in scene.manifest.objects}
+    count = 0
+    for name, body, geom in _geoms(scene.model):
+        if body in category and name.startswith(f"{body}_{kind}_"):
+            colour = CATEGORY_COLOURS[category[body]][:3]
+            outline = _outline(scene.model, scene.data, geom)
+            axes.fill(*outline.T, facecolor=(*colour, 0.30), edgecolor=colour, linewidth=0.6)
+            count += 1
+    walls = sum(name.startswith("wall_") for name, _, _ in _geoms(scene.model))
+    title = f"{count} hulls" if kind == "hull" else f"{count} boxes of objects, {walls} of walls"
+    _frame(axes, scene, title)
+
+
+def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
+    """The scene's objects as the cut takes them."""
+    found = []
+    for item in scene.manifest.objects:
+        assets = scene.folder / "assets"
+        vertices, faces, _ = read_textured_obj(assets / f"{item.name}_visual.obj")
+        hulls = [read_textured_obj(assets / f"{item.name}_hull_{i}.obj")[0] for i in range(item.n_hulls)]
+        body = scene.model.body(item.name).id
+        found.append(
+            PlacedObject(
+                name=item.name,
+                category=item.category,
+                cad_id=item.cad_id,
+                vertices_b=vertices,
+                faces=faces,
+                face_colours=np.zeros((len(faces), 3), np.uint8),
+                hulls_b=tuple(convex_hull(h) for h in hulls),
+                boxes_b=(),
+                position_w=scene.data.xpos[body].copy(),
+                quaternion_w=scene.data.xquat[body].copy(),
+                hinge=None,
+            )
+        )
+    return tuple(found)
+
+
+def _visual_cloud(scene: _Scene, stem: str, spacing_m: float) -> ColourCloud:
+    """World points on a textured mesh of the scene."""
+    points, colours = _coloured_points(scene.folder, stem, spacing_m)
+    body = scene.model.body(stem).id
+    points = points @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body]
+    return ColourCloud(points, np.zeros_like(points), colours)
+
+
+def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
+    """Reads the raw folder that a scene was made from.
+
+    Args:
+        source: the raw folder.
+        manifest: of the scene.
+        floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
 
     Raises:
-        SceneError: the folder is not a readable scene, or the picture cannot be written.
+        SceneRejected: no known layout, or unusable files.
+        SceneError: another building than the scene's.
+    """
+    from converters.pipeline import READERS, detect_format
+    from converters.storeys import split_storeys
+
+    raw = READERS[detect_format(source)][1](source, False)
+    expected = manifest.source.get("sha256", {})
+    strange = sorted(k for k in raw.sources if k in expected and raw.sources[k] != expected[k])
+    if strange or not set(raw.sources) & set(expected):
+        what = f"{strange[0]} differs" if strange else "no file is the same"
+        raise SceneError(f"{source}: is not what {manifest.name} was made from ({what}); give its own --source")
+    floors = split_storeys(raw)
+    return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
+
+
+def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
+    """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes.
+
+    Returns:
+        A palette that suits the picture.
+    """
+    left, right, bottom, top = scene.extent
+    ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
+    columns, height = (3, 4.6) if raw is not None else (2, 4.2)
+    width = max(columns * height * ratio, 7.0)  # the legend's
+    figure, grid = plt.subplots(2, columns, figsize=(width, 2 * height + 0.7), dpi=DPI)
+    panels = list(grid.ravel())
+
+    if raw is not None:
+        vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
+        keep = cut_furniture(vertices_w, raw.scan.faces, raw.scan.labels, _placed(scene)).keep
+        for axes, chosen, title in (
+            (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
+            (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
+        ):
+            faces = raw.scan.faces
+
+            def sample(spacing_m: float, chosen: np.ndarray = chosen, faces: np.ndarray = faces) -> list[ColourCloud]:
+                return [colour_cloud(raw.scan, vertices_w, faces, chosen, spacing_m)]
+
+            _draw_surface(axes, scene, sample, title)
+    filled, objects, hulls, boxes = panels
+    _draw_surface(filled, scene, lambda m: [_visual_cloud(scene, "structure", m)], "filled: the static structure")
+    _draw_objects(objects, scene)
+    _draw_collision(hulls, scene, "hull")
+    _draw_collision(boxes, scene, "box")
+
+    shown = sorted({o.category for o in scene.manifest.objects})
+    handles = [Patch(facecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
+    handles += [Patch(facecolor=TRAVERSABLE, label="traversable"), Patch(facecolor=WALL, label="wall")]
+    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
+    figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
+    figure.tight_layout(rect=(0, 0.03, 1, 0.985))
+    figure.savefig(target, metadata={"Software": None})
+    plt.close(figure)
+    return _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
+
+
+def preview(folder: Path, target: Path, source: Path | None = None) -> None:
+    """Draws a scene folder into a PNG of few colours, whole or not at all.
+
+    Args:
+        folder: of the scene.
+        target: the PNG.
+        source: the raw folder it was made from: scan and cut are drawn too.
+
+    Raises:
+        SceneError: the folder is not a readable scene, the source is another building's, or the picture cannot
+            be written.
+        SceneRejected: the source is unusable.
     """
     manifest, maps = load_manifest(folder), load_maps(folder)
     try:
@@ -163,11 +312,13 @@ def preview(folder: Path, target: Path) -> None:
         raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
     if not target.parent.is_dir():
         raise SceneError(f"{target.parent}: no such folder; give another -o")
+    raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".preview-") as scratch:
         picture = Path(scratch) / "preview.png"
-        draw(folder, model, manifest, maps, picture)
+        palette = draw(_Scene(folder, model, data, manifest, maps), raw, picture)
         with Image.open(picture) as image:
-            image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-                picture, optimize=True
-            )
+            few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
+            few.save(picture, optimize=True)
         picture.replace(target)

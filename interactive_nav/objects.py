@@ -1,13 +1,22 @@
 """The small objects strewn about each episode: parametric boxes out, with real-world masses (kg) and sizes (m).
 
 Four kinds as in the paper (section IV): baskets, shoes, pots, toys. The original's meshes are not public
-with textures, so these are ours: unions of boxes, which every physics backend collides alike.
+with textures, so these are ours: unions of boxes, which every physics backend collides alike, and primitives
+to look at. All models of a kind have equally many boxes, so that scenes of one batch may hold different models.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+
+import mujoco
+
+Rgba = tuple[float, float, float, float]
+SPLITS = ("train", "test")
+KINDS = ("basket", "shoe", "pot", "toy", "shoe", "basket", "toy", "pot")
+"""Kinds in the order in which `pick` deals them: ten are 3 baskets, 3 shoes, 2 pots, 2 toys."""
+VISUAL_GROUP = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,96 +28,263 @@ class Box:
 
 
 @dataclasses.dataclass(frozen=True)
+class Shape:
+    """A primitive to look at, in the object's frame; it never collides and weighs nothing."""
+
+    kind: str
+    """box, cylinder, capsule or ellipsoid."""
+    centre_m: tuple[float, float, float]
+    size_m: tuple[float, ...]
+    """As MuJoCo's geom size: half sizes; (radius, half length) of cylinders and capsules."""
+    rgba: Rgba
+    axis: str = "z"
+    """Axis of a cylinder or capsule: x, y or z."""
+
+
+@dataclasses.dataclass(frozen=True)
 class SmallObject:
     """A movable small object."""
 
+    name: str
     category: str
+    segmentation_id: int
+    """Class in the segmentation image (reference benchmark, section 1.4)."""
     mass_kg: float
     friction: float
     boxes: tuple[Box, ...]
+    rgba: Rgba
+    """Its main colour."""
+    shapes: tuple[Shape, ...]
 
     @property
     def radius_m(self) -> float:
         """Radius of the disc about the origin that holds the object's footprint."""
         return max(math.hypot(abs(b.centre_m[0]) + b.half_m[0], abs(b.centre_m[1]) + b.half_m[1]) for b in self.boxes)
 
+    @property
+    def height_m(self) -> float:
+        """Top of the boxes above the floor."""
+        return max(b.centre_m[2] + b.half_m[2] for b in self.boxes)
 
-def _basket(width: float, depth: float, height: float, mass: float) -> SmallObject:
+
+def _rgba(red: float, green: float, blue: float) -> Rgba:
+    return red, green, blue, 1.0
+
+
+def _darker(colour: Rgba, factor: float = 0.65) -> Rgba:
+    return colour[0] * factor, colour[1] * factor, colour[2] * factor, 1.0
+
+
+def _basket(name: str, segmentation_id: int, width: float, depth: float, height: float, mass: float,
+            colour: Rgba, bands: int = 0) -> SmallObject:  # fmt: skip
     wall = 0.012
     w, d, h = width / 2, depth / 2, height / 2
-    return SmallObject(
-        "basket",
-        mass,
-        0.5,
-        (
-            Box((0, 0, wall / 2), (w, d, wall / 2)),
-            Box((w - wall / 2, 0, h), (wall / 2, d, h)),
-            Box((-w + wall / 2, 0, h), (wall / 2, d, h)),
-            Box((0, d - wall / 2, h), (w, wall / 2, h)),
-            Box((0, -d + wall / 2, h), (w, wall / 2, h)),
-        ),
+    boxes = (
+        Box((0, 0, wall / 2), (w, d, wall / 2)),
+        Box((w - wall / 2, 0, h), (wall / 2, d, h)),
+        Box((-w + wall / 2, 0, h), (wall / 2, d, h)),
+        Box((0, d - wall / 2, h), (w, wall / 2, h)),
+        Box((0, -d + wall / 2, h), (w, wall / 2, h)),
     )
+    dark = _darker(colour)
+    shapes = [Shape("box", b.centre_m, b.half_m, colour) for b in boxes]
+    # A rim and, on woven ones, bands round the walls; the grips stand above the short sides.
+    for z, radius in [(height - 0.008, 0.011)] + [(height * (i + 1) / (bands + 1), 0.006) for i in range(bands)]:
+        for side in (-1, 1):
+            shapes.append(Shape("capsule", (side * (w - 0.005), 0, z), (radius, d - 0.01), dark, "y"))
+            shapes.append(Shape("capsule", (0, side * (d - 0.005), z), (radius, w - 0.01), dark, "x"))
+    for side in (-1, 1):
+        shapes.append(Shape("capsule", (side * (w - 0.008), 0, height + 0.02), (0.008, 0.35 * d), dark, "y"))
+    return SmallObject(name, "basket", segmentation_id, mass, 0.5, boxes, colour, tuple(shapes))
 
 
-def _shoe(length: float, width: float, mass: float) -> SmallObject:
-    return SmallObject(
-        "shoe",
-        mass,
-        0.7,
-        (
-            Box((0, 0, 0.025), (length / 2, width / 2, 0.025)),
-            Box((-0.22 * length, 0, 0.075), (0.28 * length, 0.42 * width, 0.025)),
-        ),
+def _shoe(name: str, length: float, width: float, mass: float, colour: Rgba, upper: float = 0.05,
+          sole: Rgba = (0.9, 0.9, 0.88, 1.0)) -> SmallObject:  # fmt: skip
+    boxes = (
+        Box((0, 0, 0.025), (length / 2, width / 2, 0.025)),
+        Box((-0.22 * length, 0, round(0.05 + upper / 2, 4)), (0.28 * length, 0.42 * width, upper / 2)),
     )
+    top = 0.05 + upper
+    shapes = (
+        Shape("box", (0, 0, 0.010), (0.40 * length, 0.46 * width, 0.010), sole),
+        Shape("cylinder", (0.36 * length, 0, 0.010), (0.46 * width, 0.010), sole),
+        Shape("cylinder", (-0.38 * length, 0, 0.010), (0.42 * width, 0.010), sole),
+        Shape("ellipsoid", (0.20 * length, 0, 0.034), (0.29 * length, 0.46 * width, 0.032), colour),
+        Shape("ellipsoid", (-0.22 * length, 0, 0.5 * top), (0.27 * length, 0.43 * width, 0.5 * top), colour),
+        Shape(
+            "ellipsoid", (-0.25 * length, 0, top - 0.012), (0.17 * length, 0.27 * width, 0.014), _darker(colour, 0.3)
+        ),
+        Shape("capsule", (0.06 * length, 0, 0.058), (0.004, 0.22 * width), sole, "y"),
+        Shape("capsule", (0.12 * length, 0, 0.054), (0.004, 0.24 * width), sole, "y"),
+    )
+    return SmallObject(name, "shoe", 10, mass, 0.7, boxes, colour, shapes)
 
 
-def _pot(width: float, height: float, mass: float) -> SmallObject:
+def _pot(name: str, width: float, height: float, mass: float, colour: Rgba, planted: bool = False) -> SmallObject:
     # An octagonal prism from two boxes turned against each other would need a quaternion; a plus of two
     # boxes keeps the frame and is 8 % smaller in area than the disc.
     r = width / 2
-    return SmallObject(
-        "pot",
-        mass,
-        0.45,
-        (
-            Box((0, 0, height / 2), (r * 0.92, r * 0.55, height / 2)),
-            Box((0, 0, height / 2), (r * 0.55, r * 0.92, height / 2)),
-        ),
+    boxes = (
+        Box((0, 0, height / 2), (r * 0.92, r * 0.55, height / 2)),
+        Box((0, 0, height / 2), (r * 0.55, r * 0.92, height / 2)),
     )
+    dark = _darker(colour)
+    shapes = [Shape("cylinder", (0, 0, height / 2), (0.92 * r, height / 2), colour)]
+    if planted:
+        green = _rgba(0.25, 0.50, 0.20)
+        shapes += [
+            Shape("cylinder", (0, 0, height - 0.012), (0.97 * r, 0.012), dark),
+            Shape("ellipsoid", (0, 0, height + 0.05), (0.75 * r, 0.75 * r, 0.07), green),
+            Shape("ellipsoid", (0.3 * r, 0.2 * r, height + 0.10), (0.4 * r, 0.4 * r, 0.06), _darker(green, 1.2)),
+        ]
+    else:
+        shapes += [
+            Shape("cylinder", (0, 0, height + 0.004), (0.95 * r, 0.006), dark),
+            Shape("ellipsoid", (0, 0, height + 0.022), (0.016, 0.016, 0.014), dark),
+            Shape("capsule", (0.96 * r, 0, 0.8 * height), (0.009, 0.25 * r), dark, "y"),
+            Shape("capsule", (-0.96 * r, 0, 0.8 * height), (0.009, 0.25 * r), dark, "y"),
+        ]
+    return SmallObject(name, "pot", 7, mass, 0.45, boxes, colour, tuple(shapes))
 
 
-def _toy(length: float, width: float, mass: float) -> SmallObject:
-    return SmallObject(
-        "toy",
-        mass,
-        0.4,
-        (
-            Box((0, 0, 0.04), (length / 2, width / 2, 0.04)),
-            Box((0.05 * length, 0, 0.115), (0.2 * length, 0.4 * width, 0.035)),
-        ),
+def _toy(name: str, length: float, width: float, mass: float, colour: Rgba, cab: tuple[float, float, float] = (
+         0.05, 0.20, 0.035), accent: Rgba = (0.75, 0.85, 0.92, 1.0)) -> SmallObject:  # fmt: skip
+    """A vehicle; `cab` is the cab's centre and half length as shares of the length, and its half height in m."""
+    boxes = (
+        Box((0, 0, 0.04), (length / 2, width / 2, 0.04)),
+        Box((cab[0] * length, 0, round(0.08 + cab[2], 4)), (cab[1] * length, 0.4 * width, cab[2])),
     )
+    tyre = _rgba(0.10, 0.10, 0.11)
+    shapes = [
+        Shape("box", (0, 0, 0.052), (length / 2, 0.42 * width, 0.028), colour),
+        Shape("box", boxes[1].centre_m, boxes[1].half_m, accent),
+        Shape(
+            "box",
+            (cab[0] * length, 0, 0.08 + 2 * cab[2] - 0.006),
+            (cab[1] * length + 0.004, 0.41 * width, 0.007),
+            colour,
+        ),
+    ]
+    for x in (-0.30, 0.30):
+        for side in (-1, 1):
+            shapes.append(Shape("cylinder", (x * length, side * 0.43 * width, 0.030), (0.030, 0.07 * width), tyre, "y"))
+    return SmallObject(name, "toy", 9, mass, 0.4, boxes, colour, tuple(shapes))
 
 
-# Masses: a plastic laundry basket weighs 0.6 to 1.2 kg, a shoe 0.3 to 0.5, a cooking or flower pot
-# 0.8 to 2, a toy car or robot 0.3 to 0.7.
-MODELS: tuple[SmallObject, ...] = (
-    _basket(0.38, 0.28, 0.24, 0.9),
-    _shoe(0.28, 0.10, 0.38),
-    _pot(0.24, 0.18, 1.4),
-    _toy(0.26, 0.16, 0.5),
-    _shoe(0.25, 0.09, 0.32),
-    _basket(0.30, 0.30, 0.30, 0.7),
-    _toy(0.18, 0.12, 0.3),
-    _pot(0.18, 0.14, 0.9),
-)
+# Segmentation ids 6 to 10 are the original's five models. 6 and 8 are its baskets and 9 its toy (names in its
+# demos); the released URDF of 7 calls itself a plant container, so 7 is a pot, which leaves 10 for the shoe.
+#
+# Masses. Baskets: walls of 2 mm polypropylene (905 kg/m3), so 0.77 kg for the laundry basket's 0.42 m2; wicker
+# and wire alike; a moulded Euro box of 400 x 300 x 270 mm 1.6 kg. Shoes, each: running 0.23 to 0.37 kg, casual
+# 0.27 to 0.45, hiking boots 0.45 to 1.4, work boots 0.68 to 1.4 (decentfoot.com, trailhead.pldthome.com).
+# Pots with lid: 2 mm of steel (7,900 kg/m3) on 0.09 m2 weigh 1.4 kg, cast aluminium of 4 to 6 l 1.4 to 3.2 kg
+# (kitchprep.com); terracotta of 7 mm (1,950 kg/m3) on 0.18 m2 2.4 kg. Toys: a wooden truck of 34 x 12 x 15 cm
+# 1.0 kg (robberteebob.co.nz), plastic ones of 2.5 mm ABS (1,050 kg/m3) 0.3 to 0.7 kg.
+_TRAIN: dict[str, tuple[SmallObject, ...]] = {
+    "basket": (
+        _basket("basket_laundry", 6, 0.38, 0.28, 0.24, 0.9, _rgba(0.30, 0.62, 0.70)),
+        _basket("basket_bin", 8, 0.30, 0.30, 0.30, 0.7, _rgba(0.85, 0.80, 0.68), 2),
+        _basket("basket_wicker", 6, 0.42, 0.30, 0.20, 1.1, _rgba(0.66, 0.47, 0.27), 3),
+        _basket("basket_hamper", 8, 0.36, 0.34, 0.40, 1.4, _rgba(0.74, 0.60, 0.42), 4),
+        _basket("basket_wire", 6, 0.34, 0.24, 0.16, 0.6, _rgba(0.55, 0.56, 0.58), 2),
+    ),
+    "shoe": (
+        _shoe("shoe_sneaker", 0.28, 0.10, 0.38, _rgba(0.75, 0.20, 0.18)),
+        _shoe("shoe_flat", 0.25, 0.09, 0.32, _rgba(0.20, 0.28, 0.48)),
+        _shoe("shoe_running", 0.29, 0.105, 0.29, _rgba(0.20, 0.62, 0.35), 0.045),
+        _shoe("shoe_boot", 0.30, 0.11, 0.68, _rgba(0.42, 0.27, 0.15), 0.12, _rgba(0.15, 0.13, 0.12)),
+    ),
+    "pot": (
+        _pot("pot_steel", 0.24, 0.18, 1.4, _rgba(0.68, 0.70, 0.72)),
+        _pot("pot_milk", 0.18, 0.14, 0.9, _rgba(0.82, 0.25, 0.20)),
+        _pot("pot_shallow", 0.26, 0.11, 1.2, _rgba(0.22, 0.24, 0.27)),
+        _pot("pot_stock", 0.28, 0.22, 2.1, _rgba(0.60, 0.62, 0.66)),
+    ),
+    "toy": (
+        _toy("toy_car", 0.26, 0.16, 0.5, _rgba(0.90, 0.65, 0.10)),
+        _toy("toy_buggy", 0.18, 0.12, 0.3, _rgba(0.25, 0.45, 0.85)),
+        _toy("toy_truck", 0.34, 0.14, 1.0, _rgba(0.70, 0.50, 0.30), (0.30, 0.16, 0.04), _rgba(0.85, 0.30, 0.22)),
+        _toy("toy_bus", 0.28, 0.13, 0.55, _rgba(0.85, 0.20, 0.20), (0.0, 0.46, 0.04)),
+    ),
+}  # fmt: skip
+_TEST: dict[str, tuple[SmallObject, ...]] = {
+    "basket": (
+        _basket("basket_crate", 6, 0.40, 0.30, 0.27, 1.6, _rgba(0.32, 0.38, 0.30), 1),
+        _basket("basket_sewing", 8, 0.26, 0.24, 0.18, 0.45, _rgba(0.70, 0.45, 0.55), 3),
+    ),
+    "shoe": (
+        _shoe("shoe_slipper", 0.27, 0.105, 0.25, _rgba(0.55, 0.40, 0.62), 0.03),
+        _shoe("shoe_work_boot", 0.31, 0.115, 0.85, _rgba(0.72, 0.55, 0.25), 0.10, _rgba(0.2, 0.16, 0.12)),
+    ),
+    "pot": (
+        _pot("pot_flower", 0.22, 0.20, 2.4, _rgba(0.72, 0.40, 0.26), planted=True),
+        _pot("pot_casserole", 0.29, 0.14, 2.6, _rgba(0.15, 0.35, 0.38)),
+    ),
+    "toy": (
+        _toy("toy_digger", 0.30, 0.16, 0.7, _rgba(0.92, 0.78, 0.12), (-0.25, 0.15, 0.05)),
+        _toy("toy_engine", 0.22, 0.10, 0.35, _rgba(0.16, 0.42, 0.30), (-0.28, 0.18, 0.045), _rgba(0.8, 0.2, 0.2)),
+    ),
+}  # fmt: skip
+MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {"train": _TRAIN, "test": _TEST}
+"""Split -> kind -> models; no model is in both splits."""
 
 
-def pick(num_objects: int) -> tuple[SmallObject, ...]:
-    """The first `num_objects` of the models, repeated in order: ten give 3 baskets, 3 shoes, 2 pots, 2 toys.
+def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[SmallObject, ...]:
+    """A set of small objects: two models of each kind, as many copies as it takes.
+
+    Slot i holds the same kind, with the same number of boxes, whatever the split and the variant.
+
+    Args:
+        num_objects: how many; ten give 3 baskets, 3 shoes, 2 pots, 2 toys.
+        split: whose models, train or test.
+        variant: which two models of each kind; 0 is the default set, and they come round again in the end.
 
     Raises:
-        ValueError: a negative number.
+        ValueError: a negative number, or an unknown split.
     """
     if num_objects < 0:
         raise ValueError(f"num_objects is {num_objects}, expected 0 or more")
-    return tuple(MODELS[i % len(MODELS)] for i in range(num_objects))
+    if variant < 0:
+        raise ValueError(f"variant is {variant}, expected 0 or more")
+    if split not in MODELS:
+        raise ValueError(f"split is {split!r}, expected one of {', '.join(SPLITS)}")
+    chosen = []
+    for i in range(num_objects):
+        kind = KINDS[i % len(KINDS)]
+        models = MODELS[split][kind]
+        turn = KINDS[: i % len(KINDS)].count(kind)
+        chosen.append(models[(2 * variant + turn) % len(models)])
+    return tuple(chosen)
+
+
+_GEOM = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+}
+_HALF = math.sqrt(0.5)
+_TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (_HALF, 0.0, _HALF, 0.0), "y": (_HALF, -_HALF, 0.0, 0.0)}
+
+
+def add_shapes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
+    """Adds an object's shapes to a body, massless and without collision, in the group of visuals.
+
+    Args:
+        body: the object's body, origin on the floor.
+        obj: the model.
+        name: prefix of the geoms' names.
+    """
+    for i, shape in enumerate(obj.shapes):
+        body.add_geom(
+            name=f"{name}_visual_{i}",
+            type=_GEOM[shape.kind],
+            pos=shape.centre_m,
+            quat=_TURN[shape.axis],
+            size=(*shape.size_m, 0.0, 0.0)[:3],
+            rgba=shape.rgba,
+            contype=0,
+            conaffinity=0,
+            mass=0.0,
+            group=VISUAL_GROUP,
+        )

@@ -23,7 +23,7 @@ from converters.generate.write import LICENCE, write_cad, write_json, write_png,
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "design_building", "generate_building"]
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Raised whenever the same seed would give other bytes."""
 
 Progress = Callable[[str, float], None]

@@ -137,6 +137,18 @@ def _chair_tub(width=0.64, depth=0.62, seat=0.40, back=0.33, cloth="rust", leg="
     return parts
 
 
+def _chair_spindle(width=0.43, depth=0.42, seat=0.45, back=0.47, spindles=5, wood="oak") -> list[Part]:
+    parts = four_legs(width - 0.08, depth - 0.08, seat - 0.01, 0.042, wood, splay=0.045, square=False)
+    parts.append(bar((0, seat - 0.02, 0), (0, seat + 0.02, 0), 0.56 * width, wood, 10))
+    for i in range(spindles):
+        x = (width - 0.12) * (i / (spindles - 1) - 0.5)
+        parts.append(
+            bar((x, seat, -depth / 2 + 0.05), (1.1 * x, seat + back - 0.03, -depth / 2 - 0.04), 0.013, wood, 6)
+        )
+    parts.append(box((0, seat + back - 0.03, -depth / 2 - 0.04), (width - 0.02, 0.07, 0.03), wood, tilt_rad=0.18))
+    return parts
+
+
 # -- tables and desks --------------------------------------------------
 
 
@@ -174,6 +186,17 @@ def _table_trestle(width=1.3, depth=0.75, height=0.74, top="walnut", leg="black"
             parts.append(bar(foot, (x, height - 0.03, sz * 0.08), 0.032, leg, 4))
         parts.append(box((x, 0.28, 0), (0.045, 0.05, depth * 0.62), leg))
     parts.append(box((0, 0.28, 0), (width - 0.36, 0.05, 0.045), leg))
+    return parts
+
+
+def _table_tripod(diameter=0.85, height=0.72, top="oak", leg="white") -> list[Part]:
+    r = diameter / 2
+    parts = [bar((0, height - 0.03, 0), (0, height, 0), r, top, 20)]
+    parts.append(bar((0, 0.30, 0), (0, height - 0.02, 0), 0.045, leg, 8))
+    for i in range(3):
+        a = 2 * math.pi * i / 3 + math.pi / 2
+        foot = (0.8 * r * math.cos(a), 0.0, 0.8 * r * math.sin(a))
+        parts.append(bar((0, 0.36, 0), foot, (0.035, 0.028), leg, 6))
     return parts
 
 
@@ -232,6 +255,19 @@ def _desk_hutch(width=1.15, depth=0.6, height=0.75, wood="linen", leg="oak") -> 
     return parts
 
 
+def _desk_pedestals(width=1.35, depth=0.66, height=0.75, wood="linen", front="white") -> list[Part]:
+    parts = [box((0, height - 0.016, 0), (width, 0.032, depth), wood)]
+    for sx in (-1, 1):
+        x = sx * (width / 2 - 0.20)
+        parts.append(box((x, (height - 0.02) / 2, -0.01), (0.38, height - 0.02, depth - 0.06), wood, open=True))
+        for i in range(2):
+            y = height * (0.28 + 0.42 * i)
+            parts.append(box((x, y, depth / 2 - 0.03), (0.34, 0.36 * height, 0.025), front))
+            parts.append(box((x, y + 0.1, depth / 2 - 0.01), (0.14, 0.02, 0.02), "steel"))
+    parts.append(box((0, height - 0.18, -depth / 2 + 0.05), (width - 0.76, 0.3, 0.02), wood))
+    return parts
+
+
 # -- sofas ------------------------------------------------------------
 
 
@@ -268,6 +304,30 @@ def _sofa(width=1.6, depth=0.82, seat=0.42, back=0.42, arm=0.16, seats=2, cloth=
     return parts
 
 
+def _sofa_chaise(width=1.75, depth=0.80, reach=1.25, seat=0.42, back=0.40, cloth="navy", legs=0.08) -> list[Part]:
+    low = seat - 0.14
+    long_w = 0.36 * width
+    x = (width - long_w) / 2
+    front = depth / 2 + (reach - depth)
+    parts = [
+        box((0, legs + (low - legs) / 2, 0), (width - 0.02, low - legs, depth - 0.04), cloth, open=True),
+        box(
+            (x, legs + (low - legs) / 2, (front - depth / 2) / 2), (long_w, low - legs, reach - 0.04), cloth, open=True
+        ),
+        cushion((0, legs + (seat + back - legs) / 2, -depth / 2 + 0.1), (width, seat + back - legs, 0.2), cloth, 0.04),
+        cushion((-long_w / 2, seat - 0.08, 0.08), (width - long_w - 0.02, 0.17, depth - 0.2), cloth, 0.03),
+        cushion((x, seat - 0.08, (front - depth / 2) / 2 + 0.08), (long_w - 0.02, 0.17, reach - 0.2), cloth, 0.03),
+        cushion((-width / 2 + 0.08, legs + 0.25, 0.01), (0.16, 0.5, depth - 0.02), cloth, 0.04),
+    ]
+    for sx in (-1, 1):
+        parts.append(box((sx * (width / 2 - 0.07), legs / 2, -depth / 2 + 0.07), (0.06, legs + 0.01, 0.06), "black"))
+    parts.append(box((-width / 2 + 0.07, legs / 2, depth / 2 - 0.07), (0.06, legs + 0.01, 0.06), "black"))
+    for sx in (-1, 1):
+        foot = (x + sx * (long_w / 2 - 0.07), legs / 2, front - 0.07)
+        parts.append(box(foot, (0.06, legs + 0.01, 0.06), "black"))
+    return parts
+
+
 # -- doors: leaf from x = 0 (hinge edge) to x = width, handle near the other edge
 
 
@@ -286,6 +346,16 @@ def _door(width=0.88, height=2.0, thick=0.04, paint="white", panels=2, knob=Fals
             parts.append(cushion((x, 1.02, z + sz * 0.006), (0.05, 0.05, 0.02), metal, 0.006))
         else:
             parts.append(box((x - 0.04, 1.05, z + sz * 0.006), (0.12, 0.02, 0.018), metal))
+    return parts
+
+
+def _door_battens(width=0.86, height=2.0, thick=0.038, wood="moss", metal="black") -> list[Part]:
+    parts = [box((width / 2, height / 2, 0), (width, height, thick), wood)]
+    for y in (0.25, 1.0, 1.75):
+        for sz in (-1, 1):
+            parts.append(box((width / 2, y, sz * thick / 2), (width - 0.08, 0.12, 0.016), wood))
+    for sz in (-1, 1):
+        parts.append(box((width - 0.06, 1.12, sz * (thick / 2 + 0.006)), (0.04, 0.18, 0.012), metal))
     return parts
 
 
@@ -317,11 +387,17 @@ LIBRARY: dict[str, Drawing] = {
     "door_flush": Drawing("door", _f(_door, 0.86, 2.0, 0.042, "oak", 0, True)),
     "door_three": Drawing("door", _f(_door, 0.9, 2.02, 0.04, "linen", 3)),
     "door_dark": Drawing("door", _f(_door, 0.87, 1.99, 0.044, "walnut", 4, True)),
+    "chair_spindle": Drawing("chair", _chair_spindle),
+    "table_tripod": Drawing("table", _table_tripod, "__SYM_ROTATE_UP_INF"),
+    "desk_pedestals": Drawing("desk", _desk_pedestals, front=-1),
+    "sofa_chaise": Drawing("sofa", _sofa_chaise),
+    "door_battens": Drawing("door", _door_battens),
 }
 """Model name -> how it is drawn."""
 
 TEST_MODELS = (
-    "chair_ladder", "chair_shell", "table_trestle", "table_panel", "desk_hutch", "sofa_club", "door_dark",
+    "chair_ladder", "chair_shell", "chair_spindle", "table_trestle", "table_panel", "table_tripod", "desk_hutch",
+    "desk_pedestals", "sofa_club", "sofa_chaise", "door_dark", "door_battens",
 )  # fmt: skip
 """Held out: no training building uses them."""
 

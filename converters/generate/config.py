@@ -6,6 +6,9 @@ import dataclasses
 
 from converters.generate.cad import LIBRARY, TRAIN_MODELS
 
+NAMES = ("models", "passage_chairs")
+"""Settings that are names of CAD models, not ranges."""
+
 
 class GenerationError(ValueError):
     """A building that cannot be generated; the message says what, where, what was expected and what to do."""
@@ -35,6 +38,8 @@ class BuildingConfig:
     """How much wider a doorway without a leaf may be."""
     loop_probability: float = 0.25
     """Chance of each further doorway beyond those that make all rooms reachable."""
+    corner_doorways: float = 0.0
+    """Share of doorways put right beside a room's corner, where an open leaf can rest along the side wall."""
     n_static: tuple[int, int] = (1, 2)
     """Unmovable cupboards and counters: part of the static structure."""
     n_windows: tuple[int, int] = (2, 4)
@@ -51,12 +56,30 @@ class BuildingConfig:
     """Hinged leaves, standing open."""
     door_open_deg: tuple[float, float] = (85.0, 115.0)
     """How far a leaf stands open, where the wall behind it allows; at 60 it would bar half of its doorway."""
+    corner_margin_m: float = 0.12
+    """Wall between such a doorway and the corner."""
+    leaf_wall_gap_m: float = 0.08
+    """Least room between an open leaf's edge and the wall beside it. The converter takes walls within 0.04 m of
+    a leaf's sweep, annotation errors included, for the leaf."""
+    leaf_proud_m: float = 0.0
+    """How far before the wall's face the hinges stand: an open leaf that is annotated 1 cm off clears the wall."""
+    leaves_at_walls: bool = False
+    """Leaves only where a side wall is close behind the hinge, never into a corridor or before another doorway:
+    robots that pass seldom catch them. Needs `corner_doorways` to be found often."""
     n_bottlenecks: int = 1
     """Chairs put so that they narrow the way through a doorway to `bottleneck_gap_m`."""
     bottleneck_gap_m: tuple[float, float] = (0.42, 0.62)
     """Width of the widest passage left beside such a chair."""
+    n_blockers: int = 0
+    """Further chairs that narrow the way through a doorway to `blocker_gap_m`: less than a robot, who must push
+    or go round."""
+    blocker_gap_m: tuple[float, float] = (0.05, 0.32)
+    """Width of the widest passage left beside such a chair."""
+    passage_chairs: tuple[str, ...] = ()
+    """Names of the chair models that may narrow a doorway; empty: all chairs of `models`. Light ones can be pushed
+    by a small robot."""
     robot_radius_m: float = 0.18
-    """A disc of this radius reaches every room with the furniture where it stands."""
+    """A disc of this radius reaches every room with the furniture (but for blockers) where it stands."""
     scale_jitter: float = 0.08
     """Each instance is scaled per axis by up to this fraction."""
     models: tuple[str, ...] = TRAIN_MODELS
@@ -84,7 +107,7 @@ class BuildingConfig:
         """
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, tuple) and field.name != "models" and not 0 <= value[0] <= value[1]:
+            if isinstance(value, tuple) and field.name not in NAMES and not 0 <= value[0] <= value[1]:
                 raise GenerationError(f"{field.name} is {value}: expected 0 <= lowest <= highest")
             if isinstance(value, int | float) and value < 0:
                 raise GenerationError(f"{field.name} is {value}: expected a number that is not negative")
@@ -93,14 +116,20 @@ class BuildingConfig:
                 raise GenerationError(f"{name} is {getattr(self, name)}: expected a positive number")
         if self.n_rooms[0] < 1:
             raise GenerationError(f"n_rooms is {self.n_rooms}: expected at least one room")
-        if self.n_bottlenecks > self.n_chairs[0]:
+        for name in ("corner_doorways", "loop_probability"):
+            if getattr(self, name) > 1:
+                raise GenerationError(f"{name} is {getattr(self, name)}: expected a share of 0 to 1")
+        if self.n_bottlenecks + self.n_blockers > self.n_chairs[0]:
             raise GenerationError(
-                f"n_bottlenecks is {self.n_bottlenecks} but n_chairs may be {self.n_chairs[0]}: "
-                "each bottleneck needs a chair; raise n_chairs"
+                f"n_bottlenecks is {self.n_bottlenecks} and n_blockers {self.n_blockers} but n_chairs may be "
+                f"{self.n_chairs[0]}: each bottleneck needs a chair; raise n_chairs"
             )
-        unknown = sorted(set(self.models) - set(LIBRARY))
+        unknown = sorted({*self.models, *self.passage_chairs} - set(LIBRARY))
         if unknown:
             raise GenerationError(f"unknown CAD models {unknown}: known are {sorted(LIBRARY)}")
+        strange = [m for m in self.passage_chairs if m not in self.models or LIBRARY[m].category != "chair"]
+        if strange:
+            raise GenerationError(f"passage_chairs names {strange}: expected chairs that `models` has")
         for category in ("chair", "table", "desk", "sofa", "door"):
             wanted = getattr(self, f"n_{category}s")[1]
             if wanted and not any(LIBRARY[m].category == category for m in self.models):

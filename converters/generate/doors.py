@@ -15,15 +15,21 @@ DOOR_GAP_M = 0.02
 """Between leaf and jamb, each side."""
 DOOR_BOTTOM_M = (0.006, 0.010)
 """Between leaf and floor."""
-WALL_GAP_M = 0.08
-"""Left between a leaf that is fully open and the wall beside it: room for the handle."""
-
 AJAR_RAD = math.radians(3.0)
 """A leaf stands at least this far from the end of its swing."""
 
 
-def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: bool, open_rad: float,
-              plan: Plan, lift_m: float) -> tuple[Instance, shapely.Polygon]:  # fmt: skip
+def door_leaf(
+    doorway: Doorway,
+    model: CadModel,
+    high_side: bool,
+    high_jamb: bool,
+    open_rad: float,
+    plan: Plan,
+    lift_m: float,
+    wall_gap_m: float = 0.08,
+    proud_m: float = 0.0,
+) -> tuple[Instance, shapely.Polygon]:
     """Hangs an open leaf into a doorway.
 
     The hinge line is the leaf's edge at the jamb, flush with the wall's face on the side it opens to. Closed,
@@ -37,6 +43,8 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
         open_rad: how far it should stand open; the wall beside the hinge may allow less.
         plan: for the wall that ends its swing.
         lift_m: gap below the leaf.
+        wall_gap_m: left between the fully open leaf and the wall beside it; the handle stands in it.
+        proud_m: how far before the wall's face the hinge line stands.
 
     Returns:
         The leaf as it stands, and the floor area that it sweeps from closed to fully open.
@@ -51,6 +59,7 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
     closed[along] = -1.0 if high_jamb else 1.0
     into = np.zeros(2)
     into[axis] = 1.0 if high_side else -1.0
+    hinge += proud_m * into
     # Opening turns `closed` towards `into`; the sign says which way round that is, seen from above.
     sign = float(np.sign(closed[0] * into[1] - closed[1] * into[0]))
     width, height = doorway.width_m - 2 * DOOR_GAP_M, doorway.height_m - 0.02 - lift_m
@@ -59,7 +68,7 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
     # The wall beside the hinge stops the leaf: behind the hinge only the margin to the corner is left.
     room = plan.rooms[doorway.rooms[int(high_side)]]
     corner = (room.x1, room.y1)[along] if high_jamb else (room.x0, room.y0)[along]
-    behind = abs(corner - hinge[along]) - WALL_GAP_M
+    behind = abs(corner - hinge[along]) - wall_gap_m
     most = math.pi / 2 + math.asin(min(max(behind, 0.0) / width, 0.5))
     open_rad = min(open_rad, most - AJAR_RAD)
     leaf_half_thick = _leaf_half_thickness(model)
@@ -78,6 +87,13 @@ def door_leaf(doorway: Doorway, model: CadModel, high_side: bool, high_jamb: boo
     angles = start + sign * np.linspace(0.0, most, 24)
     fan = hinge + (width + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return leaf, shapely.Polygon([hinge, *fan]).buffer(0.03)
+
+
+def wall_behind_m(doorway: Doorway, high_side: bool, high_jamb: bool, plan: Plan) -> float:
+    """Distance from the jamb to the room's side wall behind the hinge."""
+    along = 1 - doorway.axis
+    room, r = plan.rooms[doorway.rooms[int(high_side)]], doorway.rect
+    return (room.x1 - r.x1, room.y1 - r.y1)[along] if high_jamb else (r.x0 - room.x0, r.y0 - room.y0)[along]
 
 
 def _leaf_slab(model: CadModel) -> np.ndarray:

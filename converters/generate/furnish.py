@@ -15,11 +15,14 @@ import shapely
 
 from converters.generate.cad import LIBRARY, CadModel, cad_model
 from converters.generate.config import BuildingConfig, GenerationError
-from converters.generate.doors import DOOR_BOTTOM_M, door_leaf
+from converters.generate.doors import DOOR_BOTTOM_M, door_leaf, wall_behind_m
 from converters.generate.instance import Instance, place
 from converters.generate.maps import clearance
 from converters.generate.plan import Plan, Rect, doorway_zone
 from converters.generate.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
+
+SIDE_WALL_M = 0.35
+"""A side wall this close behind the hinge leaves no way through behind an open leaf."""
 
 
 class _Room:
@@ -34,9 +37,11 @@ class _Room:
         self.room_of: list[int] = []
         self.drawn: Counter[str] = Counter()
 
-    def draw_model(self, category: str, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[CadModel, np.ndarray]:
+    def draw_model(
+        self, category: str, cfg: BuildingConfig, rng: np.random.Generator, among: tuple[str, ...] = ()
+    ) -> tuple[CadModel, np.ndarray]:
         """One of the category's models that were drawn least so far, and its scale (CAD units -> metres)."""
-        names = [m for m in cfg.models if LIBRARY[m].category == category]
+        names = [m for m in among or cfg.models if LIBRARY[m].category == category]
         least = min(self.drawn[m] for m in names)
         names = [m for m in names if self.drawn[m] == least]
         model = cad_model(names[rng.integers(len(names))])
@@ -118,17 +123,29 @@ def _seat_at(
     return None
 
 
-def _narrow(state: _Room, cfg: BuildingConfig, rng: np.random.Generator, used: set[int]) -> Instance | None:
-    """Tries to put a chair before a doorway so that the way through narrows to the wanted gap."""
+def _narrow(
+    state: _Room, cfg: BuildingConfig, gap_m: tuple[float, float], rng: np.random.Generator, used: set[int], local: bool
+) -> Instance | None:
+    """Tries to put a chair before a doorway so that the way through narrows to the wanted gap.
+
+    Args:
+        state: what stands so far.
+        cfg: models.
+        gap_m: least and largest width left.
+        rng: random stream.
+        used: doorways that have a chair already; extended in place.
+        local: judge the way through this doorway only, not round through other rooms.
+    """
     plan = state.plan
-    low, high = cfg.bottleneck_gap_m
+    low, high = gap_m
     before = free_grid(plan, state.placed)
     for k in rng.permutation(len(plan.doorways)):
         d = plan.doorways[k]
         masks = [room_mask(before, plan.rooms[i]) for i in d.rooms]
-        if int(k) in used or not passes(clearance(before, GRID_M), masks, high):
+        here = masks[0] | masks[1] | room_mask(before, d.rect) if local else np.ones_like(before)
+        if int(k) in used or not passes(clearance(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
             continue
-        model, scale = state.draw_model("chair", cfg, rng)
+        model, scale = state.draw_model("chair", cfg, rng, cfg.passage_chairs)
         for _ in range(25):
             side = int(rng.integers(2))
             xy = np.array(d.rect.centre)
@@ -139,7 +156,7 @@ def _narrow(state: _Room, cfg: BuildingConfig, rng: np.random.Generator, used: s
             sweeps = state.kept_free[len(plan.doorways) :]
             if not state.fits(item, d.rooms[side], zones=False) or any(item.footprint.intersects(s) for s in sweeps):
                 continue
-            room_m = clearance(without(before, [item]), GRID_M)
+            room_m = clearance(without(before, [item]) & here, GRID_M)
             if passes(room_m, masks, low) and not passes(room_m, masks, high):
                 used.add(int(k))
                 state.add(item, d.rooms[side])
@@ -147,28 +164,43 @@ def _narrow(state: _Room, cfg: BuildingConfig, rng: np.random.Generator, used: s
     return None
 
 
-def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> list[Instance] | None:
+def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generator) -> Instance | None:
+    """Tries to hang a leaf into doorway k where its sweep meets nothing."""
+    plan, d = state.plan, state.plan.doorways[k]
+    model, _ = state.draw_model("door", cfg, rng)
+    for side, jamb in rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
+        room = d.rooms[int(side)]
+        if cfg.leaves_at_walls and (
+            room == plan.corridor or wall_behind_m(d, bool(side), bool(jamb), plan) > SIDE_WALL_M
+        ):
+            continue
+        opened = math.radians(rng.uniform(*cfg.door_open_deg))
+        lift_m = rng.uniform(*DOOR_BOTTOM_M)
+        gaps_m = cfg.leaf_wall_gap_m, cfg.leaf_proud_m
+        leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, lift_m, *gaps_m)
+        if any(sweep.intersects(t) for t in (*state.taken, *state.kept_free[len(plan.doorways) :])):
+            continue
+        others = [z for j, z in enumerate(state.kept_free[: len(plan.doorways)]) if j != k]
+        if cfg.leaves_at_walls and any(leaf.footprint.intersects(z) for z in others):
+            continue
+        state.kept_free.append(sweep)
+        state.add(leaf, room)
+        return leaf
+    return None
+
+
+def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Instance], list[Instance]] | None:
+    """One try: all furniture, and the blockers among it."""
     state = _Room(plan)
     ranges = {c: getattr(cfg, f"n_{c}s") for c in ("chair", "table", "desk", "sofa", "door")}
     count = {c: int(rng.integers(low, high + 1)) for c, (low, high) in ranges.items()}
-    leaves = []
+    leaves = 0
     for k in rng.permutation(len(plan.doorways)):
-        d = plan.doorways[k]
-        if len(leaves) == count["door"]:
+        if leaves == count["door"]:
             break
-        if d.width_m > 1.1:
-            continue
-        model, _ = state.draw_model("door", cfg, rng)
-        for side, jamb in rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
-            opened = math.radians(rng.uniform(*cfg.door_open_deg))
-            leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, rng.uniform(*DOOR_BOTTOM_M))
-            if any(sweep.intersects(t) for t in (*state.taken, *state.kept_free[len(plan.doorways) :])):
-                continue
-            leaves.append(leaf)
-            state.kept_free.append(sweep)
-            state.add(leaf, d.rooms[int(side)])
-            break
-    if len(leaves) < count["door"]:
+        if plan.doorways[k].width_m <= 1.1:
+            leaves += _hang_leaf(state, int(k), cfg, rng) is not None
+    if leaves < count["door"]:
         return None
     roomy = [i for i in range(len(plan.rooms)) if i != plan.corridor]
     hosts: list[tuple[Instance, int]] = []
@@ -191,10 +223,13 @@ def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> list[
                 return None
     used: set[int] = set()
     for _ in range(cfg.n_bottlenecks):
-        if _narrow(state, cfg, rng, used) is None:
+        if _narrow(state, cfg, cfg.bottleneck_gap_m, rng, used, local=False) is None:
             return None
+    blockers = [_narrow(state, cfg, cfg.blocker_gap_m, rng, used, local=True) for _ in range(cfg.n_blockers)]
+    if any(b is None for b in blockers):
+        return None
     desks_first = sorted(hosts, key=lambda h: h[0].model.category)
-    for n in range(count["chair"] - cfg.n_bottlenecks):
+    for n in range(count["chair"] - cfg.n_bottlenecks - cfg.n_blockers):
         model, scale = state.draw_model("chair", cfg, rng)
         item, room = None, 0
         if hosts:
@@ -210,7 +245,7 @@ def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> list[
         if item is None:
             return None
         state.add(item, room)
-    return state.placed
+    return state.placed, [b for b in blockers if b is not None]
 
 
 def furnish_plan(
@@ -228,10 +263,14 @@ def furnish_plan(
         Doors, sofas, desks, tables, chairs; None where this plan cannot take them.
     """
     for _ in range(max_tries):
-        items = _attempt(plan, cfg, rng)
-        if items is None or not rooms_joined(free_grid(plan, items), plan, cfg.robot_radius_m + 0.02):
+        found = _attempt(plan, cfg, rng)
+        if found is None:
             continue
-        return items
+        items, blockers = found
+        blocking = {id(b) for b in blockers}
+        standing = [i for i in items if id(i) not in blocking]
+        if rooms_joined(free_grid(plan, standing), plan, cfg.robot_radius_m + 0.02):
+            return items
     return None
 
 

@@ -218,6 +218,9 @@ def _doorways(
         slack = end - start - 2 * DOORWAY_MARGIN_M - width
         # Doorways sit near a corner more often than in the middle: it leaves wall for furniture.
         at = snap(start + DOORWAY_MARGIN_M + slack * rng.beta(0.5, 0.5))
+        if cfg.corner_doorways and rng.random() < cfg.corner_doorways:
+            margin = min(cfg.corner_margin_m, (end - start - width) / 2)
+            at = snap(start + margin if rng.random() < 0.5 else end - margin - width)
         hole = Rect(rect.x0, at, rect.x1, at + width) if axis == 0 else Rect(at, rect.y0, at + width, rect.y1)
         chosen.append(Doorway((i, j), axis, hole, door_height))
     return chosen

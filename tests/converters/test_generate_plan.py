@@ -220,6 +220,9 @@ def test_a_large_test_building_uses_held_out_models_only(seed):
         ({"models": ("chair_throne",)}, "unknown CAD models"),
         ({"models": ("chair_slat",)}, "names no table"),
         ({"n_bottlenecks": 9}, "each bottleneck needs a chair"),
+        ({"n_blockers": 3}, "each bottleneck needs a chair"),
+        ({"passage_chairs": ("sofa_two",)}, "passage_chairs names ['sofa_two']"),
+        ({"corner_doorways": 1.5}, "expected a share of 0 to 1"),
     ],
 )
 def test_what_cannot_be_built_is_said_in_one_line(changes, message):

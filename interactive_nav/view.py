@@ -1,0 +1,213 @@
+"""`python -m interactive_nav.view SCENE`: a scene folder in, MuJoCo's viewer with a robot and clutter in it.
+
+A window where the machine has a screen, else a page in the browser (mjviser, an optional dependency).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import importlib.util
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from interactive_nav.geodesic import clearance
+from interactive_nav.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, pick
+from interactive_nav.robots import RobotSpec, get_robot, robot_names
+from interactive_nav.scene import Scene, load_scene
+from interactive_nav.tables import furniture_map
+
+VIEWERS = ("auto", "window", "browser")
+GAP_M = 0.03
+"""Least gap between what is placed at random."""
+
+
+class ViewError(ValueError):
+    """No viewer can open; the message says what to install."""
+
+
+def can_open_window() -> bool:
+    """Whether GLFW, which MuJoCo's viewer draws with, finds a screen."""
+    try:
+        glfw = importlib.import_module("glfw")
+    except ImportError:
+        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        opened = bool(glfw.init())
+        if opened:
+            glfw.terminate()
+    return opened
+
+
+def has_browser_viewer() -> bool:
+    """Whether mjviser is installed."""
+    return importlib.util.find_spec("mjviser") is not None
+
+
+def choose_viewer(
+    wanted: str, window: Callable[[], bool] = can_open_window, browser: Callable[[], bool] = has_browser_viewer
+) -> str:
+    """'window' or 'browser'.
+
+    Args:
+        wanted: one of `VIEWERS`; auto takes a window where there is a screen.
+        window: tells whether a window can open.
+        browser: tells whether the browser's viewer is installed.
+
+    Raises:
+        ViewError: neither can open, or the one that was asked for cannot; says what to do.
+    """
+    if wanted in ("auto", "window") and window():
+        return "window"
+    if wanted == "window":
+        raise ViewError("no screen to open a window on; log in with one (ssh -X does), or use --viewer browser")
+    if browser():
+        return "browser"
+    why = "no screen to open a window on, and " if wanted == "auto" else ""
+    raise ViewError(f"{why}mjviser is not installed; 'pip install mjviser' shows the scene in a browser")
+
+
+def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np.random.Generator) -> np.ndarray:
+    """Random places where discs keep clear of walls, furniture and each other.
+
+    Args:
+        scene: with its furniture where scene.xml has it.
+        radii_m: of the discs, in the order in which they are placed.
+        height_m: furniture above this does not count.
+        rng: random stream.
+
+    Returns:
+        (n, 2) world x, y, m.
+
+    Raises:
+        ViewError: a disc finds no place.
+    """
+    maps = scene.maps
+    poses = {m.name: (m.pos_w, m.quat_w) for m in scene.movables}
+    room_m = clearance(maps.traversable & ~furniture_map(scene, poses, height_m), maps.resolution_m)
+    rows, columns = np.indices(room_m.shape)
+    centres = np.stack([columns + 0.5, rows + 0.5], axis=-1) * maps.resolution_m + maps.origin_w
+    places: list[np.ndarray] = []
+    for k, radius in enumerate(radii_m):
+        free = room_m >= radius + GAP_M
+        for xy, other in zip(places, radii_m, strict=False):
+            free &= np.linalg.norm(centres - xy, axis=-1) > radius + other + GAP_M
+        cells = np.argwhere(free)
+        if not len(cells):
+            raise ViewError(
+                f"{scene.name}: no free place for thing {k} of radius {radius:.2f} m; ask for fewer --objects"
+            )
+        r, c = cells[rng.integers(len(cells))]
+        places.append(centres[r, c])
+    return np.array(places).reshape(-1, 2)
+
+
+def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObject], seed: int = 0) -> mujoco.MjModel:
+    """The scene as stored, with textures and hulls, a robot and small objects at random free places.
+
+    Args:
+        folder: of the scene.
+        robot: or None.
+        small: small objects.
+        seed: of the places.
+
+    Raises:
+        SceneError: an unusable scene folder.
+        ViewError: no room for a robot or object.
+    """
+    scene = load_scene(folder)
+    rng = np.random.default_rng(seed)
+    radii = [robot.footprint_radius_m] if robot else []
+    height_m = max([robot.height_m if robot else 0.0, *(o.height_m for o in small)], default=0.0)
+    places = place_discs(scene, [*radii, *(o.radius_m for o in small)], max(height_m, 0.1), rng)
+    spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+    if robot is not None:
+        robot.add_to(spec)
+        base = spec.body(robot.base_body)
+        base.pos = [*places[0], robot.spawn_height_m]
+        yaw = rng.uniform(-np.pi, np.pi)
+        base.quat = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    for i, (obj, xy) in enumerate(zip(small, places[len(radii) :], strict=True)):
+        yaw = rng.uniform(-np.pi, np.pi)
+        name = f"{obj.category}_small_{i}"
+        body = spec.worldbody.add_body(name=name, pos=[*xy, 0.0], quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+        body.add_freejoint(name=f"{name}_joint")
+        volume = sum(8 * float(np.prod(b.half_m)) for b in obj.boxes)
+        for k, box in enumerate(obj.boxes):
+            body.add_geom(
+                name=f"{name}_box_{k}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=box.centre_m,
+                size=box.half_m,
+                density=obj.mass_kg / volume,
+                friction=[obj.friction, 0.005, 0.0001],
+                group=3,
+            )
+        add_shapes(body, obj, name)
+    model = spec.compile()
+    if robot is not None:
+        _show_robot(model, robot)
+    return model
+
+
+def _show_robot(model: mujoco.MjModel, robot: RobotSpec) -> None:
+    """A robot of collision shapes only is shown by these: viewers hide groups 3 and up."""
+    base = model.body(robot.base_body).id
+    own = np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)
+    if len(own) and (model.geom_group[own] > VISUAL_GROUP).all():
+        model.geom_group[own] = VISUAL_GROUP
+
+
+def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Opens MuJoCo's own viewer; returns when its window is closed."""
+    importlib.import_module("mujoco.viewer").launch(model, data)
+
+
+def open_browser(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> None:
+    """Serves mjviser's page until Ctrl-C."""
+    viser, mjviser = importlib.import_module("viser"), importlib.import_module("mjviser")
+    mjviser.Viewer(model, data, server=viser.ViserServer(port=port)).run()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m interactive_nav.view", description="Looks at a scene.")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument("--robot", metavar="NAME", help=f"robot to put in: {', '.join(robot_names())} (default: none)")
+    parser.add_argument("--objects", type=int, default=10, metavar="N", help="small objects (default 10)")
+    parser.add_argument("--small-objects", choices=SPLITS, default="train", help="whose models (default train)")
+    parser.add_argument("--seed", type=int, default=0, help="of the places (default 0)")
+    parser.add_argument("--viewer", choices=VIEWERS, default="auto", help="default: a window where there is a screen")
+    parser.add_argument("--port", type=int, default=8080, help="of the browser's viewer (default 8080)")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Opens a viewer; 0 when it was closed, 2 with one line on stderr when none can open."""
+    arguments = _parser().parse_args(argv)
+    try:
+        robot = get_robot(arguments.robot) if arguments.robot else None
+        small = pick(arguments.objects, arguments.small_objects)
+        model = build_model(arguments.scene, robot, small, arguments.seed)
+        viewer = choose_viewer(arguments.viewer)
+    except ValueError as error:
+        print("error: " + " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    if viewer == "window":
+        open_window(model, data)
+    else:
+        with contextlib.suppress(KeyboardInterrupt):
+            open_browser(model, data, arguments.port)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+"""Recipes: parsed, refused by name; one tiny scene made, kept, made again with the same bytes."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from converters.__main__ import main
+from converters.generate import Building, GenerationError, design_building
+from converters.generate.cad import TEST_MODELS, TRAIN_MODELS
+from converters.generate.doors import wall_behind_m
+from converters.generate.furnish import SIDE_WALL_M
+from converters.generate.maps import clearance
+from converters.generate.recipes import load_recipes, make_scenes, parse_recipes
+from converters.generate.space import GRID_M, passes, room_mask, static_grid, without
+
+SCENES = Path(__file__).parents[2] / "scenes_mjcf"
+TINY = """
+conversion: {structure_faces: 500, object_faces: 60, structure_texture: 64, object_texture: 32}
+shared:
+  one: &one {floor_area_m2: 12, n_rooms: 1, n_chairs: 1, n_tables: 1, n_desks: 0, n_sofas: 0, n_doors: 0}
+scenes:
+  hut: {split: train, seed: 1, building: {<<: *one, n_bottlenecks: 0, n_windows: 0, n_static: 0, voxel_m: 0.05}}
+  shed: {split: test, seed: 2, building: {<<: *one, n_bottlenecks: 0, n_windows: 0, n_static: 0, voxel_m: 0.05}}
+"""
+
+
+def good() -> dict:
+    return {"scenes": {"a": {"split": "train", "seed": 1, "building": {"n_rooms": 4, "n_chairs": [3, 5]}}}}
+
+
+def test_a_number_stands_for_a_range_and_the_split_chooses_the_models():
+    data = good()
+    data["scenes"]["b"] = {"split": "test", "seed": 2}
+    a, b = parse_recipes(data, "x").scenes
+    assert (a.building.n_rooms, a.building.n_chairs) == ((4, 4), (3, 5))
+    assert a.building.models == TRAIN_MODELS and b.building.models == TEST_MODELS
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(scene={}), "unknown key 'scene'; did you mean 'scenes'"),
+        (lambda d: d["scenes"].update(a=3), "scenes: a: got 3, expected a mapping"),
+        (lambda d: d["scenes"]["a"].update(split="val"), "split is 'val', expected one of train, test"),
+        (lambda d: d["scenes"]["a"].update(seed=-1), "seed is -1, expected a whole number"),
+        (lambda d: d["scenes"]["a"]["building"].update(n_room=4), "unknown key 'n_room'; did you mean 'n_rooms'"),
+        (lambda d: d["scenes"]["a"]["building"].update(n_rooms="4"), "n_rooms is '4', expected a number or"),
+        (lambda d: d["scenes"]["a"]["building"].update(n_rooms=[5, 4]), "n_rooms is .5, 4.: expected 0 <= lowest"),
+        (lambda d: d["scenes"]["a"]["building"].update(models=["x"]), "unknown key 'models'"),
+        (lambda d: d["scenes"]["a"]["building"].update(leaves_at_walls=1), "leaves_at_walls is 1, expected a bool"),
+        (lambda d: d["scenes"]["a"]["building"].update(n_blockers=9), "each bottleneck needs a chair"),
+        (lambda d: d.update(conversion={"object_face": 3}), "unknown key 'object_face'; did you mean 'object_faces'"),
+        (lambda d: d.update(conversion={"object_faces": 0.5}), "object_faces is 0.5, expected a whole number"),
+    ],
+)
+def test_bad_recipes_are_named(change, message):
+    data = good()
+    change(data)
+    with pytest.raises(GenerationError, match=message):
+        parse_recipes(data, "x")
+
+
+def test_missing_and_unreadable_files_and_unknown_names(tmp_path, capsys):
+    with pytest.raises(GenerationError, match="no such file"):
+        load_recipes(tmp_path / "recipes.yaml")
+    (tmp_path / "recipes.yaml").write_text("scenes: [")
+    assert main(["generate-scenes", str(tmp_path)]) == 2
+    assert "not readable as YAML" in capsys.readouterr().err
+    (tmp_path / "recipes.yaml").write_text(TINY)
+    assert main(["generate-scenes", str(tmp_path), "--only", "hat"]) == 2
+    assert capsys.readouterr().err.strip() == "error: no recipe named 'hat'; did you mean 'hut'?"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recipes.yaml"]
+
+
+def digest(folder: Path) -> dict[str, str]:
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def test_scenes_are_made_kept_and_made_again_with_the_same_bytes(tmp_path, hull_cache, monkeypatch):
+    monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
+    (tmp_path / "recipes.yaml").write_text(TINY)
+    recipes, lines, shares = load_recipes(tmp_path / "recipes.yaml"), [], []
+    failed = make_scenes(recipes, tmp_path, ("hut",), report=lambda _, s: shares.append(s), tell=lines.append)
+    assert set(failed) == {"hut"} and shares[-1] == pytest.approx(1.0) and shares == sorted(shares)
+    assert (tmp_path / "hut" / "preview.png").is_file() and not (tmp_path / "shed").exists()
+    first = digest(tmp_path / "hut")
+    assert make_scenes(recipes, tmp_path, ("hut",), tell=lines.append) == {}
+    assert lines[-1] == "hut: is there, kept"
+    make_scenes(recipes, tmp_path, ("hut",), overwrite=True)
+    assert digest(tmp_path / "hut") == first
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
+
+
+def test_an_interruption_leaves_the_old_scene_and_no_litter(tmp_path, monkeypatch):
+    (tmp_path / "hut").mkdir()
+    (tmp_path / "hut" / "scene.json").write_text("old")
+    (tmp_path / "recipes.yaml").write_text(TINY)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("converters.generate.recipes.convert", stop)
+    with pytest.raises(KeyboardInterrupt):
+        make_scenes(load_recipes(tmp_path / "recipes.yaml"), tmp_path, ("hut",), overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
+    assert (tmp_path / "hut" / "scene.json").read_text() == "old"
+
+
+RECIPES = {r.name: r for r in load_recipes(SCENES / "recipes.yaml").scenes if r.name != "apartment_0"}
+
+
+@functools.cache
+def designed(name: str) -> Building:
+    return design_building(RECIPES[name].seed, RECIPES[name].building)
+
+
+@pytest.mark.parametrize("name", ["birch", "elm"])
+def test_leaves_rest_beside_walls_out_of_the_way(name):
+    building = designed(name)
+    plan = building.plan
+    assert all(d.width_m >= 0.98 - 1e-9 for d in plan.doorways)
+    for item in [i for i in building.items if i.hinge is not None]:
+        assert item.hinge is not None
+        hinge = item.to_floor(np.array([item.hinge.origin]))[0, :2]
+        rects = [shapely.box(d.rect.x0, d.rect.y0, d.rect.x1, d.rect.y1) for d in plan.doorways]
+        doorway = plan.doorways[int(np.argmin([r.distance(shapely.Point(hinge)) for r in rects]))]
+        high_side = item.footprint.centroid.coords[0][doorway.axis] > doorway.rect.centre[doorway.axis]
+        high_jamb = hinge[1 - doorway.axis] > doorway.rect.centre[1 - doorway.axis]
+        assert doorway.rooms[int(high_side)] != plan.corridor
+        assert 0 < wall_behind_m(doorway, high_side, high_jamb, plan) <= SIDE_WALL_M
+        low, high = item.hinge.range_rad
+        opened = max(-low, high)  # from closed to where it stands
+        assert np.radians(84) <= opened <= np.radians(115)
+
+
+def test_a_blocker_leaves_a_doorway_too_narrow_for_a_robot():
+    recipe, building = RECIPES["elm"], designed("elm")
+    plan, items = building.plan, building.items
+    empty, chairs = static_grid(plan), [i for i in items if i.model.category == "chair"]
+    blocked = 0
+    for d in plan.doorways:
+        masks = [room_mask(empty, plan.rooms[i]) for i in d.rooms]
+        here = masks[0] | masks[1] | room_mask(empty, d.rect)
+        width = 2 * recipe.building.robot_radius_m
+        assert passes(clearance(empty & here, GRID_M), masks, width)
+        blocked += any(not passes(clearance(without(empty, [c]) & here, GRID_M), masks, width) for c in chairs)
+    assert blocked >= recipe.building.n_blockers == 1

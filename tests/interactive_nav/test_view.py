@@ -1,0 +1,106 @@
+"""The viewer's command: which viewer is taken, what is said where none can open, and the model it shows."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from interactive_nav import view
+from interactive_nav.objects import pick
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import load_scene
+
+
+def yes() -> bool:
+    return True
+
+
+def no() -> bool:
+    return False
+
+
+def test_a_window_where_there_is_a_screen_else_the_browser():
+    assert view.choose_viewer("auto", yes, yes) == view.choose_viewer("auto", yes, no) == "window"
+    assert view.choose_viewer("auto", no, yes) == view.choose_viewer("browser", yes, yes) == "browser"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "has", "message"),
+    [("auto", no, "no screen to open a window on, and mjviser is not installed; 'pip install mjviser'"),
+     ("browser", no, "^mjviser is not installed; 'pip install mjviser'"),
+     ("window", yes, "no screen to open a window on; .* --viewer browser")],
+)  # fmt: skip
+def test_what_is_missing_is_said(wanted, has, message):
+    with pytest.raises(view.ViewError, match=message):
+        view.choose_viewer(wanted, no, has)
+
+
+def test_without_a_display_and_mjviser_the_command_says_so_in_one_line(room, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(view, "has_browser_viewer", no)
+    monkeypatch.setattr("sys.platform", "linux")
+    # The defaults of choose_viewer were bound at import: name them again, with GLFW really asked.
+    monkeypatch.setattr(view.choose_viewer, "__defaults__", (view.can_open_window, no))
+    assert view.main([str(room), "--objects", "2"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert error == [
+        "error: no screen to open a window on, and mjviser is not installed; "
+        "'pip install mjviser' shows the scene in a browser"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--robot", "turtlbot"], "unknown robot 'turtlbot'; did you mean 'turtlebot'"),
+        (["--objects", "-1"], "num_objects is -1"),
+        (["--objects", "400"], "no free place for thing"),
+    ],
+)
+def test_bad_arguments_give_one_line(room, capsys, arguments, message):
+    assert view.main([str(room), *arguments]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1 and message in error[0]
+
+
+def test_the_chosen_viewer_is_given_the_model(room, monkeypatch):
+    opened = []
+    monkeypatch.setattr(view.choose_viewer, "__defaults__", (no, yes))
+    monkeypatch.setattr(view, "open_browser", lambda model, data, port: opened.append((model.nbody, port)))
+    assert view.main([str(room), "--robot", "turtlebot", "--objects", "1", "--port", "9000"]) == 0
+    # World, structure, the room's cube, robot with two wheels, one small object.
+    assert opened == [(7, 9000)]
+
+
+def test_what_is_placed_stands_free_at_rest_and_is_seen(two_rooms):
+    robot, small = get_robot("turtlebot"), pick(4)
+    model = view.build_model(two_rooms, robot, small, seed=3)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for contact in data.contact[: data.ncon]:
+        names = {model.geom(g).name for g in contact.geom}
+        assert "floor" in names or contact.dist > -2e-3, names
+    start = data.xpos.copy()
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    placed = [b for b in range(model.nbody) if "small" in model.body(b).name or "turtlebot" in model.body(b).name]
+    assert len(placed) == 7 and np.linalg.norm(data.xpos - start, axis=1)[placed].max() < 0.03
+    for name in (robot.base_body, "basket_small_0"):
+        body = model.body(name).id
+        assert (model.geom_group[model.geom_bodyid == body] <= 2).any()
+    assert model.body("basket_small_0").subtreemass[0] == pytest.approx(0.9)
+
+
+def test_places_keep_clear_of_walls_furniture_and_each_other(two_rooms):
+    scene = load_scene(two_rooms)
+    places = view.place_discs(scene, [0.2] * 5, 0.4, np.random.default_rng(0))
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1) + 9 * np.eye(5)
+    assert gaps.min() > 0.4
+    assert (np.abs(places[:, 0]) < 2.5 - 0.2).all() and (np.abs(places[:, 1]) < 2.0 - 0.2).all()
+    for movable in scene.movables:
+        if movable.hinge is None:
+            half = movable.boxes[0, 7:9]
+            outside = np.maximum(np.abs(places - movable.pos_w[:2]) - half, 0)
+            assert np.linalg.norm(outside, axis=1).min() > 0.2

@@ -1,0 +1,103 @@
+"""The scenes of this repository: split, sizes, counts, CAD models of their own, gates, room for each robot."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from converters.gates import LIMITS, eroded
+from converters.generate.cad import TEST_MODELS, TRAIN_MODELS, cad_model
+from converters.generate.recipes import load_recipes
+from converters.maps import label_pieces
+from scenes_mjcf.schema import SceneManifest, load_manifest, load_maps
+
+ROOT = Path(__file__).parents[1]
+SCENES = ROOT / "scenes_mjcf"
+SMALL = "apartment_0"
+"""The building of tests and benchmarks; not one of the ten."""
+RECIPES = {r.name: r for r in load_recipes(SCENES / "recipes.yaml").scenes}
+TEN = sorted(set(RECIPES) - {SMALL})
+FURNITURE = ("chair", "desk", "door", "sofa", "table")
+
+
+@functools.cache
+def manifest(name: str) -> SceneManifest:
+    return load_manifest(SCENES / name)
+
+
+def test_every_recipe_is_a_scene_and_every_scene_has_a_recipe():
+    folders = {p.parent.name for p in SCENES.glob("*/scene.json")}
+    assert folders == set(RECIPES) and len(TEN) == 10
+    assert {name: manifest(name).split for name in RECIPES} == {name: r.split for name, r in RECIPES.items()}
+    assert Counter(manifest(name).split for name in TEN) == {"train": 8, "test": 2}
+    assert len({r.seed for r in RECIPES.values()}) == len(RECIPES)
+
+
+def test_sizes_and_rooms_span_those_of_the_original():
+    areas = sorted(manifest(name).floor_area_m2 for name in TEN)
+    assert 60 <= areas[0] < 70 and 140 < areas[-1] <= 165
+    assert min(b - a for a, b in zip(areas, areas[1:], strict=False)) > 1.0
+    rooms = [RECIPES[name].building.n_rooms[0] for name in TEN]
+    assert min(rooms) == 4 and max(rooms) == 11 and len(set(rooms)) >= 6
+
+
+@pytest.mark.parametrize("name", TEN)
+def test_objects(name):
+    counts = Counter(o.category for o in manifest(name).objects)
+    assert 12 <= sum(counts.values()) <= 25 and set(counts) == set(FURNITURE)
+    assert counts["chair"] >= 5 and counts["door"] >= 2
+
+
+def test_no_cad_model_is_in_both_splits_and_each_class_has_several():
+    used = {
+        split: {(o.category, o.cad_id) for n in RECIPES if manifest(n).split == split for o in manifest(n).objects}
+        for split in ("train", "test")
+    }
+    assert used["train"].isdisjoint(used["test"])
+    library = {cad_model(name).id_cad: name for name in (*TRAIN_MODELS, *TEST_MODELS)}
+    assert {library[cad] for _, cad in used["train"]} <= set(TRAIN_MODELS)
+    assert {library[cad] for _, cad in used["test"]} <= set(TEST_MODELS)
+    for split, least in (("train", 3), ("test", 2)):
+        variety = Counter(category for category, _ in used[split])
+        assert all(variety[c] >= least for c in FURNITURE), (split, variety)
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_gates_pass_and_mujoco_loads_it(name):
+    gates = manifest(name).gates
+    assert set(gates) == set(LIMITS) and all(g["passed"] for g in gates.values())
+    model = mujoco.MjModel.from_xml_path(str(SCENES / name / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert np.isfinite(data.qpos).all()
+    assert {model.joint(f"{o.name}_hinge").name for o in manifest(name).objects if o.category == "door"}
+
+
+@pytest.mark.parametrize("name", TEN)
+def test_robots_reach_all_rooms_through_the_static_structure(name):
+    maps = load_maps(SCENES / name)
+    for radius_m in (0.18, 0.30):  # TurtleBot, Fetch
+        pieces, count = label_pieces(eroded(maps.traversable, maps.resolution_m, radius_m), np.ones((3, 3)))
+        size = np.bincount(pieces.ravel())[1:] * maps.resolution_m**2
+        # Slivers between a cupboard and a corner may be cut off; a room may not.
+        assert count and size.sum() - size.max() < 0.5
+    pieces, _ = label_pieces(eroded(maps.traversable, maps.resolution_m, 0.45), np.ones((3, 3)))
+    assert np.bincount(pieces.ravel())[1:].max() * maps.resolution_m**2 > 5.0  # JackRabbot
+
+
+@pytest.mark.parametrize("name", TEN)
+def test_preview_is_there_and_not_empty(name):
+    with Image.open(SCENES / name / "preview.png") as image:
+        assert min(image.size) > 400
+        assert len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)) > 50
+
+
+def test_scenes_stay_small():
+    size = sum(p.stat().st_size for p in SCENES.rglob("*") if p.is_file() and "__pycache__" not in p.parts)
+    assert size < 9 * 2**20
