@@ -376,9 +376,7 @@ class InteractiveNav(Env):
         config = self.config
         p_eff = scores.path_efficiency(success, nav.shortest_path_m, nav.robot_path_m, config.clip_path_efficiency)
         kinematic = scores.kinematic_effort(masses, paths)
-        dynamic = scores.dynamic_effort(
-            self.score_mass_kg, nav.force_sum_n, nav.step_count, config.score_gravity_m_s2
-        )
+        dynamic = scores.dynamic_effort(self.score_mass_kg, nav.force_sum_n, nav.step_count, config.score_gravity_m_s2)
         counts = 1.0 if config.effort_on_failure else jnp.asarray(success, jnp.float32)
         kinematic, dynamic = counts * kinematic, counts * dynamic
         e_eff = 0.5 * (kinematic + dynamic)
