@@ -52,7 +52,7 @@ def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]
 
 
 def sensor_addresses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Addresses in sensordata of the whole robot's and of its rolling bodies' lists: [a, SLOTS, 7] and [b, SLOTS, 7]."""
+    """Addresses in sensordata of the whole robot's lists and of its rolling bodies': [a, SLOTS, 7], [b, SLOTS, 7]."""
     names = [(model.sensor(i).name, int(model.sensor_adr[i])) for i in range(model.nsensor)]
 
     def of(prefix: str) -> np.ndarray:

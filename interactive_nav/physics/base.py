@@ -137,8 +137,12 @@ class ForceOptions:
     needs_contacts: bool = False
 
 
+PAPER_FORCE = ForceOptions()
+"""The paper's: everything that touches, summed as vectors."""
+
+
 def summarise_forces(
-    force_w: Any, xp: Any = jnp, contacts: Any = None, options: ForceOptions = ForceOptions()
+    force_w: Any, xp: Any = jnp, contacts: Any = None, options: ForceOptions = PAPER_FORCE
 ) -> dict[str, Any]:
     """Contact forces of all substeps to the fields of `StepSignals` that hold forces.
 

@@ -15,7 +15,7 @@ from mujoco import mjx
 
 from interactive_nav.config import NavConfig
 from interactive_nav.contacts import from_sensors, part_of_contacts, sensor_addresses
-from interactive_nav.physics.base import ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import Layout, World
@@ -31,7 +31,7 @@ CCD_PER_ENV = 32
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap."""
 
-    def __init__(self, world: World, config: NavConfig, impl: str, forces: ForceOptions = ForceOptions()):
+    def __init__(self, world: World, config: NavConfig, impl: str, forces: ForceOptions = PAPER_FORCE):
         self.name = impl
         self.window = Window(world, config)
         self._world, self._substeps = world, config.substeps

@@ -17,7 +17,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from interactive_nav.contacts import from_sensors, sensor_addresses
-from interactive_nav.physics.base import ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import World
 
@@ -53,7 +53,7 @@ class NativePhysics(Physics):
         substeps: int,
         sleep: bool = True,
         threads: int = 0,
-        forces: ForceOptions = ForceOptions(),
+        forces: ForceOptions = PAPER_FORCE,
     ):
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
         self._substeps = substeps
