@@ -30,6 +30,9 @@ from interactive_nav.world import World, build_world, parking_spot
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
 
+SETTLE_STEPS = 5
+"""Small objects that come to rest in an episode's first control steps, untouched, have not been moved."""
+
 LIFT_M = 0.2
 """A base that rises this far above its standing height has left the floor (the original's early failure)."""
 
@@ -340,8 +343,9 @@ class InteractiveNav(Env):
         travelled = _moved(pos_w - nav.robot_pos_w)
         pushed = jnp.where(self.tables.mass_kg[scene, 1:] > 0, _moved(objects - nav.object_pos_w), 0.0)
         touched = nav.touched | (~broken & (signals.slot_force_n > TOUCH_FORCE_N))
-        if self.config.kinematic_sum == "touched":
-            pushed = jnp.where(touched, pushed, 0.0)
+        settled = nav.step_count >= SETTLE_STEPS
+        counts = touched if self.config.kinematic_sum == "touched" else touched | settled
+        pushed = jnp.where(counts, pushed, 0.0)
         ok = (~broken).astype(jnp.int32)
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
         yaw = jnp.where(broken, nav.yaw_rad, _yaw(rotation))

@@ -245,7 +245,7 @@ class Planner:
     @staticmethod
     def _stale(plan: Plan, pos: np.ndarray, objects: np.ndarray) -> bool:
         moved = np.linalg.norm(objects - plan.object_pos_w, axis=-1).max(initial=0.0) > MOVED_M
-        off = not len(plan.path_w) or np.linalg.norm(plan.path_w - pos, axis=-1).min() > 0.15
+        off = len(plan.path_w) > 0 and np.linalg.norm(plan.path_w - pos, axis=-1).min() > 0.15
         return bool(moved or off)
 
     def _plan(self, scene: int, qpos, pos, goal, objects, step: int) -> Plan:
