@@ -162,6 +162,7 @@ def plan_path(free: np.ndarray, cost: np.ndarray, start: tuple[int, int], goal: 
         b = (slice(dr, rows), slice(c0 + dc, c1 + dc))
         ok = free[a] & free[b]
         mean = 0.5 * (cost[a] + cost[b])
+        through = np.zeros(mean.shape)
         if abs(dr) + abs(dc) > 1:
             # The two cells in the middle of a knight's move, the two beside a diagonal.
             sign = 1 if dc > 0 else -1
@@ -169,6 +170,9 @@ def plan_path(free: np.ndarray, cost: np.ndarray, start: tuple[int, int], goal: 
             for mr, mc in middles[dr, abs(dc)]:
                 m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
                 ok = ok & free[m]
+                through = through + cost[m]
+        if abs(dr) + abs(dc) == 3:
+            mean = 0.5 * mean + 0.25 * through
         sources.append(index[a][ok])
         targets.append(index[b][ok])
         weights.append(CELL_M * math.hypot(dr, dc) * mean[ok])

@@ -85,7 +85,7 @@ def run_episodes(
     episode_of = np.arange(count)  # episode played by each place in the batch
     finished = np.zeros(count, bool)
     planner = policy if isinstance(policy, Planner) else None
-    chunk = None if planner else jax.jit(functools.partial(_play_chunk, env, policy))
+    chunk = None if isinstance(policy, Planner) else jax.jit(functools.partial(_play_chunk, env, policy))
     one_step = jax.jit(functools.partial(_play_step, env)) if planner else None
     step = 0
     while not finished.all():
