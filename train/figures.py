@@ -125,7 +125,7 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
     for level in np.arange(0.1, 1.0, 0.1):
         p = np.linspace(0.0, 1.0, 50)
         axis.plot(p, 2 * level - p, color="0.85", linewidth=0.7, zorder=0)
-    axis.set_xlim(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.02)
+    axis.set_xlim(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.09)
     axis.set_ylim(low_y, 1.02)
     axis.set_xlabel("P$_{eff}$: shortest path over path driven, 0 on failure")
     axis.set_ylabel("E$_{eff}$: effort efficiency")
