@@ -69,7 +69,7 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     if episodes < 1:
         raise ValueError(f"episodes is {episodes}, expected at least 1")
     keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
-    starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw(jax.random.split(key)[1]))))(keys)
+    starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
     starts, lengths = jax.tree.map(np.asarray, (starts, lengths))
     rows = []
     for i in range(episodes):
