@@ -51,7 +51,8 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     Args:
         robot: a name from `robot_names()`.
         scenes: scene folders; each episode draws one.
-        **settings: fields of `NavConfig`, such as backend, num_objects, observations, k_int, episode_steps.
+        **settings: fields of `NavConfig`, such as backend, num_objects, observations, k_int, episode_steps; or
+            `variant="code"` for the values of the original's code where it differs from its paper.
 
     Returns:
         A `brax.envs.Env` with pure `reset` and `step` for one environment; batch it with `jax.vmap`.

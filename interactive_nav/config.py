@@ -17,6 +17,39 @@ RENDERERS = ("auto", "warp", "rays")
 IMAGE_DTYPES = ("float32", "float16", "uint8")
 COLLISIONS = ("boxes", "hulls")
 CONES = ("pyramidal", "elliptic")
+CHOICES = {
+    "backend": BACKENDS,
+    "collision": COLLISIONS,
+    "cone": CONES,
+    "interaction_with": ("movables", "anything"),
+    "kinematic_sum": ("all", "touched"),
+    "force_part": ("full", "normal"),
+    "force_sum": ("vector", "contacts", "last_substep"),
+    "robot_mass": ("total", "links", "base"),
+    "waypoint_style": ("ahead", "grid"),
+    "potential": ("continuous", "quantised"),
+    "scene_choice": ("episode", "slot"),
+}
+"""Settings that are one of a few words."""
+ORIGINAL_CODE: dict[str, Any] = {
+    "episode_steps": 500,
+    "success_in_3d": True,
+    "fail_when_lifted": True,
+    "interaction_with": "anything",
+    "kinematic_sum": "touched",
+    "force_part": "normal",
+    "score_gravity_m_s2": 9.8,
+    "robot_mass": "links",
+    "effort_on_failure": False,
+    "waypoint_style": "grid",
+    "potential": "quantised",
+    "scene_choice": "slot",
+    "goal_clear": False,
+    "random_object_yaw": False,
+    "bootstrap_at_time_limit": False,
+}
+"""What the original's code did where it differs from its paper (reference benchmark, section 11)."""
+VARIANTS: dict[str, dict[str, Any]] = {"paper": {}, "code": ORIGINAL_CODE}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +89,39 @@ class NavConfig:
     """Arc length between waypoints."""
     nav_cell_m: float = 0.1
     """Cell side of the navigation grid."""
-    max_goals: int = 1024
-    """Goal cells per scene: a uniform draw of the free cells, so that tables stay small."""
+    success_in_3d: bool = False
+    """Success by the distance in space to the goal on the floor, as the original's code; else in the plane."""
+    fail_when_lifted: bool = False
+    """End the episode as a failure when the base rises 0.2 m above its standing height; it is counted anyway."""
+    interaction_with: str = "movables"
+    """Touches that cost k_int: movables (any part of the robot) or anything (walls too, but wheels exempt)."""
+    kinematic_sum: str = "all"
+    """Objects in the kinematic effort: all, or touched (each from the step of its first touch on)."""
+    force_part: str = "full"
+    """Force in the dynamic effort: full contact force, or normal (without friction, wheels exempt)."""
+    force_sum: str = "vector"
+    """F_t: norm of the vector sum (vector) or sum of the contacts' norms (contacts), mean over the substeps; or the
+    vector sum of the last_substep only."""
+    score_gravity_m_s2: float = 9.81
+    """g in the dynamic effort."""
+    robot_mass: str = "total"
+    """m_0 in the scores: total, links (all but the root link) or base (the root link alone)."""
+    clip_path_efficiency: bool = True
+    """P_eff at most 1."""
+    effort_on_failure: bool = True
+    """E_eff counts on failures; else it is 0 there, as the original's log had it."""
+    waypoint_style: str = "ahead"
+    """ahead: at equal arc length ahead; grid: from the robot's own cell, as the original's code."""
+    potential: str = "continuous"
+    """Geodesic distance from the robot's position, or quantised: from the centre of its cell."""
+    scene_choice: str = "episode"
+    """Each episode draws a scene, or each environment of a batch keeps one (slot; `AutoResetEnv`)."""
+    goal_clear: bool = True
+    """Goals are free of contact for the robot; else only of structure."""
+    random_object_yaw: bool = True
+    """Small objects are turned at random; else they all have yaw 0."""
+    bootstrap_at_time_limit: bool = True
+    """The time limit is a truncation, at which learners bootstrap; else it looks like any other end."""
     solver_iterations: int = 10
     """Newton iterations of the constraint solver per physics step."""
     contact_time_constant_s: float = 0.04
@@ -117,12 +181,9 @@ class NavConfig:
             raise ValueError(f"{field} is {getattr(self, field)!r}, expected {expected}")
 
         object.__setattr__(self, "observations", tuple(self.observations))
-        if self.backend not in BACKENDS:
-            refuse("backend", f"one of {', '.join(BACKENDS)}")
-        if self.collision not in COLLISIONS:
-            refuse("collision", f"one of {', '.join(COLLISIONS)}")
-        if self.cone not in CONES:
-            refuse("cone", f"one of {', '.join(CONES)}")
+        for field, choices in CHOICES.items():
+            if getattr(self, field) not in choices:
+                refuse(field, f"one of {', '.join(choices)}")
         known = (*SIGNALS, *IMAGES)
         unknown = [o for o in self.observations if o not in known]
         if unknown or not self.observations or len(set(self.observations)) != len(self.observations):
@@ -146,7 +207,7 @@ class NavConfig:
         for field in ("depth_range_m", "lidar_range_m"):
             if not getattr(self, field) > 0:
                 refuse(field, "a positive number")
-        for field in ("episode_steps", "num_waypoints", "max_goals", "solver_iterations", "image_size", "lidar_rays"):
+        for field in ("episode_steps", "num_waypoints", "solver_iterations", "image_size", "lidar_rays"):
             if getattr(self, field) < 1:
                 refuse(field, "at least 1")
         for field in (
@@ -169,6 +230,7 @@ class NavConfig:
             "nav_cell_m",
             "max_goal_distance_m",
             "contact_time_constant_s",
+            "score_gravity_m_s2",
         ):
             if not getattr(self, field) > 0:
                 refuse(field, "a positive number")
@@ -188,17 +250,33 @@ class NavConfig:
         """Physics steps per control step."""
         return round(self.control_dt_s / self.sim_dt_s)
 
+    @property
+    def needs_contacts(self) -> bool:
+        """Whether an option looks at single contacts, not just at each body's net force."""
+        return self.interaction_with == "anything" or self.force_part == "normal" or self.force_sum == "contacts"
 
-def make_config(**settings: Any) -> NavConfig:
+
+def original_code(**settings: Any) -> NavConfig:
+    """All values of the original's code at once (`ORIGINAL_CODE`), and settings by name over them."""
+    return make_config(variant="code", **settings)
+
+
+def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
     """A `NavConfig` from settings by name.
 
+    Args:
+        variant: `paper`, the defaults, or `code`: where the original's code differs from its paper, the code.
+        **settings: fields of `NavConfig`; they go before the variant's.
+
     Raises:
-        ValueError: unknown setting (the message names the nearest valid one) or impossible value.
+        ValueError: unknown variant or setting (the message names the nearest valid one) or impossible value.
     """
+    if variant not in VARIANTS:
+        raise ValueError(f"variant is {variant!r}, expected one of {', '.join(VARIANTS)}")
     fields = {f.name for f in dataclasses.fields(NavConfig)}
     for key in settings:
         if key not in fields:
             near = difflib.get_close_matches(key, fields, 1)
             hint = f"did you mean '{near[0]}'? " if near else ""
             raise ValueError(f"unknown setting '{key}'; {hint}known settings: {', '.join(sorted(fields))}")
-    return NavConfig(**settings)
+    return NavConfig(**{**VARIANTS[variant], **settings})

@@ -14,7 +14,7 @@ from brax.envs.base import Env, State
 
 from interactive_nav import metrics as scores
 from interactive_nav.config import NavConfig
-from interactive_nav.navigation import geodesic_at, waypoints_at
+from interactive_nav.navigation import cell_centre, geodesic_at, goal_field, grid_waypoints_at, waypoints_at
 from interactive_nav.observation import advance_odometry, rotation_from_quat, waypoints_in_body, wrap_angle
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
 from interactive_nav.physics.base import TOUCH_FORCE_N
@@ -24,11 +24,17 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
 from interactive_nav.sensors import Sensors
 from interactive_nav.tables import build_tables, furniture_map, rest_poses
-from interactive_nav.types import EpisodeStart, NavInfo
-from interactive_nav.world import build_world, parking_spot
+from interactive_nav.types import EpisodeStart, GoalField, NavInfo
+from interactive_nav.world import World, build_world, parking_spot
 
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
+
+SETTLE_STEPS = 5
+"""Small objects that come to rest in an episode's first control steps, untouched, have not been moved."""
+
+LIFT_M = 0.2
+"""A base that rises this far above its standing height has left the floor (the original's early failure)."""
 
 EPISODE_METRICS = (
     "success",
@@ -49,6 +55,7 @@ EPISODE_METRICS = (
     "left_out_steps",
     "unconverged_steps",
     "objects_dropped",
+    "lifted",
 )
 REWARD_TERMS = ("reward/success", "reward/potential", "reward/interaction")
 
@@ -84,6 +91,7 @@ class InteractiveNav(Env):
         self.physics = make_physics(self.world, config)
         self.sensors = Sensors(self.world, config, self.physics.name)
         self.success_distance_m = config.success_distance_m or robot.body_width_m
+        self.score_mass_kg = _score_mass(self.world, config)
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
         self._num_small = len(self.world.small_objects)
         self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
@@ -112,30 +120,41 @@ class InteractiveNav(Env):
         """[rows, columns] bool on a scene's map: where furniture stands at rest, below the robot's height."""
         return furniture_map(self.scenes[scene], rest_poses(self.world, scene), self.robot.height_m)
 
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
         """Draws an episode.
 
         Args:
             rng: one PRNG key; consumed.
+            scene: [] i32, to choose the scene; None: drawn.
 
         Returns:
             The first state of the episode.
         """
-        return self.observe(self.draw(rng))
+        return self.observe(self.draw(rng, scene))
 
-    def draw(self, rng: jax.Array) -> State:
+    def draw(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
         """`reset` without an observation: `obs` is empty until `observe`."""
         rng, key = jax.random.split(rng)
-        start = draw_episode(
+        return self._begin(self.draw_start(key, scene), rng)
+
+    def draw_start(self, key: jax.Array, scene: jax.Array | None = None) -> EpisodeStart:
+        """What an episode starts from, as `reset` draws it.
+
+        Args:
+            key: consumed.
+            scene: [] i32, to choose the scene; None: drawn.
+        """
+        return draw_episode(
             key,
             self.tables,
             self._small_radius_m,
             self.robot.footprint_radius_m,
             self.config.min_goal_distance_m,
             self.config.max_goal_distance_m,
-            0.35 * self.config.nav_cell_m,
+            scene,
+            self.config.goal_clear,
+            self.config.random_object_yaw,
         )
-        return self._begin(start, rng)
 
     def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
         """The first state of a given episode (fixed evaluation episodes, tests).
@@ -149,30 +168,32 @@ class InteractiveNav(Env):
     def _begin(self, start: EpisodeStart, rng: jax.Array) -> State:
         physics = self._initial_physics(start)
         pos_w, rotation = self._robot_pose(physics)
-        scene, goal = start.scene_index, start.goal_index
-        geodesic = geodesic_at(self.tables, scene, goal, pos_w[:2])
+        scene = start.scene_index
+        goal = goal_field(self.tables, scene, start.goal_xy_w)
         waypoints_b = self._waypoints(scene, goal, pos_w, rotation)
         zero, count = jnp.zeros(()), jnp.zeros((), jnp.int32)
         slots = self.world.layout.num_slots
         nav = NavInfo(
             scene_index=scene,
-            goal_index=goal,
             goal_xy_w=start.goal_xy_w,
+            goal_field=goal,
             start_xy_w=start.start_xy_w,
             robot_pos_w=pos_w,
             yaw_rad=_yaw(rotation),
             waypoints_b=waypoints_b,
             object_pos_w=self._object_positions(scene, physics),
-            geodesic_m=geodesic,
-            shortest_path_m=geodesic,
+            geodesic_m=self._geodesic(scene, goal, pos_w),
+            shortest_path_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
             robot_path_m=zero,
             object_path_m=jnp.zeros(slots),
+            touched=jnp.zeros(slots, bool),
             force_sum_n=zero,
             interaction_steps=count,
             structure_steps=count,
             overflow_steps=count,
             left_out_steps=count,
             unconverged_steps=count,
+            lifted_steps=count,
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
             step_count=count,
             odometry=jnp.zeros(3),
@@ -218,8 +239,14 @@ class InteractiveNav(Env):
         # Contacts were dropped: what the robot did is no longer known, and the episode ends here.
         lost = ~broken & (signals.overflow > 0)
 
-        success = ~broken & ~lost & (jnp.linalg.norm(nav.goal_xy_w - nav.robot_pos_w[:2]) < self.success_distance_m)
-        interacts = self._touches(nav.scene_index, signals)
+        away = jnp.concatenate([nav.goal_xy_w, jnp.zeros(1)]) - nav.robot_pos_w
+        away = away if self.config.success_in_3d else away[:2]
+        success = ~broken & ~lost & (jnp.linalg.norm(away) < self.success_distance_m)
+        lifted = ~broken & ~lost & ~success & (nav.lifted_steps > 0) & self.config.fail_when_lifted
+        if self.config.interaction_with == "anything":
+            interacts = signals.body_force_n > TOUCH_FORCE_N
+        else:
+            interacts = self._touches(nav.scene_index, signals)
         reward, terms = interactive_navigation_reward(
             success.astype(jnp.float32),
             state.info["nav"].geodesic_m,
@@ -228,12 +255,12 @@ class InteractiveNav(Env):
             self.config.k_int,
             self.config.success_reward,
         )
-        timed_out = ~success & ~broken & ~lost & (nav.step_count >= self.config.episode_steps)
-        done = (success | timed_out | broken | lost).astype(jnp.float32)
+        timed_out = ~success & ~broken & ~lost & ~lifted & (nav.step_count >= self.config.episode_steps)
+        done = (success | timed_out | lifted | broken | lost).astype(jnp.float32)
         values = self._scores(nav, success, broken)
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
-        truncation = (timed_out | lost).astype(jnp.float32)
+        truncated = timed_out | lost if self.config.bootstrap_at_time_limit else lost
         return state.replace(
             pipeline_state=physics,
             reward=reward,
@@ -242,7 +269,7 @@ class InteractiveNav(Env):
             info={
                 **state.info,
                 "nav": nav,
-                "truncation": truncation,
+                "truncation": truncated.astype(jnp.float32),
                 "time_out": timed_out.astype(jnp.float32),
             },
         )
@@ -291,24 +318,36 @@ class InteractiveNav(Env):
         occupied = self.tables.mass_kg[scene, 1:] > 0
         return jnp.any(occupied & (signals.slot_force_n > TOUCH_FORCE_N))
 
-    def _waypoints(self, scene, goal, pos_w, rotation) -> jax.Array:
-        world = waypoints_at(
-            self.tables, scene, goal, pos_w[:2], self.config.num_waypoints, self.config.waypoint_spacing_m
-        )
+    def _geodesic(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array) -> jax.Array:
+        """[] m: the distance that the potential is made of."""
+        xy = pos_w[:2]
+        if self.config.potential == "quantised":
+            xy = cell_centre(self.tables, scene, xy)
+        return geodesic_at(self.tables, scene, goal, xy)
+
+    def _waypoints(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
+        config = self.config
+        points_at = grid_waypoints_at if config.waypoint_style == "grid" else waypoints_at
+        world = points_at(self.tables, scene, goal, pos_w[:2], config.num_waypoints, config.waypoint_spacing_m)
         return waypoints_in_body(world, pos_w, rotation)
 
     def _advance(
         self, nav: NavInfo, physics: PhysicsState, signals: StepSignals, broken: jax.Array, rng: jax.Array
     ) -> NavInfo:
         """The task's memory after a step; a broken step leaves positions and totals as they were."""
-        scene, goal = nav.scene_index, nav.goal_index
+        scene, goal = nav.scene_index, nav.goal_field
         pos_w, rotation = self._robot_pose(physics)
         rotation = jnp.where(broken, jnp.eye(3), rotation)
         pos_w = jnp.where(broken, nav.robot_pos_w, pos_w)
         objects = jnp.where(broken, nav.object_pos_w, self._object_positions(scene, physics))
         travelled = _moved(pos_w - nav.robot_pos_w)
         pushed = jnp.where(self.tables.mass_kg[scene, 1:] > 0, _moved(objects - nav.object_pos_w), 0.0)
+        touched = nav.touched | (~broken & (signals.slot_force_n > TOUCH_FORCE_N))
+        settled = nav.step_count >= SETTLE_STEPS
+        counts = touched if self.config.kinematic_sum == "touched" else touched | settled
+        pushed = jnp.where(counts, pushed, 0.0)
         ok = (~broken).astype(jnp.int32)
+        lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
         yaw = jnp.where(broken, nav.yaw_rad, _yaw(rotation))
         touches, hits_wall = self._touches(scene, signals), signals.structure_force_n > TOUCH_FORCE_N
         slip = self.sensors.odometry_error(rng, nav.step_count)
@@ -317,15 +356,17 @@ class InteractiveNav(Env):
             yaw_rad=yaw,
             waypoints_b=self._waypoints(scene, goal, pos_w, rotation),
             object_pos_w=objects,
-            geodesic_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
+            geodesic_m=self._geodesic(scene, goal, pos_w),
             robot_path_m=nav.robot_path_m + travelled,
             object_path_m=nav.object_path_m + pushed,
+            touched=touched,
             force_sum_n=nav.force_sum_n + jnp.where(broken, 0.0, signals.force_n),
             interaction_steps=nav.interaction_steps + ok * touches.astype(jnp.int32),
             structure_steps=nav.structure_steps + ok * hits_wall.astype(jnp.int32),
             overflow_steps=nav.overflow_steps + signals.overflow,
             left_out_steps=nav.left_out_steps + signals.left_out,
             unconverged_steps=nav.unconverged_steps + signals.unconverged,
+            lifted_steps=nav.lifted_steps + ok * lifted.astype(jnp.int32),
             step_count=nav.step_count + 1,
             odometry=advance_odometry(
                 nav.odometry, (pos_w - nav.robot_pos_w)[:2], nav.yaw_rad, wrap_angle(yaw - nav.yaw_rad), slip
@@ -334,11 +375,14 @@ class InteractiveNav(Env):
         )
 
     def _scores(self, nav: NavInfo, success: jax.Array, broken: jax.Array) -> dict[str, jax.Array]:
-        masses = self.tables.mass_kg[nav.scene_index]
+        masses = self.tables.mass_kg[nav.scene_index].at[0].set(self.score_mass_kg)
         paths = jnp.concatenate([nav.robot_path_m[None], nav.object_path_m])
-        p_eff = scores.path_efficiency(success, nav.shortest_path_m, nav.robot_path_m)
+        config = self.config
+        p_eff = scores.path_efficiency(success, nav.shortest_path_m, nav.robot_path_m, config.clip_path_efficiency)
         kinematic = scores.kinematic_effort(masses, paths)
-        dynamic = scores.dynamic_effort(self.world.robot_mass_kg, nav.force_sum_n, nav.step_count)
+        dynamic = scores.dynamic_effort(self.score_mass_kg, nav.force_sum_n, nav.step_count, config.score_gravity_m_s2)
+        counts = 1.0 if config.effort_on_failure else jnp.asarray(success, jnp.float32)
+        kinematic, dynamic = counts * kinematic, counts * dynamic
         e_eff = 0.5 * (kinematic + dynamic)
         values = {
             "success": success,
@@ -359,8 +403,15 @@ class InteractiveNav(Env):
             "left_out_steps": nav.left_out_steps,
             "unconverged_steps": nav.unconverged_steps,
             "objects_dropped": nav.objects_dropped,
+            "lifted": nav.lifted_steps > 0,
         }
         return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+
+
+def _score_mass(world: World, config: NavConfig) -> float:
+    """m_0 as the scores take it, kg."""
+    total, base = world.robot_mass_kg, float(world.models[0].body_mass[world.layout.robot_bodies[0]])
+    return {"total": total, "links": total - world.robot.root_link_kg, "base": base}[config.robot_mass]
 
 
 def _yaw(rotation: jax.Array) -> jax.Array:

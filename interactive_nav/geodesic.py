@@ -1,12 +1,13 @@
-"""Occupancy grids in, geodesic distances and shortest paths out.
+"""Occupancy grids in, geodesic distances and shortest paths out; two solvers.
 
-Distances are shortest paths on a grid whose nodes are the free cells' centres and whose edges are the
-32 moves of `STENCIL`, each allowed only where every cell that it crosses is free. The largest gap
-between the moves' directions is 18.4 degrees, so in open space a distance is at most
-1/cos(9.2 deg) - 1 = 1.3 % too long, where an 8-connected grid errs by up to 8.2 %.
+The environment's is `corner_graph`: among blocked squares a shortest path is straight but where it bends
+round a corner, so the corners' mutual distances, and which corners each place sees, hold every distance
+from anywhere to anywhere (`interactive_nav.navigation` looks them up inside jit).
 
-`distance_field` solves it inside jit by relaxation; `DistanceTable` holds the solution for many goals,
-computed once by SciPy's Dijkstra on the same graph.
+`distance_field` is for any map and goal inside jit: shortest paths on a grid whose nodes are the free
+cells' centres and whose edges are the 32 moves of `STENCIL`, each allowed only where every cell that it
+crosses is free. The largest gap between the moves' directions is 18.4 degrees, so in open space a distance
+is at most 1/cos(9.2 deg) - 1 = 1.3 % too long, where an 8-connected grid errs by up to 8.2 %.
 """
 
 from __future__ import annotations
@@ -169,54 +170,6 @@ def largest_component(free: np.ndarray) -> np.ndarray:
     return labels == 1 + int(np.argmax(sizes))
 
 
-def grid_graph(free: np.ndarray, resolution_m: float) -> tuple[scipy.sparse.csr_matrix, np.ndarray]:
-    """The graph that `distance_field` relaxes.
-
-    Args:
-        free: [rows, columns] bool.
-        resolution_m: cell side.
-
-    Returns:
-        Symmetric CSR matrix [n, n] of edge lengths in m, and the nodes' (row, column) [n, 2].
-    """
-    nodes = np.argwhere(free)
-    index = np.full(free.shape, -1, np.int64)
-    index[free] = np.arange(len(nodes))
-    sources, targets, lengths = [], [], []
-    for move, mask in zip(STENCIL, _edge_masks(np, free), strict=True):
-        at = np.argwhere(mask)
-        sources.append(index[at[:, 0], at[:, 1]])
-        targets.append(index[at[:, 0] + move[0], at[:, 1] + move[1]])
-        lengths.append(np.full(len(at), resolution_m * math.hypot(*move)))
-    entries = (np.concatenate(lengths), (np.concatenate(sources), np.concatenate(targets)))
-    return scipy.sparse.csr_matrix(entries, shape=(len(nodes), len(nodes))), nodes
-
-
-@dataclasses.dataclass(frozen=True)
-class DistanceTable:
-    """Distances and next hops from every free cell to each of G goals, on one navigation grid.
-
-    Cells that are not free (the body would touch structure) borrow their nearest free cell: a robot
-    pressed against a wall still has a distance and a path.
-    """
-
-    resolution_m: float
-    origin_w: tuple[float, float]
-    """World x, y of the outer corner of cell [0, 0]."""
-    node_of_cell: np.ndarray
-    """[rows, columns] int32: index of the nearest free cell."""
-    offset_of_cell_m: np.ndarray
-    """[rows, columns] float32: distance to that cell's centre, 0 on free cells."""
-    node_xy_w: np.ndarray
-    """[n, 2] float32: centres of the free cells."""
-    goal_node: np.ndarray
-    """[G] int32: the goals, which are free cells' centres."""
-    distance_m: np.ndarray
-    """[G, n] float32."""
-    next_node: np.ndarray
-    """[G, n] int32: the next node on the way; a goal's next node is itself."""
-
-
 def navigation_grid(
     traversable: np.ndarray,
     resolution_m: float,
@@ -246,48 +199,183 @@ def navigation_grid(
     return largest_component(sampled >= max(radius_m, 1e-6))
 
 
-def distance_table(
-    free: np.ndarray,
-    cell_m: float,
-    origin_w: tuple[float, float],
-    max_goals: int,
-    seed: int = 0,
-    goals: np.ndarray | None = None,
-) -> DistanceTable:
-    """Solves all-free-cells-to-goal shortest paths for a uniform draw of goal cells.
+@dataclasses.dataclass(frozen=True)
+class CornerGraph:
+    """All shortest paths among blocked squares, for goals anywhere: V corners, n nodes, at most K seen by one.
+
+    Nodes stand for the cells of a coarser grid; a cell without free ground borrows its nearest node, so a
+    robot pressed against a wall still has a distance and a path.
+    """
+
+    free: np.ndarray
+    """[R, C] bool, fine cells, one 4-connected component without cells that touch only diagonally."""
+    fine_m: float
+    """Side of a fine cell."""
+    cell_m: float
+    """Side of a node's cell, a multiple of `fine_m`."""
+    origin_w: tuple[float, float]
+    """World x, y of the outer corner of cell [0, 0] of both grids."""
+    node_of_cell: np.ndarray
+    """[rows, columns] int32."""
+    node_xy_w: np.ndarray
+    """[n, 2] float32: a free point of each node's cell."""
+    corner_xy_w: np.ndarray
+    """[V, 2] float32: convex corners of the blocked squares."""
+    seen: np.ndarray
+    """[n, K] int32: corners that each node sees and a shortest path may bend at; V where there are fewer."""
+    distance_m: np.ndarray
+    """[V, V] float32 between corners."""
+    next_corner: np.ndarray
+    """[V, V] int32: the next corner on the way from the row's to the column's; a corner's own is itself."""
+
+
+_INSET = 0.2
+"""Corners lie this share of a fine cell off their wall, so that sight along the wall is free."""
+_SIGHT_STEP = 1.0
+"""Samples of a line of sight lie at most this many fine cells apart; what slips between clips a corner."""
+
+
+def _without_pinches(free: np.ndarray) -> np.ndarray:
+    """Blocks one of two free cells that touch only at a corner, until none are left."""
+    free = free.copy()
+    while True:
+        a, b, c, d = free[:-1, :-1], free[:-1, 1:], free[1:, :-1], free[1:, 1:]
+        falling, rising = a & d & ~b & ~c, b & c & ~a & ~d
+        if not (falling.any() or rising.any()):
+            return free
+        free[:-1, :-1] &= ~falling
+        free[:-1, 1:] &= ~rising
+
+
+def _corners(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Convex corners of the blocked cells: points [V, 2] (column, row) in cells, and the signs [V, 2] that
+    lead from each into its blocked cell."""
+    padded = np.pad(free, 1)
+    quads = [padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]]
+    signs = [(-1, -1), (1, -1), (-1, 1), (1, 1)]
+    one = sum((~q).astype(int) for q in quads) == 1
+    points, into = [], []
+    for quad, sign in zip(quads, signs, strict=True):
+        r, c = np.nonzero(one & ~quad)
+        points.append(np.stack([c, r], -1) - _INSET * np.asarray(sign))
+        into.append(np.broadcast_to(sign, (len(r), 2)))
+    return np.concatenate(points).astype(float), np.concatenate(into).astype(float)
+
+
+def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Which pairs of points see each other over free cells.
 
     Args:
-        free: [rows, columns] bool, one connected component.
-        cell_m: cell side.
-        origin_w: world corner of cell [0, 0].
-        max_goals: goals are all eligible cells, or this many drawn without replacement.
-        seed: of that draw.
-        goals: [rows, columns] bool, eligible cells; None: all free cells.
+        free: [R, C] bool.
+        a: [P, 2] points (column, row) in cells.
+        b: [P, 2] likewise.
 
     Returns:
-        The table. Memory is 8 bytes x G x n.
+        [P] bool. Halving: the middle first, so that most blocked pairs cost a few samples.
     """
-    graph, nodes = grid_graph(free, cell_m)
-    n = len(nodes)
-    chosen = np.arange(n) if goals is None else np.flatnonzero(goals[free])
-    if len(chosen) > max_goals:
-        chosen = np.sort(np.random.default_rng(seed).choice(chosen, max_goals, replace=False))
-    distance, previous = scipy.sparse.csgraph.dijkstra(graph, indices=chosen, return_predecessors=True)
-    own = previous < 0
-    previous = np.where(own, np.arange(n)[None, :], previous)
-    _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
-    index = np.full(free.shape, -1, np.int64)
-    index[free] = np.arange(n)
-    near_r, near_c = nearest
-    rows, columns = np.indices(free.shape)
-    xy = np.stack([origin_w[0] + (nodes[:, 1] + 0.5) * cell_m, origin_w[1] + (nodes[:, 0] + 0.5) * cell_m], -1)
-    return DistanceTable(
-        resolution_m=cell_m,
+    rows, columns = free.shape
+    out = np.ones(len(a), bool)
+    length = np.linalg.norm(b - a, axis=-1)
+    alive, parts = np.arange(len(a)), 1
+    while len(alive):
+        shares = (np.arange(parts) + 0.5) / parts
+        for share in shares:
+            at = a[alive] + share * (b[alive] - a[alive])
+            c, r = np.floor(at).astype(int).T
+            inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
+            ok = inside & free[np.clip(r, 0, rows - 1), np.clip(c, 0, columns - 1)]
+            out[alive[~ok]] = False
+            alive = alive[ok]
+        parts *= 2
+        alive = alive[length[alive] > _SIGHT_STEP * parts / 2]
+    return out
+
+
+def _seen_corners(
+    free: np.ndarray, points: np.ndarray, corners: np.ndarray, into: np.ndarray, slack: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (point, corner) in sight of which a shortest path may bend at the corner.
+
+    A path that comes from the quadrant opposite the blocked cell could be cut short, so it never bends there;
+    `slack` (cells) widens what counts, for a point that stands for its surroundings.
+    """
+    firsts, seconds = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    if not len(corners):
+        return firsts[0], seconds[0]
+    block = max(1, 2_000_000 // max(len(corners), 1))
+    for begin in range(0, len(points), block):
+        part = points[begin : begin + block]
+        towards = (part[:, None] - corners[None]) * into[None]
+        i, j = np.nonzero(~(towards < -slack).all(-1) & ~(towards > slack).all(-1))
+        ok = sees(free, part[i], corners[j])
+        firsts.append(begin + i[ok])
+        seconds.append(j[ok])
+    return np.concatenate(firsts), np.concatenate(seconds)
+
+
+def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple[float, float]) -> CornerGraph:
+    """Prepares shortest paths from anywhere to anywhere on a map of free cells.
+
+    Args:
+        free: [R, C] bool: cells that the body's centre may be in.
+        fine_m: their side.
+        cell_m: side of a node's cell, a whole multiple of `fine_m`.
+        origin_w: world corner of cell [0, 0].
+
+    Returns:
+        The graph, over the largest component of `free`.
+
+    Raises:
+        ValueError: cell_m is not a multiple of fine_m, or nothing is free.
+    """
+    ratio = round(cell_m / fine_m)
+    if ratio < 1 or abs(cell_m / fine_m - ratio) > 1e-6:
+        raise ValueError(f"cell_m is {cell_m}, expected a whole multiple of fine_m ({fine_m})")
+    free = largest_component(_without_pinches(np.asarray(free, bool)))
+    if not free.any():
+        raise ValueError("free has no free cell, expected at least one")
+    rows, columns = (-(-n // ratio) for n in free.shape)
+    margin = np.zeros((rows * ratio, columns * ratio))
+    margin[: free.shape[0], : free.shape[1]] = clearance(free, 1.0)
+    # The node of a cell is the middle of that of its fine cells that lies farthest from what is blocked.
+    split = margin.reshape(rows, ratio, columns, ratio).swapaxes(1, 2).reshape(rows, columns, -1)
+    best = split.argmax(-1)
+    has_node = split.max(-1) > 0
+    r, c = np.nonzero(has_node)
+    own = best[has_node]
+    points = np.stack([c * ratio + own % ratio + 0.5, r * ratio + own // ratio + 0.5], -1)
+    _, nearest = scipy.ndimage.distance_transform_edt(~has_node, return_indices=True)  # type: ignore[misc]
+    index = np.full(has_node.shape, -1, np.int64)
+    index[has_node] = np.arange(len(points))
+    node_of_cell = index[nearest[0], nearest[1]]
+
+    corners, into = _corners(free)
+    count = len(corners)
+    i, j = _seen_corners(free, corners, corners, into, 2 * _INSET)
+    both = scipy.sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+    both = scipy.sparse.coo_matrix(both.multiply(both.T))
+    i, j = both.row[both.row != both.col], both.col[both.row != both.col]
+    lengths = np.linalg.norm(corners[i] - corners[j], axis=-1) * fine_m
+    graph = scipy.sparse.csr_matrix((lengths, (i, j)), shape=(count, count))
+    if count:
+        distance, previous = scipy.sparse.csgraph.dijkstra(graph, return_predecessors=True)
+        # Row: where from; the predecessor on the way from column to row is the next on the way from row to column.
+        following = np.where(previous.T < 0, np.arange(count)[:, None], previous.T)
+    else:
+        distance, following = np.zeros((0, 0)), np.zeros((0, 0))
+    i, j = _seen_corners(free, points, corners, into, ratio)
+    per_node = np.bincount(i, minlength=len(points))
+    seen = np.full((len(points), max(int(per_node.max()), 1)), count, np.int64)
+    seen[i, np.arange(len(i)) - np.repeat(np.cumsum(per_node) - per_node, per_node)] = j
+    return CornerGraph(
+        free=free,
+        fine_m=fine_m,
+        cell_m=cell_m,
         origin_w=origin_w,
-        node_of_cell=index[near_r, near_c].astype(np.int32),
-        offset_of_cell_m=(np.hypot(near_r - rows, near_c - columns) * cell_m).astype(np.float32),
-        node_xy_w=xy.astype(np.float32),
-        goal_node=chosen.astype(np.int32),
+        node_of_cell=node_of_cell.astype(np.int32),
+        node_xy_w=(np.asarray(origin_w) + points * fine_m).astype(np.float32),
+        corner_xy_w=(np.asarray(origin_w) + corners * fine_m).astype(np.float32).reshape(-1, 2),
+        seen=seen.astype(np.int32),
         distance_m=distance.astype(np.float32),
-        next_node=previous.astype(np.int32),
+        next_corner=following.astype(np.int32),
     )

@@ -23,7 +23,7 @@ def _xp(*values: Any):
     return jax.numpy if any(isinstance(v, jax.Array) for v in values) else np
 
 
-def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array) -> Array:
+def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array, clip: bool = True) -> Array:
     """P_eff = 1_suc * L* / l_0, clipped to [0, 1] (paper section IV; with alpha = 1 the INS is SPL).
 
     A goal is a region, so a robot may succeed on a path shorter than L*: hence the clip. A robot that
@@ -33,16 +33,17 @@ def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array)
         success: [...] 1 or True where the episode reached the goal.
         shortest_path_m: [...] L*, metres, among static structure only; must not be negative.
         robot_path_m: [...] l_0, metres travelled.
+        clip: at most 1; else the plain ratio.
 
     Returns:
-        [...] float in [0, 1].
+        [...] float in [0, 1], without `clip` 0 or more.
     """
     xp = _xp(success, shortest_path_m, robot_path_m)
     shortest = xp.asarray(shortest_path_m) * 1.0
     travelled = xp.asarray(robot_path_m) * 1.0
     moved = travelled > 0.0
     ratio = xp.where(moved, shortest / xp.where(moved, travelled, 1.0), 1.0)
-    return xp.where(xp.asarray(success) > 0, xp.clip(ratio, 0.0, 1.0), 0.0)
+    return xp.where(xp.asarray(success) > 0, xp.clip(ratio, 0.0, 1.0 if clip else None), 0.0)
 
 
 def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:

@@ -1,4 +1,10 @@
-"""Scene tables and a position in, distance to the goal and the path ahead out, inside jit."""
+"""Scene tables and a position in, distance to the goal and the path ahead out, inside jit.
+
+A shortest path is straight but where it bends round a corner (`interactive_nav.geodesic.CornerGraph`). Once
+an episode, `goal_field` solves every corner's distance to the goal; from then on a distance is the least, over
+the corners in sight, of the way there plus what the corner has left. Which corners are in sight is tabulated at
+nodes 0.1 m apart and blended between the four nearest, so the distance is continuous.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +13,10 @@ import math
 import jax
 import jax.numpy as jnp
 
-from interactive_nav.types import SceneTables
+from interactive_nav.types import GoalField, SceneTables
+
+_LIFT = 1.0 + 1e-4
+"""Going straight wins over going round a corner that lies on the line."""
 
 
 def _cell(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -18,25 +27,77 @@ def _cell(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> tuple[jax.Arr
 
 
 def node_at(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Array:
-    """[...] i32: the free cell nearest to the cell that holds each world point [..., 2]."""
+    """[...] i32: the node that stands for the cell that holds each world point [..., 2]."""
     r, c = _cell(tables, scene, xy)
     return tables.node_of_cell[scene, r, c]
 
 
-def geodesic_at(tables: SceneTables, scene: jax.Array, goal: jax.Array, xy: jax.Array) -> jax.Array:
-    """Geodesic distance to a goal from a world point, continuous inside cells.
+def cell_centre(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Array:
+    """[..., 2] m: centre of the navigation cell that holds each world point [..., 2]."""
+    r, c = _cell(tables, scene, xy)
+    return tables.grid_origin_w[scene] + tables.cell_m * (jnp.stack([c, r], -1) + 0.5)
 
-    Bilinear between the four nearest cell centres. A centre where the body would touch structure counts
-    as its nearest free cell's distance plus the way there.
+
+def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
+    """[] bool: whether the line between two world points (2,) crosses free cells only."""
+    rows, columns = tables.free.shape[1:]
+    share = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples
+    points = a + share[:, None] * (b - a)
+    at = jnp.floor((points - tables.grid_origin_w[scene]) / tables.fine_m).astype(jnp.int32)
+    r, c = jnp.clip(at[:, 1], 0, rows - 1), jnp.clip(at[:, 0], 0, columns - 1)
+    return tables.free[scene, r, c].all()
+
+
+def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> GoalField:
+    """Every corner's distance to a goal, and the next corner on the way: once an episode.
 
     Args:
         tables: constants of the scenes.
         scene: [] i32.
-        goal: [] i32 row of the goal.
+        goal_xy_w: (2,) m, anywhere on free ground.
+    """
+    none = tables.corner_xy_w.shape[1] - 1
+    near = tables.seen[scene, node_at(tables, scene, goal_xy_w)].astype(jnp.int32)
+
+    def through(best, corner):
+        distance, last = best
+        length = jnp.linalg.norm(tables.corner_xy_w[scene, corner] - goal_xy_w)
+        total = tables.corner_distance_m[scene, corner] + jnp.where(corner == none, jnp.inf, length)
+        shorter = total < distance
+        return (jnp.where(shorter, total, distance), jnp.where(shorter, corner, last)), None
+
+    nothing = (jnp.full((none + 1,), jnp.inf), jnp.full((none + 1,), none, jnp.int32))
+    (distance, last), _ = jax.lax.scan(through, nothing, near)
+    own = jnp.arange(none + 1)
+    following = jnp.where(last == own, none, tables.next_corner[scene, own, last].astype(jnp.int32))
+    return GoalField(xy_w=goal_xy_w, corner_m=distance, next_corner=jnp.where(jnp.isinf(distance), none, following))
+
+
+def _from_node(
+    tables: SceneTables, scene: jax.Array, goal: GoalField, node: jax.Array, xy: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Distance of a point that sees what its node sees, and where its path first leads: a corner, or the goal."""
+    none = tables.corner_xy_w.shape[1] - 1
+    corners = tables.seen[scene, node].astype(jnp.int32)
+    around = jnp.linalg.norm(tables.corner_xy_w[scene, corners] - xy, axis=-1) + goal.corner_m[corners]
+    best = jnp.argmin(around)
+    straight = jnp.linalg.norm(goal.xy_w - xy)
+    direct = _in_sight(tables, scene, tables.node_xy_w[scene, node], goal.xy_w) | jnp.isinf(around[best])
+    direct &= straight <= around[best] * _LIFT
+    return jnp.where(direct, straight, around[best]), jnp.where(direct, none, corners[best])
+
+
+def geodesic_at(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array) -> jax.Array:
+    """Geodesic distance to a goal from a world point, continuous.
+
+    Args:
+        tables: constants of the scenes.
+        scene: [] i32.
+        goal: of `goal_field`.
         xy: (2,) m, world.
 
     Returns:
-        [] f32, m.
+        [] f32, m. Within centimetres of structure, where the body cannot be, it is that of the nearest node's view.
     """
     rows, columns = tables.node_of_cell.shape[1:]
     u = (xy - tables.grid_origin_w[scene]) / tables.cell_m - 0.5
@@ -44,21 +105,45 @@ def geodesic_at(tables: SceneTables, scene: jax.Array, goal: jax.Array, xy: jax.
     f = u - low
     c = jnp.clip(low[0].astype(jnp.int32) + jnp.array([0, 1, 0, 1]), 0, columns - 1)
     r = jnp.clip(low[1].astype(jnp.int32) + jnp.array([0, 0, 1, 1]), 0, rows - 1)
-    node = tables.node_of_cell[scene, r, c]
-    value = tables.distance_m[scene, goal, node] + tables.offset_of_cell_m[scene, r, c]
+    nodes = tables.node_of_cell[scene, r, c]
+    values, _ = jax.vmap(lambda node: _from_node(tables, scene, goal, node, xy))(nodes)
     weight = jnp.stack([(1 - f[0]) * (1 - f[1]), f[0] * (1 - f[1]), (1 - f[0]) * f[1], f[0] * f[1]])
-    return jnp.sum(weight * value)
+    return jnp.sum(weight * values)
+
+
+def _path(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, hops: int) -> jax.Array:
+    """[hops + 1, 2] m: the point and the bends of its shortest path; the goal repeated at its end."""
+    none = tables.corner_xy_w.shape[1] - 1
+    _, first = _from_node(tables, scene, goal, node_at(tables, scene, xy), xy)
+
+    def hop(corner, _):
+        return goal.next_corner[corner], corner
+
+    _, corners = jax.lax.scan(hop, first, None, length=hops)
+    bends = jnp.where((corners == none)[:, None], goal.xy_w, tables.corner_xy_w[scene, corners])
+    return jnp.concatenate([xy[None], bends])
+
+
+def _along(points: jax.Array, length: jax.Array, arc: jax.Array) -> jax.Array:
+    """[k, 2]: points of a polyline [p, 2] at given lengths [k], its pieces measured by `length` [p - 1]."""
+    before = jnp.cumsum(length) - length
+    share = jnp.clip((arc[:, None] - before) / jnp.maximum(length, 1e-6), 0.0, 1.0)
+    return points[0] + share @ (points[1:] - points[:-1])
+
+
+def _hops(tables: SceneTables, ahead_m: float) -> int:
+    return math.ceil(ahead_m / tables.cell_m) + 2
 
 
 def waypoints_at(
-    tables: SceneTables, scene: jax.Array, goal: jax.Array, xy: jax.Array, count: int, spacing_m: float
+    tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, count: int, spacing_m: float
 ) -> jax.Array:
     """The next waypoints on the shortest path, at equal arc length, the goal repeated at its end.
 
     Args:
         tables: constants of the scenes.
         scene: [] i32.
-        goal: [] i32.
+        goal: of `goal_field`.
         xy: (2,) m, world.
         count: number of waypoints.
         spacing_m: arc length between them; the first lies this far ahead.
@@ -66,24 +151,24 @@ def waypoints_at(
     Returns:
         (count, 2) f32, m, world.
     """
-    hops = math.ceil(count * spacing_m / tables.cell_m) + 2
-    here = node_at(tables, scene, xy)
-    r, c = _cell(tables, scene, xy)
-    astray = tables.offset_of_cell_m[scene, r, c] > 0
+    points = _path(tables, scene, goal, xy, _hops(tables, count * spacing_m))
+    length = jnp.linalg.norm(points[1:] - points[:-1], axis=-1)
+    return _along(points, length, spacing_m * jnp.arange(1, count + 1))
 
-    def following(node):
-        return tables.next_node[scene, goal, node].astype(jnp.int32)
 
-    first = jnp.where(astray, here, following(here))
+def grid_waypoints_at(
+    tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, count: int, spacing_m: float
+) -> jax.Array:
+    """Waypoints as the original's code had them (reference benchmark, section 1.2), from cell to cell.
 
-    def hop(node, _):
-        return following(node), node
+    The first is the robot's own cell; from there every second node (spacing / cell) of a path that steps to
+    one of eight neighbours, so 0.2 m apart along an axis and 0.283 m on diagonals; then the goal, repeated.
 
-    _, nodes = jax.lax.scan(hop, first, None, length=hops)
-    points = jnp.concatenate([xy[None], tables.node_xy_w[scene, nodes]])
-    segment = points[1:] - points[:-1]
-    length = jnp.linalg.norm(segment, axis=-1)
-    before = jnp.cumsum(length) - length
-    arc = spacing_m * jnp.arange(1, count + 1)
-    share = jnp.clip((arc[:, None] - before) / jnp.maximum(length, 1e-6), 0.0, 1.0)
-    return xy + share @ segment
+    Args and returns: as `waypoints_at`.
+    """
+    points = _path(tables, scene, goal, cell_centre(tables, scene, xy), _hops(tables, 1.5 * count * spacing_m))
+    # A step to one of eight neighbours advances the larger of the two differences by one cell.
+    length = jnp.abs(points[1:] - points[:-1]).max(-1)
+    arc = spacing_m * jnp.arange(count)
+    snapped = cell_centre(tables, scene, _along(points, length, arc))
+    return jnp.where((arc >= length.sum())[:, None], goal.xy_w, snapped)

@@ -6,10 +6,12 @@ retries without bound; a small object that finds no place is parked outside, and
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 
-from interactive_nav.navigation import node_at
+from interactive_nav.navigation import geodesic_at, goal_field
 from interactive_nav.types import EpisodeStart, SceneTables
 
 PAIR_CANDIDATES = 64
@@ -20,9 +22,11 @@ CLEARANCE_M = 0.02
 """Least gap between bodies at the start of an episode."""
 
 
-def _uniform_index(key: jax.Array, shape, count: jax.Array) -> jax.Array:
-    """Uniform integers in [0, count) for a traced count."""
-    return jnp.minimum((jax.random.uniform(key, shape) * count).astype(jnp.int32), count - 1)
+def _uniform_places(key: jax.Array, shape: tuple[int, ...], cells: jax.Array, count: jax.Array, side_m: float):
+    """[*shape, 2] points, uniform over the first `count` of square cells [p, 2] given by their middles."""
+    key_cell, key_within = jax.random.split(key)
+    index = jnp.minimum((jax.random.uniform(key_cell, shape) * count).astype(jnp.int32), count - 1)
+    return cells[index] + side_m * jax.random.uniform(key_within, (*shape, 2), minval=-0.5, maxval=0.5)
 
 
 def draw_episode(
@@ -32,9 +36,15 @@ def draw_episode(
     robot_radius_m: float,
     min_goal_distance_m: float,
     max_goal_distance_m: float,
-    jitter_m: float,
+    scene: jax.Array | None = None,
+    goal_clear: bool = True,
+    random_yaw: bool = True,
 ) -> EpisodeStart:
     """Draws scene, start, goal and small objects uniformly (paper section IV).
+
+    Start and goal are the first of `PAIR_CANDIDATES` independent uniform pairs that is far enough apart, so
+    uniform among such pairs; each small object lies at the first of `CLUTTER_CANDIDATES` uniform places that
+    is clear of what lies already.
 
     Args:
         key: consumed.
@@ -43,55 +53,59 @@ def draw_episode(
         robot_radius_m: footprint of the robot.
         min_goal_distance_m: least planar distance from start to goal.
         max_goal_distance_m: largest geodesic distance from start to goal.
-        jitter_m: half side of the square about a tabulated start in which the start is uniform.
+        scene: [] i32; None: drawn.
+        goal_clear: keep small objects off the robot's footprint at the goal.
+        random_yaw: turn small objects at random; else yaw 0.
 
     Returns:
-        The episode's start. Start and goal are free of contact: small objects keep
-        clear of the robot at both, and of each other.
+        The episode's start. Nothing touches: small objects keep clear of the robot at the start, at the goal
+        (with `goal_clear`), and of each other.
     """
-    key_scene, key_start, key_goal, key_jitter, key_yaw, key_clutter = jax.random.split(key, 6)
-    scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
-    starts = tables.start_xy_w[scene, _uniform_index(key_start, (PAIR_CANDIDATES,), tables.num_starts[scene])]
-    goals = _uniform_index(key_goal, (PAIR_CANDIDATES,), tables.num_goals[scene])
-    goal_nodes = tables.goal_node[scene, goals]
-    goal_xy = tables.node_xy_w[scene, goal_nodes]
-    straight = jnp.linalg.norm(starts - goal_xy, axis=-1)
-    nodes = node_at(tables, scene, starts)
-    geodesic = tables.distance_m[scene, goals, nodes]
-    valid = (straight >= min_goal_distance_m) & (geodesic <= max_goal_distance_m)
-    # Without a valid pair, the one nearest to being valid; construction refuses scenes with no room at all.
-    badness = jnp.maximum(min_goal_distance_m - straight, 0.0) + jnp.maximum(geodesic - max_goal_distance_m, 0.0)
-    chosen = jnp.where(valid.any(), jnp.argmax(valid), jnp.argmin(badness))
-    jitter = jax.random.uniform(key_jitter, (2,), minval=-jitter_m, maxval=jitter_m)
-    start_xy = starts[chosen] + jnp.where(straight[chosen] - min_goal_distance_m > 2 * jitter_m, jitter, 0.0)
+    key_scene, key_start, key_goal, key_yaw, key_place, key_turn = jax.random.split(key, 6)
+    if scene is None:
+        scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
+    shape = (PAIR_CANDIDATES,)
+    starts = _uniform_places(key_start, shape, tables.start_xy_w[scene], tables.num_starts[scene], tables.fine_m)
+    goals = _uniform_places(key_goal, shape, tables.goal_xy_w[scene], tables.num_goals[scene], tables.fine_m)
+    straight = jnp.linalg.norm(starts - goals, axis=-1)
+    badness = jnp.maximum(min_goal_distance_m - straight, 0.0)
+    if math.isfinite(max_goal_distance_m):
+
+        def distance(start, goal):
+            return geodesic_at(tables, scene, goal_field(tables, scene, goal), start)
+
+        badness += jnp.maximum(jax.vmap(distance)(starts, goals) - max_goal_distance_m, 0.0)
+    # The first good pair; without one, the nearest to being good (construction refuses scenes with no room at all).
+    chosen = jnp.argmin(badness)
+    start_xy, goal_xy = starts[chosen], goals[chosen]
 
     count = small_radius_m.shape[0]
-    key_place, key_turn = jax.random.split(key_clutter)
-    candidates = _uniform_index(key_place, (count, CLUTTER_CANDIDATES), tables.num_clutter[scene])
+    shape = (count, CLUTTER_CANDIDATES)
+    places = _uniform_places(key_place, shape, tables.clutter_xy_w[scene], tables.num_clutter[scene], tables.fine_m)
 
     def place(carry, i):
         xys, oks = carry
-        xy = tables.clutter_xy_w[scene, candidates[i]]
+        xy = places[i]
         reach = small_radius_m[i] + CLEARANCE_M
         gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - small_radius_m
         ok = ((gaps > reach) | ~oks).all(-1)
         ok &= jnp.linalg.norm(xy - start_xy, axis=-1) > robot_radius_m + reach
-        ok &= jnp.linalg.norm(xy - goal_xy[chosen], axis=-1) > robot_radius_m + reach
+        if goal_clear:
+            ok &= jnp.linalg.norm(xy - goal_xy, axis=-1) > robot_radius_m + reach
         ok &= tables.num_clutter[scene] > 0
         best = jnp.argmax(ok)
         return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None
 
-    nothing = (jnp.zeros((count, 2)), jnp.zeros((count,), bool))
-    small_xy, small_placed = nothing
+    small_xy, small_placed = jnp.zeros((count, 2)), jnp.zeros((count,), bool)
     if count:
-        (small_xy, small_placed), _ = jax.lax.scan(place, nothing, jnp.arange(count))
+        (small_xy, small_placed), _ = jax.lax.scan(place, (small_xy, small_placed), jnp.arange(count))
+    turn = jax.random.uniform(key_turn, (count,), minval=-jnp.pi, maxval=jnp.pi)
     return EpisodeStart(
         scene_index=scene,
-        goal_index=goals[chosen],
         start_xy_w=start_xy,
         start_yaw_rad=jax.random.uniform(key_yaw, (), minval=-jnp.pi, maxval=jnp.pi),
-        goal_xy_w=goal_xy[chosen],
+        goal_xy_w=goal_xy,
         small_xy_w=small_xy,
-        small_yaw_rad=jax.random.uniform(key_turn, (count,), minval=-jnp.pi, maxval=jnp.pi),
+        small_yaw_rad=turn if random_yaw else jnp.zeros((count,)),
         small_placed=small_placed,
     )

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
 
 from interactive_nav.config import NavConfig
-from interactive_nav.geodesic import DistanceTable, clearance, distance_table, navigation_grid
+from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
 from interactive_nav.placement import CLEARANCE_M
 from interactive_nav.scene import Scene
 from interactive_nav.types import SceneTables
 from interactive_nav.world import World
 from scenes_mjcf.schema import SceneError
+
+FINE_CELLS = 2
+"""Fine cells along the side of a navigation cell: corners and places are 0.05 m fine, nodes 0.1 m apart."""
+SIGHT_STEP_CELLS = 2.0
+"""Fine cells between samples of a line of sight inside jit. What is blocked for the robot's centre is at least a
+robot wide, so nothing is stepped over; a corner clipped between two samples is cut by centimetres at most."""
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:
@@ -77,45 +86,52 @@ def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarr
     return rest
 
 
-def _scene_places(world: World, index: int, config: NavConfig) -> tuple[DistanceTable, np.ndarray, np.ndarray]:
-    """Distance table, start places [p, 2] and clutter places [q, 2] of one scene."""
+def _scene_places(
+    world: World, index: int, config: NavConfig
+) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:
+    """Shortest paths, start cells [p, 2], goal cells [g, 2] and clutter cells [q, 2] of one scene."""
     scene, robot = world.scenes[index], world.robot
-    maps, cell = scene.maps, config.nav_cell_m
-    free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, cell)
+    maps, fine = scene.maps, config.nav_cell_m / FINE_CELLS
+    free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, fine)
     if not free.any():
         raise SceneError(
             f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "
             "map; use a smaller robot or check the scan's floor"
         )
-    open_m = clearance(
-        maps.traversable & ~furniture_map(scene, rest_poses(world, index), robot.height_m), maps.resolution_m
-    )
-    margin = _sample(open_m, maps.resolution_m, free.shape, cell)
+    graph = corner_graph(free, fine, config.nav_cell_m, maps.origin_w)
+
+    def room(blocked: np.ndarray | bool) -> np.ndarray:
+        """Clearance in metres that every point of a fine cell has."""
+        open_m = clearance(maps.traversable & ~np.asarray(blocked), maps.resolution_m)
+        return _sample(open_m, maps.resolution_m, free.shape, fine) - math.sqrt(0.5) * fine
+
+    furnished = room(furniture_map(scene, rest_poses(world, index), robot.height_m))
     largest = max((o.radius_m for o in world.small_objects), default=0.0)
+    needed = robot.footprint_radius_m + CLEARANCE_M
 
     def centres(mask: np.ndarray) -> np.ndarray:
         r, c = np.nonzero(mask)
-        return np.stack([maps.origin_w[0] + (c + 0.5) * cell, maps.origin_w[1] + (r + 0.5) * cell], -1)
+        return np.stack([maps.origin_w[0] + (c + 0.5) * fine, maps.origin_w[1] + (r + 0.5) * fine], -1)
 
-    # The robot must fit at the goal too, or a goal under a sofa could never be reached.
-    goal_cells = free & (margin >= robot.footprint_radius_m + CLEARANCE_M)
-    table = distance_table(
-        free, cell, maps.origin_w, config.max_goals, seed=int(scene.digest[:8], 16), goals=goal_cells
-    )
-    starts = centres(free & (margin >= robot.footprint_radius_m + 0.75 * cell + CLEARANCE_M))
-    clutter = centres(margin >= largest + CLEARANCE_M)
-    goals = table.node_xy_w[table.goal_node]
-    far = (
-        len(starts)
-        and len(goals)
-        and np.linalg.norm(starts[:, None] - goals[None], axis=-1).max() >= config.min_goal_distance_m
-    )
+    starts = centres(graph.free & (furnished >= needed))
+    # Unless the option says otherwise the robot must fit at the goal too, or one under a sofa could never be reached.
+    goals = starts if config.goal_clear else centres(graph.free & (room(False) >= needed))
+    clutter = centres(furnished >= largest + CLEARANCE_M)
+    far = len(starts) and len(goals) and _farthest(starts, goals) >= config.min_goal_distance_m
     if not far:
         raise SceneError(
             f"{scene.path}: no room for a start and a goal {config.min_goal_distance_m} m apart for robot "
             f"'{robot.name}'; lower min_goal_distance_m or use a larger scene"
         )
-    return table, starts, clutter
+    return graph, starts, goals, clutter
+
+
+def _farthest(a: np.ndarray, b: np.ndarray) -> float:
+    """Largest distance between points [p, 2] and [g, 2], to within 4 %: by their extent along 16 directions."""
+    angle = np.arange(16) * np.pi / 16
+    along = np.stack([np.cos(angle), np.sin(angle)])
+    first, second = a @ along, b @ along
+    return float(np.maximum(first.max(0) - second.min(0), second.max(0) - first.min(0)).max())
 
 
 def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
@@ -129,9 +145,33 @@ def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
     return np.stack(padded)
 
 
-def _index_dtype(navs: list[DistanceTable]):
-    """The smallest unsigned type that numbers every free cell: the table is large."""
-    return jnp.uint16 if max(len(n.node_xy_w) for n in navs) < 2**16 else jnp.uint32
+def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
+    """The shortest paths of all scenes, padded; in each the last corner is none."""
+    count = max(len(g.corner_xy_w) for g in graphs)
+    # The tables are large: the smallest type that numbers every corner.
+    index = np.uint16 if count < 2**16 else np.int32
+
+    def squared(table: np.ndarray, fill: float) -> np.ndarray:
+        missing = count + 1 - len(table)
+        return np.pad(table, [(0, missing), (0, missing)], constant_values=fill)
+
+    seen = [np.where(g.seen < len(g.corner_xy_w), g.seen, count) for g in graphs]
+    extent = max(math.hypot(*g.free.shape) * g.fine_m for g in graphs)
+    return {
+        "node_of_cell": jnp.asarray(_pad([g.node_of_cell for g in graphs], 2), jnp.int32),
+        "grid_origin_w": jnp.asarray([g.origin_w for g in graphs], jnp.float32),
+        "node_xy_w": jnp.asarray(_pad([g.node_xy_w for g in graphs], 1), jnp.float32),
+        "seen": jnp.asarray(_pad(seen, 2, fill=count).astype(index)),
+        "corner_xy_w": jnp.asarray(
+            np.stack([np.pad(g.corner_xy_w, [(0, count + 1 - len(g.corner_xy_w)), (0, 0)]) for g in graphs])
+        ),
+        "corner_distance_m": jnp.asarray(np.stack([squared(g.distance_m, np.inf) for g in graphs]), jnp.float32),
+        "next_corner": jnp.asarray(np.stack([squared(g.next_corner, count) for g in graphs]).astype(index)),
+        "free": jnp.asarray(_pad([g.free for g in graphs], 2)),
+        "cell_m": graphs[0].cell_m,
+        "fine_m": graphs[0].fine_m,
+        "sight_samples": math.ceil(extent / (SIGHT_STEP_CELLS * graphs[0].fine_m)),
+    }
 
 
 def build_tables(world: World, config: NavConfig) -> SceneTables:
@@ -141,7 +181,6 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
         SceneError: a scene with no room for the robot, or for a start and a goal.
     """
     places = [_scene_places(world, i, config) for i in range(len(world.scenes))]
-    navs = [p[0] for p in places]
     layout, slots = world.layout, world.layout.num_slots
     com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
     hinge = {
@@ -171,17 +210,11 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
         hinge_quat_w=f32(hinge["quat"]),
         hinge_axis=f32(hinge["axis"]),
         hinge_anchor_m=f32(hinge["anchor"]),
-        node_of_cell=i32(_pad([n.node_of_cell for n in navs], 2)),
-        offset_of_cell_m=f32(_pad([n.offset_of_cell_m for n in navs], 2, fill=1.0)),
-        grid_origin_w=f32([n.origin_w for n in navs]),
-        node_xy_w=f32(_pad([n.node_xy_w for n in navs], 1)),
-        goal_node=i32(_pad([n.goal_node for n in navs], 1)),
-        num_goals=i32([len(n.goal_node) for n in navs]),
-        distance_m=f32(_pad([n.distance_m for n in navs], 2)),
-        next_node=jnp.asarray(_pad([n.next_node for n in navs], 2), _index_dtype(navs)),
+        **navigation_tables([p[0] for p in places]),
         start_xy_w=f32(_pad([p[1] for p in places], 1)),
         num_starts=i32([len(p[1]) for p in places]),
-        clutter_xy_w=f32(_pad([p[2].reshape(-1, 2) if len(p[2]) else np.zeros((1, 2)) for p in places], 1)),
-        num_clutter=i32([len(p[2]) for p in places]),
-        cell_m=config.nav_cell_m,
+        goal_xy_w=f32(_pad([p[2] for p in places], 1)),
+        num_goals=i32([len(p[2]) for p in places]),
+        clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
+        num_clutter=i32([len(p[3]) for p in places]),
     )

@@ -8,7 +8,10 @@ import jax
 
 @flax.struct.dataclass
 class SceneTables:
-    """Constants of all scenes on the device; S scenes, M movable slots, G goals, n free cells, padded alike."""
+    """Constants of all scenes on the device; S scenes, M movable slots, padded alike.
+
+    Navigation: n nodes, V corners, of which a node sees at most K; index V means none, infinitely far.
+    """
 
     rest_qpos: jax.Array
     """[S, nq] f32 furniture at rest, robot and small objects parked."""
@@ -25,31 +28,51 @@ class SceneTables:
     hinge_anchor_m: jax.Array
     """[S, M, 3] f32 in the body's frame."""
     node_of_cell: jax.Array
-    """[S, rows, columns] i32 nearest free cell."""
-    offset_of_cell_m: jax.Array
-    """[S, rows, columns] f32 distance to it."""
+    """[S, rows, columns] i32 the node that stands for each cell."""
     grid_origin_w: jax.Array
     """[S, 2] f32 outer corner of cell [0, 0]."""
     node_xy_w: jax.Array
-    """[S, n, 2] f32 centres of the free cells."""
-    goal_node: jax.Array
-    """[S, G] i32 goals: free cells where the robot stands clear of furniture."""
-    num_goals: jax.Array
-    """[S] i32."""
-    distance_m: jax.Array
-    """[S, G, n] f32."""
-    next_node: jax.Array
-    """[S, G, n] u16 or u32: the next free cell on the shortest path; a goal's is itself."""
+    """[S, n, 2] f32 free points that the nodes stand at."""
+    seen: jax.Array
+    """[S, n, K] u16 or i32 corners in each node's sight."""
+    corner_xy_w: jax.Array
+    """[S, V + 1, 2] f32."""
+    corner_distance_m: jax.Array
+    """[S, V + 1, V + 1] f32."""
+    next_corner: jax.Array
+    """[S, V + 1, V + 1] u16 or i32 the next corner on the way from the row's to the column's."""
+    free: jax.Array
+    """[S, R, C] bool fine cells that the robot's centre may be in."""
     start_xy_w: jax.Array
-    """[S, p, 2] f32 places where the robot stands clear of structure and furniture."""
+    """[S, p, 2] f32 middles of fine cells all over which the robot stands clear of structure and furniture."""
     num_starts: jax.Array
     """[S] i32."""
+    goal_xy_w: jax.Array
+    """[S, g, 2] f32 middles of fine cells of goals: as the starts, or clear of structure only."""
+    num_goals: jax.Array
+    """[S] i32."""
     clutter_xy_w: jax.Array
-    """[S, q, 2] f32 places where the largest small object lies clear of structure and furniture."""
+    """[S, q, 2] f32 middles of fine cells all over which the largest small object lies clear."""
     num_clutter: jax.Array
     """[S] i32."""
     cell_m: float = flax.struct.field(pytree_node=False, default=0.1)
     """Side of a navigation cell."""
+    fine_m: float = flax.struct.field(pytree_node=False, default=0.05)
+    """Side of a fine cell."""
+    sight_samples: int = flax.struct.field(pytree_node=False, default=64)
+    """Samples of a line of sight: denser than the thinnest wall, across the largest scene."""
+
+
+@flax.struct.dataclass
+class GoalField:
+    """An episode's goal and what every corner of its scene has left to it."""
+
+    xy_w: jax.Array
+    """(2,) f32, m."""
+    corner_m: jax.Array
+    """(V + 1,) f32 geodesic distance from each corner; infinite for the last, which is none."""
+    next_corner: jax.Array
+    """(V + 1,) i32 where the path goes next; V: straight to the goal."""
 
 
 @flax.struct.dataclass
@@ -58,10 +81,10 @@ class NavInfo:
 
     scene_index: jax.Array
     """[] i32."""
-    goal_index: jax.Array
-    """[] i32 row of the goal in the scene's tables."""
     goal_xy_w: jax.Array
     """(2,) f32, m."""
+    goal_field: GoalField
+    """What the geodesic needs to know of the goal."""
     start_xy_w: jax.Array
     """(2,) f32, m."""
     robot_pos_w: jax.Array
@@ -80,6 +103,8 @@ class NavInfo:
     """[] f32 l_0."""
     object_path_m: jax.Array
     """(M,) f32 l_i."""
+    touched: jax.Array
+    """(M,) bool: the robot has touched it."""
     force_sum_n: jax.Array
     """[] f32 sum of F_t."""
     interaction_steps: jax.Array
@@ -92,6 +117,8 @@ class NavInfo:
     """[] i32 control steps in which an object within reach was not simulated (MJX's window was full)."""
     unconverged_steps: jax.Array
     """[] i32 control steps in which the solver met its iteration limit."""
+    lifted_steps: jax.Array
+    """[] i32 control steps with the base 0.2 m above its standing height."""
     objects_dropped: jax.Array
     """[] i32 small objects for which no free place was found: parked outside."""
     step_count: jax.Array
@@ -107,10 +134,13 @@ class EpisodeStart:
     """What one draw of an episode decides."""
 
     scene_index: jax.Array
-    goal_index: jax.Array
+    """[] i32."""
     start_xy_w: jax.Array
+    """(2,) f32, m."""
     start_yaw_rad: jax.Array
+    """[] f32."""
     goal_xy_w: jax.Array
+    """(2,) f32, m."""
     small_xy_w: jax.Array
     """(num_objects, 2) f32."""
     small_yaw_rad: jax.Array

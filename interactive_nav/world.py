@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.config import NavConfig
+from interactive_nav.contacts import add_contact_sensors
 from interactive_nav.objects import SmallObject, pick
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Movable, Scene
@@ -297,7 +298,7 @@ def build_empty_spec(
     for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
         _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
     _add_structure(spec, np.zeros((0, 10)), n_walls)
-    _add_sensors(spec, robot, named)
+    _add_sensors(spec, robot, named, config)
     _soften(spec, config)
     model = spec.compile()
     return spec, model, _layout(model, robot, named)
@@ -326,7 +327,7 @@ def _build_spec(
             _add_movable(spec, name, column[scene_index], n_boxes, kind, len(slots), config.collision, None in column)
             slots.append((name, kind))
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
-    _add_sensors(spec, robot, slots)
+    _add_sensors(spec, robot, slots, config)
     _soften(spec, config)
     return spec, slots
 
@@ -343,13 +344,15 @@ def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
         _add_box(structure, row, f"wall_{i}", 0.5)
 
 
-def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]]) -> None:
+def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], config: NavConfig) -> None:
     for i, (name, kind) in enumerate(slots):
         _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
         if kind == "hinge":
             # A door leaf hangs in its frame: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
     _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
+    if config.needs_contacts:
+        add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
 
 
 def _add_force_sensor(spec: mujoco.MjSpec, robot_body: str, other: str, name: str) -> None:

@@ -47,7 +47,10 @@ class AutoResetEnv(Env):
 
     def reset(self, rng: jax.Array) -> State:
         """[N, 2] keys to N states."""
-        state = jax.vmap(self.env.reset)(rng)
+        if self.env.config.scene_choice == "slot":
+            state = jax.vmap(self.env.reset)(rng, jnp.arange(rng.shape[0]) % len(self.env.scenes))
+        else:
+            state = jax.vmap(self.env.reset)(rng)
         zero = jnp.zeros(rng.shape[0])
         info = {
             **state.info,
@@ -87,7 +90,11 @@ class AutoResetEnv(Env):
         return jax.vmap(self.env.observe)(stepped.replace(pipeline_state=physics, info=info))
 
     def _with_new_episodes(self, current, done: jax.Array):
-        fresh = jax.vmap(self.env.draw)(current[-1])
+        nav, rng = current[-2:]
+        if self.env.config.scene_choice == "slot":
+            fresh = jax.vmap(self.env.draw)(rng, nav.scene_index)
+        else:
+            fresh = jax.vmap(self.env.draw)(rng)
         new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
 
         def choose(a, b):

@@ -16,12 +16,15 @@ import pyarrow as pa
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
+from interactive_nav.episodes import load as load_episodes
 from train import checkpoint, config_io, ppo
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig
 from train.errors import ConfigError, TrainError
 from train.files import whole_file
-from train.policies import YARDSTICKS, PolicyFn, make_learned
+from train.planners import Planner
+from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_learned, make_yardstick
 from train.rollout import Episodes, episode_keys, run_episodes
 from train.rows import episode_table, score_table, write_parquet
 from train.run import check_fits, make_env
@@ -47,7 +50,7 @@ def load_policy(
 
 
 def evaluate(
-    folder: RunFolder,
+    folder: RunFolder | None,
     config: TrainConfig,
     env: Any,
     policies: Sequence[str],
@@ -57,28 +60,33 @@ def evaluate(
     deterministic: bool,
     record: int,
     console: Console,
+    fixed: EpisodeFile | None = None,
 ) -> tuple[pa.Table, dict[str, Episodes]]:
-    """Plays the same fixed episodes with each policy.
+    """Plays the same fixed episodes with each policy: `episodes` drawn from `seed`, or those of a file.
 
     Returns:
         Rows of all policies, one an episode; and the episodes by policy.
     """
     # Everything that can be refused is refused before the first episode.
-    made: dict[str, tuple[PolicyFn, CheckpointMeta | None]] = {}
+    made: dict[str, tuple[PolicyFn | Planner, CheckpointMeta | None]] = {}
     for name in policies:
-        if name == LEARNED:
+        if name == LEARNED and folder:
             made[name] = load_policy(folder, config, env, which, deterministic)
-        elif name in YARDSTICKS:
-            made[name] = (YARDSTICKS[name](env), None)
         else:
-            known = ", ".join((LEARNED, *YARDSTICKS))
-            raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
+            made[name] = (make_yardstick(name, env), None)
+    starts = None
+    if fixed:
+        try:
+            starts = starts_of(fixed, env, "--episode-file")
+        except EpisodeFileError as error:
+            raise ConfigError(str(error)) from None
+        episodes, seed = len(fixed.episodes), fixed.seed
     keys = episode_keys(seed, episodes)
     tables, played = [], {}
     for name, (policy, meta) in made.items():
         began = time.perf_counter()
         with _progress(console, name, episodes) as on_progress:
-            played[name] = run_episodes(env, policy, keys, record, on_progress)
+            played[name] = run_episodes(env, policy, keys, record, on_progress, starts)
         constants = {
             "run": config.run.name,
             "robot": env.robot.name,
@@ -95,7 +103,8 @@ def evaluate(
         }
         table = episode_table(played[name], env.scenes, constants)
         tables.append(table.cast(_schema(table.schema)))
-        console.print(f"{name}: {episodes} episodes in {time.perf_counter() - began:.0f} s", highlight=False)
+        note = f" ({policy.note})" if isinstance(policy, Planner) and policy.note else ""
+        console.print(f"{name}: {episodes} episodes in {time.perf_counter() - began:.0f} s{note}", highlight=False)
     return pa.concat_tables(tables), played
 
 
@@ -153,15 +162,42 @@ class _progress:
         self._bar.stop()
 
 
+def _read_episodes(path: str) -> EpisodeFile:
+    try:
+        return load_episodes(path)
+    except EpisodeFileError as error:
+        raise ConfigError(f"--episode-file: {error}") from None
+
+
+def _config_of_yardsticks(policies: Sequence[str], scenes: Sequence[str] | None, out: str | None) -> TrainConfig:
+    """The default config, for policies that need no run folder."""
+    if LEARNED in policies or not scenes or not out:
+        raise ConfigError(
+            "RUN_DIR is missing; without one, expected --scenes, --out and --policies without learned, "
+            "for example --policies random,follower,avoider,namo:0.5"
+        )
+    return dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="yardsticks"))
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.evaluate", description="Plays fixed episodes.")
-    made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
+    made.add_argument(
+        "run",
+        nargs="?",
+        metavar="RUN_DIR",
+        help="folder that `python -m train` wrote; without one, --scenes, --out and --policies say what to play",
+    )
     made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
     made.add_argument("--episodes", type=int, default=200, help="fixed episodes for each policy (default 200)")
+    made.add_argument("--episode-file", metavar="FILE", help="play these (python -m interactive_nav.episodes make)")
     made.add_argument("--seed", type=int, default=1_000_000, help="which episodes (default 1000000)")
     names = ",".join((LEARNED, *YARDSTICKS))
-    made.add_argument("--policies", default=names, help=f"comma-separated choice from {names} (default: all)")
+    made.add_argument(
+        "--policies",
+        default=names,
+        help=f"comma-separated choice from {','.join((names, *PLANNERS))} (default: {names})",
+    )
     made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
     made.add_argument(
         "--stochastic",
@@ -182,28 +218,37 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     try:
         if arguments.episodes < 1:
             raise ConfigError(f"--episodes is {arguments.episodes}, expected at least 1")
-        folder = RunFolder(Path(arguments.run))
-        config = folder.read_config()
+        policies = [name for name in arguments.policies.split(",") if name]
+        if arguments.run and "=" in arguments.run:
+            arguments.overrides.insert(0, arguments.run)
+            arguments.run = None
+        if arguments.run:
+            folder = RunFolder(Path(arguments.run))
+            config = folder.read_config()
+        else:
+            folder, config = None, _config_of_yardsticks(policies, arguments.scenes, arguments.out)
         for word in arguments.overrides:
             if not word.startswith("env."):
                 raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
         config = config_io.apply_overrides(config, arguments.overrides)
         if arguments.scenes:
             config = dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
-        out = Path(arguments.out) if arguments.out else folder.path / "evaluation" / "episodes.parquet"
+        out = Path(arguments.out) if arguments.out or not folder else folder.path / "evaluation" / "episodes.parquet"
+        fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
         claim(out.parent)
         env = build_env(config.env)
         rows, played = evaluate(
             folder,
             config,
             env,
-            [name for name in arguments.policies.split(",") if name],
+            policies,
             arguments.episodes,
             arguments.seed,
             arguments.checkpoint,
             not arguments.stochastic,
             arguments.record,
             console,
+            fixed,
         )
         write_parquet(rows, out)
         write_paths(out.with_suffix(".npz"), played, env)

@@ -13,6 +13,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import pyarrow.parquet as pq
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -22,6 +23,7 @@ from matplotlib.ticker import EngFormatter
 
 from train.errors import RunFolderError, TrainError
 from train.files import whole_file
+from train.rows import interval
 from train.run_folder import read_metrics
 
 CURVES = (
@@ -29,7 +31,7 @@ CURVES = (
     ("episode/ins_0.5", "INS$_{0.5}$"),
     ("episode/sum_reward", "episode reward"),
 )
-COLOURS = {"learned": "#0072b2", "follower": "#009e73", "random": "#cc79a7"}
+COLOURS = {"learned": "#0072b2", "follower": "#009e73", "random": "#cc79a7", "avoider": "#d55e00"}
 FURNITURE_COLOUR = "#ecd9b8"
 MOVED_M = 0.02
 """Objects moved less than this are drawn once."""
@@ -85,6 +87,49 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6) -> Figure:
         Line2D([], [], marker="s", label="object at end (coloured by who moved it)", markersize=6, **grey),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
+    """Mean P_eff and E_eff of each policy, with 95 % intervals, and the line of the swept planner's weights.
+
+    Args:
+        rows: columns policy, path_efficiency and effort_efficiency, one entry an episode.
+        title: of the figure.
+    """
+    names = np.asarray(rows["policy"])
+    scores = {name: np.asarray(rows[name], float) for name in ("path_efficiency", "effort_efficiency")}
+    figure, axis = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
+    swept: list[tuple[float, float, float]] = []
+    for k, policy in enumerate(dict.fromkeys(names)):
+        x, y = (values[names == policy] for values in scores.values())
+        bars = [np.abs(np.array(interval(n, v)) - v.mean())[:, None] for n, v in zip(scores, (x, y), strict=True)]
+        kind, _, weight = policy.partition(":")
+        colour = "0.25" if kind == "namo" else _colour(policy, k)
+        axis.errorbar(x.mean(), y.mean(), bars[1], bars[0], fmt="o", color=colour, capsize=2, linewidth=0.9)
+        axis.annotate(
+            f"w = {float(weight):g}" if kind == "namo" else policy,
+            (x.mean(), y.mean()),
+            xytext=(6, 5),
+            textcoords="offset points",
+            fontsize=8,
+            color=colour,
+        )
+        if kind == "namo":
+            swept.append((float(weight), x.mean(), y.mean()))
+    if len(swept) > 1:
+        line = np.array(sorted(swept))
+        axis.plot(line[:, 1], line[:, 2], color="0.25", linewidth=1.2, label="NAMO planner, weight w of pushing")
+        axis.legend(loc="lower left", fontsize=8)
+    low_x, low_y = axis.get_xlim()[0], axis.get_ylim()[0]
+    for level in np.arange(0.1, 1.0, 0.1):
+        p = np.linspace(0.0, 1.0, 50)
+        axis.plot(p, 2 * level - p, color="0.85", linewidth=0.7, zorder=0)
+    axis.set_xlim(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.09)
+    axis.set_ylim(low_y, 1.02)
+    axis.set_xlabel("P$_{eff}$: shortest path over path driven, 0 on failure")
+    axis.set_ylabel("E$_{eff}$: effort efficiency")
+    axis.set_title(f"{title}\ngrey: equal INS$_{{0.5}}$, steps of 0.1", fontsize=9)
     return figure
 
 
@@ -144,11 +189,21 @@ def figures_of(results: Path) -> Iterator[tuple[str, Figure]]:
     logs = sorted(results.rglob("metrics.jsonl"))
     records = sorted(path for path in results.rglob("*.npz") if "checkpoints" not in path.parts)
     records = [path for path in records if not path.parent.name.startswith("diverged-")]
+    tables = sorted(path for path in results.rglob("*.parquet"))
     curves = {log.parent.name: lines for log in logs if (lines := read_metrics(log))}
-    if not curves and not records:
-        raise RunFolderError(f"{results}: nothing to draw (no metrics.jsonl, no recorded paths); expected a run folder")
+    if not curves and not records and not tables:
+        raise RunFolderError(
+            f"{results}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
+        )
     if curves:
         yield "learning_curves", learning_curves(curves)
+    for path in tables:
+        rows = pq.read_table(path).to_pydict()
+        if {"policy", "path_efficiency", "effort_efficiency"} <= rows.keys() and rows["policy"]:
+            run = path.parent.parent.name if path.parent.name == "evaluation" else path.stem
+            scenes = ", ".join(dict.fromkeys(rows["scene"]))
+            episodes = len(rows["policy"]) // len(set(rows["policy"]))
+            yield f"frontier_{run}", frontier(rows, f"{scenes}, {episodes} episodes a policy")
     for path in records:
         with np.load(path) as stored:
             if "policies" in stored.files:

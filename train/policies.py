@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from interactive_nav.robots import RobotSpec
 from train.errors import TrainError
+from train.planners import Planner
 
 PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -89,3 +90,25 @@ def make_learned(act: Any) -> PolicyFn:
 
 
 YARDSTICKS: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
+PLANNERS = ("avoider", "namo:W")
+"""Planners on the host; W is the weight of pushing against detour, 0 to 1."""
+
+
+def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
+    """A policy or planner that never learns, by name: random, follower, avoider or namo:W.
+
+    Raises:
+        TrainError: unknown name or weight, or a robot or observations that it cannot use.
+    """
+    if name in YARDSTICKS:
+        return YARDSTICKS[name](env)
+    if name == "avoider":
+        return Planner(env, None)
+    kind, _, weight = name.partition(":")
+    if kind == "namo":
+        try:
+            return Planner(env, float(weight))
+        except ValueError:
+            raise TrainError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
+    known = ", ".join(("learned", *YARDSTICKS, *PLANNERS))
+    raise TrainError(f"--policies: got {name!r}, expected a choice from {known}")

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from train.planners import Planner
 from train.policies import PolicyFn
 
 CHUNK_STEPS = 50
@@ -57,22 +58,24 @@ def episode_keys(seed: int, episodes: int) -> jax.Array:
 
 def run_episodes(
     env: Any,
-    policy: PolicyFn,
+    policy: PolicyFn | Planner,
     keys: jax.Array,
     record: int = 0,
     on_progress: Callable[[int, int], None] = lambda finished, step: None,
+    starts: Any = None,
 ) -> Episodes:
     """Plays every episode to its end, all in one batch.
 
     Args:
         env: one environment, not batched, not resetting itself.
-        policy: see `train.policies`.
+        policy: see `train.policies`, or a planner.
         keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
         record: for how many of the first episodes to return paths.
         on_progress: told (episodes finished, steps taken) now and then.
+        starts: of `interactive_nav.episodes.starts_of`, leaves [N, ...]: these episodes instead of drawn ones.
     """
     count, record = len(keys), min(record, len(keys))
-    state = jax.jit(jax.vmap(env.reset))(keys)
+    state = jax.jit(jax.vmap(env.reset))(keys) if starts is None else jax.jit(jax.vmap(env.reset_to))(starts, keys)
     policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
     first = jax.tree.map(np.asarray, state.info["nav"])
     metrics = {name: np.full(count, np.nan, np.float32) for name in state.metrics}
@@ -81,11 +84,16 @@ def run_episodes(
 
     episode_of = np.arange(count)  # episode played by each place in the batch
     finished = np.zeros(count, bool)
-    chunk = jax.jit(functools.partial(_play_chunk, env, policy))
+    planner = policy if isinstance(policy, Planner) else None
+    chunk = None if isinstance(policy, Planner) else jax.jit(functools.partial(_play_chunk, env, policy))
+    one_step = jax.jit(functools.partial(_play_step, env)) if planner else None
     step = 0
     while not finished.all():
         ended_here = jnp.asarray(finished[episode_of])
-        state, ended, final, moved, track = chunk(state, policy_keys[episode_of], ended_here, step)
+        if chunk is None:
+            state, ended, final, moved, track = _play_planned(one_step, planner, state, episode_of, ended_here, step)
+        else:
+            state, ended, final, moved, track = chunk(state, policy_keys[episode_of], ended_here, step)
         step += CHUNK_STEPS
         new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
         for name, values in final.items():
@@ -114,8 +122,35 @@ def run_episodes(
     return Episodes(first.scene_index, metrics, paths)
 
 
+def _play_step(env: Any, carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+    """Steps all environments; what belongs to an episode is frozen at the step that ended it."""
+    state, ended, final, moved = carry
+    state = jax.vmap(env.step)(state, action)
+    ends = (state.done > 0) & ~ended
+    nav = state.info["nav"]
+    final = {name: jnp.where(ends, state.metrics[name], value) for name, value in final.items()}
+    moved = jnp.where(ends[:, None, None], nav.object_pos_w, moved)
+    track = jnp.where(ended[:, None], jnp.nan, nav.robot_pos_w[:, :2])
+    return (state, ended | ends, final, moved), track
+
+
+def _play_planned(one_step: Any, planner: Any, state: Any, episode_of: np.ndarray, ended: jax.Array, step: int) -> Any:
+    """`_play_chunk` for a planner on the host."""
+    carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
+    tracks = []
+    for t in range(CHUNK_STEPS):
+        running = ~np.asarray(carry[1])
+        if not running.any():
+            break
+        carry, track = one_step(carry, planner.act(carry[0], episode_of, running, step + t))
+        tracks.append(np.asarray(track))
+    state, ended, final, moved = carry
+    tracks += [np.full_like(tracks[0], np.nan)] * (CHUNK_STEPS - len(tracks))
+    return state, ended, final, moved, np.stack(tracks)
+
+
 def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: jax.Array, step: int) -> Any:
-    """Steps all environments; what belongs to an episode is frozen at the step that ended it.
+    """Steps all environments by `CHUNK_STEPS`.
 
     Returns:
         state, ended [N], metrics at the end {name: [N]}, objects at the end [N, M, 3],
@@ -123,15 +158,8 @@ def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: 
     """
 
     def one_step(carry: Any, t: jax.Array) -> tuple[Any, jax.Array]:
-        state, ended, final, moved = carry
-        action = jax.vmap(policy)(state.obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
-        state = jax.vmap(env.step)(state, action)
-        ends = (state.done > 0) & ~ended
-        nav = state.info["nav"]
-        final = {name: jnp.where(ends, state.metrics[name], value) for name, value in final.items()}
-        moved = jnp.where(ends[:, None, None], nav.object_pos_w, moved)
-        track = jnp.where(ended[:, None], jnp.nan, nav.robot_pos_w[:, :2])
-        return (state, ended | ends, final, moved), track
+        action = jax.vmap(policy)(carry[0].obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
+        return _play_step(env, carry, action)
 
     carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
     (state, ended, final, moved), track = jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))

@@ -7,7 +7,7 @@ import importlib.util
 import jax
 
 from interactive_nav.config import NavConfig
-from interactive_nav.physics.base import Physics, PhysicsState, StepSignals
+from interactive_nav.physics.base import ForceOptions, Physics, PhysicsState, StepSignals
 from interactive_nav.world import World
 
 
@@ -42,13 +42,14 @@ def make_physics(world: World, config: NavConfig) -> Physics:
         raise ValueError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
     if config.cone == "elliptic" and backend != "native":
         raise ValueError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
+    forces = ForceOptions(config.force_part, config.force_sum, config.needs_contacts)
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics
 
-        return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads)
+        return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads, forces=forces)
     from interactive_nav.physics.mjx_batch import MjxPhysics
 
-    return MjxPhysics(world, config, backend)
+    return MjxPhysics(world, config, backend, forces)
 
 
 __all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

@@ -7,12 +7,16 @@ so resets are `jnp.where`, checkpoints are portable and nothing engine-specific 
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import custom_batching
+
+from interactive_nav.contacts import combine
 
 TOUCH_FORCE_N = 1e-4
 """A body counts as touched when the robot's net force on it exceeds this in any substep."""
@@ -35,11 +39,15 @@ class StepSignals:
     """What one control step did; M movable slots."""
 
     force_n: Any
-    """[] f32: mean over substeps of the norm of the robot's summed contact force on all but the floor, N."""
+    """[] f32: F_t, N: mean over substeps of the norm of the robot's summed contact force on all but the floor, or
+    what the options `force_part` and `force_sum` make of it."""
     slot_force_n: Any
     """[M] f32: largest norm over substeps of the net force on each slot's body, N."""
     structure_force_n: Any
     """[] f32: the same for walls and other fixed structure, N."""
+    body_force_n: Any
+    """[] f32: largest summed normal force over substeps of all but wheels and casters on all but the floor, N; 0
+    unless an option looks at single contacts."""
     overflow: Any
     """[] i32: 1 if a contact, constraint or broadphase buffer overflowed in any substep: contacts were dropped."""
     left_out: Any
@@ -120,16 +128,36 @@ def _step_single(physics: Physics, *args):
     return single(*args)
 
 
-def summarise_forces(force_w: Any, xp: Any = jnp) -> tuple[Any, Any, Any]:
-    """Contact forces of all substeps to the numbers of `StepSignals`.
+@dataclasses.dataclass(frozen=True)
+class ForceOptions:
+    """What counts as the force of a control step (`NavConfig` has the same names)."""
+
+    force_part: str = "full"
+    force_sum: str = "vector"
+    needs_contacts: bool = False
+
+
+PAPER_FORCE = ForceOptions()
+"""The paper's: everything that touches, summed as vectors."""
+
+
+def summarise_forces(
+    force_w: Any, xp: Any = jnp, contacts: Any = None, options: ForceOptions = PAPER_FORCE
+) -> dict[str, Any]:
+    """Contact forces of all substeps to the fields of `StepSignals` that hold forces.
 
     Args:
         force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
         xp: numpy or jax.numpy.
-
-    Returns:
-        force_n [...], slot_force_n [..., M], structure_force_n [...].
+        contacts: see `interactive_nav.contacts.combine`.
+        options: what F_t is.
     """
-    total = xp.sqrt((force_w.sum(-2) ** 2).sum(-1)).mean(-1)
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)
-    return total, each[..., :-1], each[..., -1]
+    force, body = combine(force_w.sum(-2), contacts, options.force_part, options.force_sum, xp)
+    values = {
+        "force_n": force,
+        "slot_force_n": each[..., :-1],
+        "structure_force_n": each[..., -1],
+        "body_force_n": body,
+    }
+    return {name: value.astype(np.float32) for name, value in values.items()}

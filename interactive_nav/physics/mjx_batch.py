@@ -14,7 +14,8 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.config import NavConfig
-from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.contacts import from_sensors, part_of_contacts, sensor_addresses
+from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import Layout, World
@@ -30,7 +31,7 @@ CCD_PER_ENV = 32
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap."""
 
-    def __init__(self, world: World, config: NavConfig, impl: str):
+    def __init__(self, world: World, config: NavConfig, impl: str, forces: ForceOptions = PAPER_FORCE):
         self.name = impl
         self.window = Window(world, config)
         self._world, self._substeps = world, config.substeps
@@ -52,6 +53,10 @@ class MjxPhysics(Physics):
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
         self._slot_of_geom = _slot_of_geom(layout, host)
+        self._forces = forces
+        self._contacts = sensor_addresses(host) if impl == "warp" and forces.needs_contacts else None
+        rolling = [mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_BODY, name) for name in world.robot.rolling_bodies]
+        self._rolls = np.isin(host.geom_bodyid, rolling)
 
     def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]
@@ -102,42 +107,44 @@ class MjxPhysics(Physics):
                     data = mjx.step(model, data)
                     return data, self._forces_from_contacts(data)
 
-                data, forces = jax.lax.scan(substep, data, jnp.arange(self._substeps))
+                data, (forces, contacts) = jax.lax.scan(substep, data, jnp.arange(self._substeps))
                 # Its buffers are static, and it does not report its solver's iterations.
                 failures = jnp.asarray(0, jnp.int32)
             else:
                 # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's
                 # carry cannot.
-                collected, failures = [], jnp.asarray(0, jnp.int32)
+                collected, listed, failures = [], [], jnp.asarray(0, jnp.int32)
                 for k in range(self._substeps):
                     if every and k:
                         data = control(data, command, time_s + k * dt)
                     data = mjx.step(model, data)
                     collected.append(data.sensordata[self._sensors])
+                    if self._contacts is not None:
+                        listed.append(from_sensors(data.sensordata, self._contacts, self._forces.force_part, jnp))
                     failures |= data._impl.overflow
                 forces = jnp.stack(collected)
+                contacts = jax.tree.map(lambda *x: jnp.stack(x), *listed) if listed else None
             out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
-            return out, window.spread_forces(forces, chosen), failures, missed
+            return out, (window.spread_forces(forces, chosen), contacts), failures, missed
 
-        new, forces, failures, missed = jax.vmap(one)(scene, state, command, time_s)
-        force_n, slot_n, structure_n = summarise_forces(forces)
+        new, (forces, contacts), failures, missed = jax.vmap(one)(scene, state, command, time_s)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
         return new, StepSignals(
-            force_n=force_n,
-            slot_force_n=slot_n,
-            structure_force_n=structure_n,
+            **summarise_forces(forces, jnp, contacts, self._forces),
             overflow=((failures & _DROPPED) != 0).astype(jnp.int32),
             left_out=missed,
             unconverged=((failures & _UNCONVERGED) != 0).astype(jnp.int32),
             nonfinite=(~finite).astype(jnp.int32),
         )
 
-    def _forces_from_contacts(self, data) -> jax.Array:
-        """[M + 1, 3] net force of the robot on each slot and the structure, world frame, from MJX-JAX's contacts."""
+    def _forces_from_contacts(self, data) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array] | None]:
+        """From MJX-JAX's contacts: the net force [M + 1, 3] of the robot on each slot and the structure, world frame;
+        and, where an option asks, what `from_sensors` gives on the other backends."""
         contact, efc = data._impl.contact, data._impl.efc_force
         out = jnp.zeros((len(self._sensors), 3))
         dims, address = np.asarray(contact.dim), np.asarray(contact.efc_address)
-        slot = jnp.asarray(self._slot_of_geom)
+        slot, rolls = jnp.asarray(self._slot_of_geom), jnp.asarray(self._rolls)
+        sums = (jnp.zeros(3), jnp.zeros(()), jnp.zeros(())) if self._forces.needs_contacts else None
         for dim in np.unique(dims):
             at = np.flatnonzero((dims == dim) & (address >= 0))
             rows = efc[address[at][:, None] + np.arange(1 if dim == 1 else 2 * (dim - 1))]
@@ -153,7 +160,17 @@ class MjxPhysics(Physics):
             given = jnp.where((first == _ROBOT)[:, None], force, -force)
             target = jnp.where(first == _ROBOT, second, jnp.where(second == _ROBOT, first, -1))
             out = out.at[jnp.maximum(target, 0)].add(jnp.where(target[:, None] >= 0, given, 0.0))
-        return out
+            if sums is None:
+                continue
+            local = jnp.where((target >= 0)[:, None], local, 0.0)
+            normal = jnp.where((first == _ROBOT)[:, None], contact.frame[at][:, 0], -contact.frame[at][:, 0])
+            rolling = rolls[contact.geom[at]].any(-1)
+            part = self._forces.force_part
+            everything = part_of_contacts(local, normal, part, jnp)
+            of_body = part_of_contacts(jnp.where(rolling[:, None], 0.0, local), normal, part, jnp)
+            chosen = (of_body[0], of_body[1] if part == "normal" else everything[1], of_body[2])
+            sums = (sums[0] + chosen[0], sums[1] + chosen[1], sums[2] + chosen[2])
+        return out, sums
 
 
 _ROBOT = -2

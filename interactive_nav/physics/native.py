@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.contacts import from_sensors, sensor_addresses
+from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import World
 
@@ -46,10 +47,19 @@ class NativePhysics(Physics):
 
     name = "native"
 
-    def __init__(self, world: World, substeps: int, sleep: bool = True, threads: int = 0):
+    def __init__(
+        self,
+        world: World,
+        substeps: int,
+        sleep: bool = True,
+        threads: int = 0,
+        forces: ForceOptions = PAPER_FORCE,
+    ):
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
         self._substeps = substeps
         self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
+        self._forces = forces
+        self._contacts = sensor_addresses(world.models[0]) if forces.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
         self._threads, self._sleep = threads, sleep
@@ -75,6 +85,7 @@ class NativePhysics(Physics):
                 force_n=jax.ShapeDtypeStruct((n,), f32),
                 slot_force_n=jax.ShapeDtypeStruct((n, self._slots), f32),
                 structure_force_n=jax.ShapeDtypeStruct((n,), f32),
+                body_force_n=jax.ShapeDtypeStruct((n,), f32),
                 overflow=jax.ShapeDtypeStruct((n,), i32),
                 left_out=jax.ShapeDtypeStruct((n,), i32),
                 unconverged=jax.ShapeDtypeStruct((n,), i32),
@@ -127,13 +138,14 @@ class NativePhysics(Physics):
         nonfinite = ~finite | raised[:, [int(w) for w in _ENGINE_FAILURES]].any(1)
         pool.qpos, pool.qvel = new_qpos, new_qvel
         pool.qpos[nonfinite] = np.nan
-        force_n, slot_n, structure_n = summarise_forces(sensed[:, :, self._sensors], np)
+        contacts = None
+        if self._contacts is not None:
+            contacts = from_sensors(sensed, self._contacts, self._forces.force_part, np)
+        forces = summarise_forces(sensed[:, :, self._sensors], np, contacts, self._forces)
         return (
             PhysicsState(new_qpos.copy(), new_qvel.copy(), pool.state_warm.astype(np.float32)),
             StepSignals(
-                force_n=force_n.astype(np.float32),
-                slot_force_n=slot_n.astype(np.float32),
-                structure_force_n=structure_n.astype(np.float32),
+                **forces,
                 overflow=raised[:, [int(w) for w in _OVERFLOWS]].any(1).astype(np.int32),
                 left_out=np.zeros(size, np.int32),
                 unconverged=(iterations >= self._models[0].opt.iterations).astype(np.int32),

@@ -7,7 +7,7 @@ import pytest
 
 import interactive_nav
 from interactive_nav import metrics
-from interactive_nav.env import EPISODE_METRICS
+from interactive_nav.env import EPISODE_METRICS, SETTLE_STEPS
 from interactive_nav.wrappers import AutoResetEnv
 
 N = 6
@@ -168,6 +168,7 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
     state = reset(keys(7))
     masses = np.asarray(env.tables.mass_kg)[np.asarray(state.info["nav"].scene_index)]
     tracks, forces = [[] for _ in range(N)], [[] for _ in range(N)]
+    touched: list[list[np.ndarray]] = [[] for _ in range(N)]
     done_at: list[dict[str, float]] = [{} for _ in range(N)]
     previous = np.zeros(N)
     for i in range(N):
@@ -179,6 +180,7 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
         for i in range(N):
             if not done_at[i]:
                 tracks[i].append(np.vstack([nav.robot_pos_w[i], nav.object_pos_w[i]]))
+                touched[i].append(np.asarray(nav.touched[i]))
                 forces[i].append(float(nav.force_sum_n[i]) - previous[i])
                 if state.done[i]:
                     done_at[i] = {k: float(v[i]) for k, v in state.metrics.items()}
@@ -189,6 +191,7 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
         got = done_at[i]
         moved = np.linalg.norm(np.diff(np.asarray(tracks[i], float), axis=0), axis=-1)
         moved[moved < 1e-4] = 0.0
+        moved[:SETTLE_STEPS, 1:][~np.asarray(touched[i][:SETTLE_STEPS])] = 0.0
         paths = moved.sum(0)
         paths[1:][masses[i, 1:] == 0] = 0.0
         work = masses[i] * paths

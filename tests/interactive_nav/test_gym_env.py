@@ -21,7 +21,7 @@ N, STEPS = 3, 9
 
 @pytest.fixture(scope="module")
 def settings(room):
-    return {"scenes": [room], "backend": "native", "num_objects": 2, "episode_steps": 4, "max_goals": 32}
+    return {"scenes": [room], "backend": "native", "num_objects": 2, "episode_steps": 4}
 
 
 @pytest.fixture(scope="module")

@@ -36,9 +36,7 @@ STEPS = 60
 
 @pytest.fixture(scope="module")
 def env(room):
-    return interactive_nav.make(
-        "turtlebot", [room], backend="native", num_objects=3, episode_steps=STEPS, max_goals=32, sleep=False
-    )
+    return interactive_nav.make("turtlebot", [room], backend="native", num_objects=3, episode_steps=STEPS, sleep=False)
 
 
 def straight(observation, key):
@@ -270,7 +268,7 @@ def test_a_map_shows_what_was_moved(played, room, tmp_path):
 
 
 def test_gymnasium_renders_the_view_from_behind(room):
-    settings = {"backend": "native", "num_objects": 1, "max_goals": 16, "render_mode": "rgb_array"}
+    settings = {"backend": "native", "num_objects": 1, "render_mode": "rgb_array"}
     env = gym_env.InteractiveNavEnv("turtlebot", [str(room)], **settings)
     assert env.metadata["render_fps"] == 10 and env.render() is None
     env.reset(seed=0)

@@ -10,7 +10,7 @@ sb3 = pytest.importorskip("stable_baselines3", reason="stable_baselines3 is not 
 def envs(room):
     from interactive_nav.sb3_env import SB3VecEnv
 
-    return SB3VecEnv("turtlebot", [room], num_envs=4, backend="native", num_objects=1, episode_steps=8, max_goals=16)
+    return SB3VecEnv("turtlebot", [room], num_envs=4, backend="native", num_objects=1, episode_steps=8)
 
 
 def test_an_episodes_end_is_told_as_stable_baselines_expects(envs):

@@ -22,7 +22,7 @@ import jax, jax.numpy as jnp, numpy as np
 from interactive_nav.sharding import ShardedEnv
 from interactive_nav.wrappers import AutoResetEnv
 
-env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1, max_goals=8,
+env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1,
                                         sleep=False, episode_steps=6))
 keys = jax.random.split(jax.random.PRNGKey(0), 4)
 actions = jax.random.uniform(jax.random.PRNGKey(1), (8, 4, 2), minval=-1.0)
@@ -51,7 +51,7 @@ start_distributed(sys.argv[2], 2, int(sys.argv[3]))
 import jax, jax.numpy as jnp
 from interactive_nav.wrappers import AutoResetEnv
 
-env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1, max_goals=8,
+env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1,
                                         sleep=False))
 sharded = ShardedEnv(env)
 state = jax.jit(lambda: sharded.reset(jax.random.split(jax.random.PRNGKey(0), 4)))()

@@ -44,7 +44,7 @@ def test_the_batch_gives_and_takes_tensors(room):
     from interactive_nav.gym_env import InteractiveNavVectorEnv
 
     envs = InteractiveNavVectorEnv(
-        "turtlebot", [room], num_envs=3, arrays="torch", backend="native", num_objects=1, episode_steps=2, max_goals=16
+        "turtlebot", [room], num_envs=3, arrays="torch", backend="native", num_objects=1, episode_steps=2
     )
     obs, _ = envs.reset(seed=1)
     for _ in range(2):

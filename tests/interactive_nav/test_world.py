@@ -168,7 +168,7 @@ def test_goals_and_starts_are_clear_of_furniture_and_walls(world, two_rooms):
     tables = build_tables(world, NavConfig(num_objects=3))
     scene = world.scenes[1]
     cubes = np.array([[1.2, 0.0], [-1.2, 1.0]])  # 0.4 m cubes, see the fixture
-    goals = np.asarray(tables.node_xy_w[1])[np.asarray(tables.goal_node[1])[: int(tables.num_goals[1])]]
+    goals = np.asarray(tables.goal_xy_w[1])[: int(tables.num_goals[1])]
     starts = np.asarray(tables.start_xy_w[1])[: int(tables.num_starts[1])]
     for places in (goals, starts):
         assert len(places) > 100

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from interactive_nav.config import ORIGINAL_CODE
 from train import config_io
 from train.config import AUTO_PPO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
 from train.config_io import apply_overrides, field_docs, flatten, from_yaml, help_text, load, to_yaml
@@ -147,3 +148,9 @@ def test_command_line_says_one_line_and_exits_2():
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert line.startswith("train: override: unknown key 'ppo.learnin_rate', did you mean 'ppo.learning_rate'?")
+
+
+def test_the_preset_of_the_original_code_holds_all_its_values():
+    config = config_io.load("turtlebot_ppo_code")
+    assert {key: getattr(config.env, key) for key in ORIGINAL_CODE} == ORIGINAL_CODE
+    assert config.ppo.discounting == 0.98

@@ -89,8 +89,11 @@ def test_evaluation_is_repeatable_and_choosable(run, evaluated, tmp_path):
     [
         (
             ["--policies", "lerned"],
-            "--policies: got 'lerned', expected a choice from learned, random, follower",
+            "--policies: got 'lerned', expected a choice from learned, random, follower, avoider, namo:W",
         ),
+        (["--policies", "namo:x"], "policy namo: got 'namo:x', expected a weight, as in namo:0.5"),
+        (["--policies", "namo:2"], "policy namo: weight is 2.0, expected between 0 and 1"),
+        (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: cannot read"),
         (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
         (["--episodes", "0"], "--episodes is 0, expected at least 1"),
         (["ppo.learning_rate=1"], "expected env.<setting>=value"),
@@ -125,7 +128,7 @@ def test_checkpoint_of_another_robot(run, tmp_path, capsys):
 def test_figures(run, evaluated, tmp_path, capsys):
     assert figures.main([str(run.path), "-o", str(tmp_path / "f")]) == 0
     made = sorted(path.name for path in (tmp_path / "f").iterdir())
-    assert made == ["learning_curves.png", "trajectories_toy.png"]
+    assert made == ["frontier_toy.png", "learning_curves.png", "trajectories_toy.png"]
     assert all((tmp_path / "f" / name).stat().st_size > 10_000 for name in made)
     capsys.readouterr()
     (tmp_path / "empty").mkdir()

@@ -35,6 +35,7 @@ class ToyConfig:
     observations: tuple[str, ...] = ("goal", "velocity", "waypoints")
     num_waypoints: int = 10
     waypoint_spacing_m: float = 0.2
+    scene_choice: str = "episode"
 
 
 @flax.struct.dataclass

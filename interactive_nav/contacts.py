@@ -1,0 +1,119 @@
+"""Single contacts of the robot, for the options that each body's net force does not answer.
+
+The original's code leaves out friction and wheels, and could sum the contacts' norms instead of their vectors
+(reference benchmark, section 11, rows 4, 6 and 7). MuJoCo's contact sensors list contacts by body, so wheels are
+taken off again: what the whole robot does to a body, less what its rolling bodies do to it. These sensors are
+added only when an option asks for them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from interactive_nav.robots import RobotSpec
+
+SLOTS = 32
+"""Contacts listed between the robot, or one of its wheels, and one body; more than a robot's few boxes make."""
+_FIELDS = 7
+"""found (1), force in the contact's frame (3), normal in the world frame (3)."""
+_DATA = sum(
+    1 << int(bit)
+    for bit in (
+        mujoco.mjtConDataField.mjCONDATA_FOUND,
+        mujoco.mjtConDataField.mjCONDATA_FORCE,
+        mujoco.mjtConDataField.mjCONDATA_NORMAL,
+    )
+)
+_ALL = "contacts_of_robot"
+_ROLLING = "contacts_of_rolling"
+
+
+def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]) -> None:
+    """Lists the robot's and its rolling bodies' contacts with each of the bodies."""
+
+    def add(name: str, objtype: mujoco.mjtObj, objname: str, body: str) -> None:
+        spec.add_sensor(
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=objtype,
+            objname=objname,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname=body,
+            intprm=[_DATA, 0, SLOTS],
+        )
+
+    for i, body in enumerate(bodies):
+        add(f"{_ALL}_{i}", mujoco.mjtObj.mjOBJ_XBODY, robot.base_body, body)
+        for wheel in robot.rolling_bodies:
+            add(f"{_ROLLING}_{i}_{wheel}", mujoco.mjtObj.mjOBJ_BODY, wheel, body)
+
+
+def sensor_addresses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Addresses in sensordata of the whole robot's lists and of its rolling bodies': [a, SLOTS, 7], [b, SLOTS, 7]."""
+    names = [(model.sensor(i).name, int(model.sensor_adr[i])) for i in range(model.nsensor)]
+
+    def of(prefix: str) -> np.ndarray:
+        starts = np.array([adr for name, adr in names if name.startswith(prefix)], np.int64)
+        return starts[:, None, None] + np.arange(SLOTS * _FIELDS).reshape(SLOTS, _FIELDS)
+
+    return of(_ALL), of(_ROLLING)
+
+
+def part_of_contacts(force_c: Any, normal_w: Any, part: str, xp: Any) -> tuple[Any, Any, Any]:
+    """Sums over contacts.
+
+    Args:
+        force_c: [..., c, 3] in the contacts' frames, normal first, N; 0 where there is no contact.
+        normal_w: [..., c, 3] world frame.
+        part: `full` or `normal`.
+        xp: numpy or jax.numpy.
+
+    Returns:
+        The vector sum of the normal forces [..., 3], the sum of the chosen part's norms [...], and the sum of the
+        normal forces' norms [...].
+    """
+    pressure = force_c[..., 0]
+    norm = xp.sqrt((force_c**2).sum(-1)) if part == "full" else abs(pressure)
+    return (pressure[..., None] * normal_w).sum(-2), norm.sum(-1), abs(pressure).sum(-1)
+
+
+def from_sensors(data: Any, addresses: tuple[np.ndarray, np.ndarray], part: str, xp: Any) -> tuple[Any, Any, Any]:
+    """`part_of_contacts` of a record of sensordata [..., nsensordata]: over all listed contacts, without the rolling
+    bodies' in the first and third, and in the second too where `part` is `normal`."""
+    sums = []
+    for where in addresses:
+        listed = data[..., where.reshape(-1, _FIELDS)]
+        found = listed[..., :1] > 0
+        sums.append(part_of_contacts(xp.where(found, listed[..., 1:4], 0.0), listed[..., 4:7], part, xp))
+    (vector, norm, touch), (rolling_vector, rolling_norm, rolling_touch) = sums
+    norm = norm - rolling_norm if part == "normal" else norm
+    # Differences of equal sums leave rounding behind.
+    return vector - rolling_vector, xp.maximum(norm, 0.0), xp.maximum(touch - rolling_touch, 0.0)
+
+
+def combine(
+    net_w: Any, contacts: tuple[Any, Any, Any] | None, force_part: str, force_sum: str, xp: Any
+) -> tuple[Any, Any]:
+    """The options' F_t and the force of what touches.
+
+    Args:
+        net_w: [..., substeps, 3] the robot's full contact force on all but the floor, N.
+        contacts: of `from_sensors`, leaves [..., substeps, (3)]; None: no option asks.
+        force_part: `full` or `normal`.
+        force_sum: `vector`, `contacts` or `last_substep`.
+        xp: numpy or jax.numpy.
+
+    Returns:
+        F_t [...], and [...] the largest force, over the substeps, of parts that do not roll on anything but the floor.
+    """
+    vector = net_w
+    if contacts is not None and force_part == "normal":
+        vector = contacts[0]
+    length = xp.sqrt((vector**2).sum(-1))
+    if contacts is not None and force_sum == "contacts":
+        length = contacts[1]
+    force = length[..., -1] if force_sum == "last_substep" else length.mean(-1)
+    return force, xp.zeros_like(force) if contacts is None else contacts[2].max(-1)

@@ -1,0 +1,279 @@
+"""Fixed evaluation episodes: an environment and a seed in, a versioned file out, and back into starts.
+
+`python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
+
+A file names its scenes by the digest of their content, so the same file means the same episodes on every
+machine and backend; with other scenes, another robot or other objects it is refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from interactive_nav.env import InteractiveNav
+    from interactive_nav.types import EpisodeStart
+
+FORMAT = "interactive-nav-episodes"
+VERSION = 1
+LENGTH_TOLERANCE_M = 1e-3
+"""L* of a file and of the environment may differ by rounding only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeFile:
+    """N episodes, as they stand in a file."""
+
+    robot: str
+    seed: int
+    scenes: tuple[tuple[str, str], ...]
+    """(name, digest) of each scene."""
+    objects: tuple[str, ...]
+    """Categories of the small objects, in order."""
+    objects_digest: str
+    """SHA-256 of the small objects' shapes, masses and friction."""
+    episodes: tuple[dict[str, Any], ...]
+    """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
+    that found no place) and shortest_path_m; metres and radians, world frame."""
+
+
+class EpisodeFileError(ValueError):
+    """An episode file that cannot be used; the message says what, where, what was expected and what to do."""
+
+
+def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
+    """Draws episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
+
+    Args:
+        env: not batched.
+        episodes: how many, at least 1.
+        seed: of the draw.
+
+    Raises:
+        ValueError: fewer than one episode.
+    """
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    if episodes < 1:
+        raise ValueError(f"episodes is {episodes}, expected at least 1")
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
+    starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
+    starts, lengths = jax.tree.map(np.asarray, (starts, lengths))
+    rows = []
+    for i in range(episodes):
+        small = [
+            [*map(float, xy), float(yaw)] if placed else None
+            for xy, yaw, placed in zip(
+                starts.small_xy_w[i], starts.small_yaw_rad[i], starts.small_placed[i], strict=True
+            )
+        ]
+        rows.append(
+            {
+                "scene": int(starts.scene_index[i]),
+                "start_xy_w": [float(v) for v in starts.start_xy_w[i]],
+                "start_yaw_rad": float(starts.start_yaw_rad[i]),
+                "goal_xy_w": [float(v) for v in starts.goal_xy_w[i]],
+                "objects": small,
+                "shortest_path_m": float(lengths[i]),
+            }
+        )
+    return EpisodeFile(
+        robot=env.robot.name,
+        seed=seed,
+        scenes=tuple((scene.name, scene.digest) for scene in env.scenes),
+        objects=tuple(o.category for o in env.world.small_objects),
+        objects_digest=_objects_digest(env),
+        episodes=tuple(rows),
+    )
+
+
+def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart, Any]:
+    from interactive_nav.navigation import geodesic_at, goal_field
+
+    field = goal_field(env.tables, start.scene_index, start.goal_xy_w)
+    return start, geodesic_at(env.tables, start.scene_index, field, start.start_xy_w)
+
+
+def _objects_digest(env: InteractiveNav) -> str:
+    return hashlib.sha256(repr(env.world.small_objects).encode()).hexdigest()
+
+
+def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -> EpisodeStart:
+    """The file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...].
+
+    Args:
+        file: of `load`.
+        env: whose scenes must include the file's; their order may differ.
+        where: named in errors.
+
+    Raises:
+        EpisodeFileError: the file was made for another robot, other scenes, other small objects or another map of
+            shortest paths than the environment's.
+    """
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from interactive_nav.types import EpisodeStart
+
+    if file.robot != env.robot.name:
+        raise EpisodeFileError(
+            f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
+            "make the episodes again for it"
+        )
+    ours = {scene.digest: i for i, scene in enumerate(env.scenes)}
+    by_name = {scene.name: scene.digest for scene in env.scenes}
+    for name, digest in file.scenes:
+        if digest in ours:
+            continue
+        if name in by_name:
+            raise EpisodeFileError(
+                f"{where}: scene '{name}' has digest {digest[:12]}, the environment's '{name}' has "
+                f"{by_name[name][:12]}: its content changed since; use the scene it was made from or make the "
+                "episodes again"
+            )
+        raise EpisodeFileError(
+            f"{where}: needs scene '{name}' (digest {digest[:12]}), the environment has {', '.join(by_name)}; "
+            "add it to --scenes"
+        )
+    if file.objects_digest != _objects_digest(env):
+        raise EpisodeFileError(
+            f"{where}: made with {len(file.objects)} small objects ({', '.join(file.objects) or 'none'}), the "
+            f"environment has {len(env.world.small_objects)} or other models; set num_objects={len(file.objects)}, or "
+            "make the episodes again"
+        )
+    rows, count = file.episodes, len(file.objects)
+    small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]
+    poses = np.asarray(small, np.float32).reshape(len(rows), count, 3)
+    scene = [ours[file.scenes[row["scene"]][1]] for row in rows]
+
+    def f32(name: str) -> jax.Array:
+        return jnp.asarray([row[name] for row in rows], jnp.float32)
+
+    starts = EpisodeStart(
+        scene_index=jnp.asarray(scene, jnp.int32),
+        start_xy_w=f32("start_xy_w"),
+        start_yaw_rad=f32("start_yaw_rad"),
+        goal_xy_w=f32("goal_xy_w"),
+        small_xy_w=jnp.asarray(poses[..., :2]),
+        small_yaw_rad=jnp.asarray(poses[..., 2]),
+        small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows]).reshape(-1, count),
+    )
+    _, lengths = jax.jit(jax.vmap(lambda start: _with_length(env, start)))(starts)
+    wrong = np.abs(np.asarray(lengths) - np.asarray(f32("shortest_path_m"))) > LENGTH_TOLERANCE_M
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise EpisodeFileError(
+            f"{where}: episode {i}: shortest_path_m is {rows[i]['shortest_path_m']:.3f} m, the environment finds "
+            f"{float(lengths[i]):.3f} m; use the settings (nav_cell_m) and version it was made with, or make it again"
+        )
+    return starts
+
+
+def save(file: EpisodeFile, path: str | Path) -> None:
+    """Writes whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(file)}
+    head = {k: v for k, v in data.items() if k != "episodes"}
+    # One line an episode: readable, and small in a diff.
+    lines = ",\n".join(json.dumps(row) for row in file.episodes)
+    text = f'{json.dumps(head, indent=1)[:-2]},\n "episodes": [\n{lines}\n ]\n}}\n'
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def load(path: str | Path) -> EpisodeFile:
+    """Reads and checks a file.
+
+    Raises:
+        EpisodeFileError: no such file, not such a file, another version, a missing or impossible value.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise EpisodeFileError(
+            f"{path}: cannot read ({error.strerror}); make one with 'python -m interactive_nav.episodes make'"
+        ) from None
+    except ValueError:
+        raise EpisodeFileError(f"{path}: not readable as JSON, expected an episode file") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise EpisodeFileError(f"{path}: not an episode file (format is not '{FORMAT}')")
+    if data.get("version") != VERSION:
+        raise EpisodeFileError(f"{path}: version is {data.get('version')!r}, expected {VERSION}; make it again")
+    try:
+        scenes = tuple((str(name), str(digest)) for name, digest in data["scenes"])
+        file = EpisodeFile(
+            robot=str(data["robot"]),
+            seed=int(data["seed"]),
+            scenes=scenes,
+            objects=tuple(data["objects"]),
+            objects_digest=str(data["objects_digest"]),
+            episodes=tuple(data["episodes"]),
+        )
+        for i, row in enumerate(file.episodes):
+            _check(row, i, file)
+    except (KeyError, TypeError) as error:
+        raise EpisodeFileError(f"{path}: missing or malformed entry ({error}); make it again") from None
+    except ValueError as error:
+        raise EpisodeFileError(f"{path}: {error}; make it again") from None
+    return file
+
+
+def _check(row: dict[str, Any], index: int, file: EpisodeFile) -> None:
+    numbers = [*row["start_xy_w"], row["start_yaw_rad"], *row["goal_xy_w"], row["shortest_path_m"]]
+    numbers += [value for pose in row["objects"] if pose is not None for value in pose]
+    if len(row["start_xy_w"]) != 2 or len(row["goal_xy_w"]) != 2 or not all(math.isfinite(v) for v in numbers):
+        raise ValueError(f"episode {index} has a number missing or not finite")
+    if any(pose is not None and len(pose) != 3 for pose in row["objects"]):
+        raise ValueError(f"episode {index} has an object whose pose is not [x, y, yaw]")
+    if not 0 <= row["scene"] < len(file.scenes) or len(row["objects"]) != len(file.objects):
+        raise ValueError(f"episode {index} names scene {row['scene']} of {len(file.scenes)} or has other objects")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Makes a file; 0 when done, 2 on a user's error."""
+    parser = argparse.ArgumentParser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    make_parser = commands.add_parser("make", help="draw episodes and write them to a file")
+    make_parser.add_argument("--robot", default="turtlebot", help="default: turtlebot")
+    make_parser.add_argument("--scenes", nargs="+", required=True, metavar="SCENE_DIR")
+    make_parser.add_argument("--episodes", type=int, default=100, help="default: 100")
+    make_parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    make_parser.add_argument("--num-objects", type=int, default=10, help="small objects (default 10)")
+    make_parser.add_argument("-o", "--out", required=True, metavar="FILE")
+    arguments = parser.parse_args(argv)
+    import interactive_nav
+
+    try:
+        env = interactive_nav.make(
+            arguments.robot, arguments.scenes, backend="native", num_objects=arguments.num_objects
+        )
+        file = draw(env, arguments.episodes, arguments.seed)
+        save(file, arguments.out)
+    except (ValueError, OSError) as error:
+        print(f"interactive_nav.episodes: {error}", file=sys.stderr)
+        return 2
+    shortest = [row["shortest_path_m"] for row in file.episodes]
+    print(
+        f"{arguments.out}: {len(shortest)} episodes in {len(file.scenes)} scenes, shortest paths "
+        f"{min(shortest):.2f} to {max(shortest):.2f} m"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

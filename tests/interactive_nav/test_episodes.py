@@ -1,0 +1,101 @@
+"""Episode files: the same episodes for everybody, and one clear line for each way a file does not fit."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import interactive_nav
+from interactive_nav import episodes
+from interactive_nav.episodes import EpisodeFileError
+
+
+@pytest.fixture(scope="module")
+def env(room, two_rooms):
+    return interactive_nav.make("turtlebot", [room, two_rooms], backend="native", num_objects=3)
+
+
+@pytest.fixture(scope="module")
+def made(env):
+    return episodes.draw(env, 6, seed=4)
+
+
+def test_round_trip_and_the_same_episodes_as_reset(env, made, tmp_path):
+    path = tmp_path / "deep" / "episodes.json"
+    episodes.save(made, path)
+    assert episodes.load(path) == made
+    assert len(path.read_text().splitlines()) < 60  # one line an episode
+    starts = episodes.starts_of(episodes.load(path), env)
+    keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.PRNGKey(4), i))(np.arange(6))
+    want = jax.jit(jax.vmap(env.reset))(keys)
+    got = jax.jit(jax.vmap(env.reset_to))(starts, keys)
+    np.testing.assert_allclose(got.pipeline_state.qpos, want.pipeline_state.qpos, atol=1e-5)
+    np.testing.assert_allclose(got.info["nav"].goal_xy_w, want.info["nav"].goal_xy_w, atol=1e-6)
+    lengths = [row["shortest_path_m"] for row in made.episodes]
+    np.testing.assert_allclose(got.info["nav"].shortest_path_m, lengths, atol=1e-5)
+    assert {0, 1} == {row["scene"] for row in made.episodes}
+    # A longer file begins with the same episodes.
+    assert episodes.draw(env, 2, seed=4).episodes == made.episodes[:2]
+
+
+def test_scenes_are_found_by_content_not_by_place(env, made, room, two_rooms):
+    turned = interactive_nav.make("turtlebot", [two_rooms, room], backend="native", num_objects=3)
+    starts = episodes.starts_of(made, turned)
+    np.testing.assert_array_equal(starts.scene_index, [1 - row["scene"] for row in made.episodes])
+
+
+def test_files_that_do_not_fit_are_refused(env, made, room):
+    def refused(message, file=made, where=env):
+        with pytest.raises(EpisodeFileError, match=message):
+            episodes.starts_of(file, where)
+
+    refused("made for robot 'fetch', the environment's is 'turtlebot'", dataclasses.replace(made, robot="fetch"))
+    other = tuple((name, "0" * 64) for name, _ in made.scenes)
+    refused("scene 'room' has digest 000000000000, .* its content changed", dataclasses.replace(made, scenes=other))
+    elsewhere = tuple((f"{name}_2", "0" * 64) for name, _ in made.scenes)
+    refused("needs scene 'room_2' .* add it to --scenes", dataclasses.replace(made, scenes=elsewhere))
+    refused("made with 3 small objects .* set num_objects=3", dataclasses.replace(made, objects_digest="x"))
+    longer = ({**made.episodes[0], "shortest_path_m": 9.0}, *made.episodes[1:])
+    refused("episode 0: shortest_path_m is 9.000 m", dataclasses.replace(made, episodes=longer))
+    with pytest.raises(ValueError, match="episodes is 0, expected at least 1"):
+        episodes.draw(env, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(version=2), "version is 2, expected 1"),
+        (lambda d: d.update(format="x"), "not an episode file"),
+        (lambda d: d.pop("robot"), "missing or malformed entry"),
+        (lambda d: d["episodes"][0].pop("goal_xy_w"), "missing or malformed entry"),
+        (lambda d: d["episodes"][1].update(start_yaw_rad=float("nan")), "episode 1 has a number missing or not finite"),
+        (lambda d: d["episodes"][1].update(scene=7), "episode 1 names scene 7 of 2"),
+    ],
+)
+def test_damaged_files_are_named(made, tmp_path, change, message):
+    path = tmp_path / "episodes.json"
+    episodes.save(made, path)
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(EpisodeFileError, match=message):
+        episodes.load(path)
+
+
+def test_the_command_line(room, tmp_path, capsys):
+    out = tmp_path / "e.json"
+    words = ["make", "--scenes", str(room), "--episodes", "3", "--seed", "1", "--num-objects", "2", "-o", str(out)]
+    assert episodes.main(words) == 0
+    assert "3 episodes in 1 scenes" in capsys.readouterr().out
+    file = episodes.load(out)
+    assert (file.seed, len(file.episodes), file.objects) == (1, 3, ("basket", "shoe"))
+    assert episodes.main(["make", "--scenes", str(tmp_path / "nowhere"), "-o", str(out)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("interactive_nav.episodes: ") and "no such file" in line
+    with pytest.raises(EpisodeFileError, match="cannot read"):
+        episodes.load(tmp_path / "absent.json")
+    (tmp_path / "bad.json").write_text("{")
+    with pytest.raises(EpisodeFileError, match="not readable as JSON"):
+        episodes.load(tmp_path / "bad.json")

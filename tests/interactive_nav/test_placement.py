@@ -1,0 +1,129 @@
+"""Episodes are uniform, far enough apart and free of contact: 10,000 draws in a toy room with a partition."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from interactive_nav import geodesic
+from interactive_nav.config import NavConfig
+from interactive_nav.placement import CLEARANCE_M, draw_episode
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import load_scene
+from interactive_nav.tables import build_tables
+from interactive_nav.world import build_world
+
+DRAWS = 10_000
+CONFIG = NavConfig(num_objects=10)
+
+
+@pytest.fixture(scope="module")
+def built(two_rooms):
+    world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), CONFIG)
+    return world, build_tables(world, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def draws(built):
+    world, tables = built
+    radii = jnp.asarray([o.radius_m for o in world.small_objects])
+
+    def draw(key):
+        return draw_episode(key, tables, radii, world.robot.footprint_radius_m, 1.0, np.inf)
+
+    drawn = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), DRAWS))
+    return jax.tree.map(np.asarray, drawn)
+
+
+def uniform_p_value(points: np.ndarray, weights: np.ndarray, cells: np.ndarray, side_m: float) -> float:
+    """Chi-square of points [n, 2] against expected shares of cells' middles [c, 2], in blocks of 0.4 m."""
+    block = 0.4
+    low = cells.min(0) - side_m / 2
+    at = np.floor((points - low) / block + 1e-6).astype(int)
+    own = np.floor((cells - low) / block + 1e-6).astype(int)
+    shape = own.max(0) + 2
+    counts = np.bincount(np.ravel_multi_index(np.minimum(at, shape - 1).T, shape), minlength=shape.prod())
+    expected = np.bincount(np.ravel_multi_index(own.T, shape), weights=weights, minlength=shape.prod())
+    expected *= len(points) / expected.sum()
+    some = expected >= 5
+    rest = (counts[~some].sum(), expected[~some].sum())
+    observed = np.append(counts[some], rest[0]) if rest[1] >= 1 else counts[some]
+    hoped = np.append(expected[some], rest[1]) if rest[1] >= 1 else expected[some]
+    return float(stats.chisquare(observed, hoped * observed.sum() / hoped.sum()).pvalue)
+
+
+def pair_shares(cells: np.ndarray) -> np.ndarray:
+    """Share of starts in each cell where start and goal are uniform pairs at least 1 m apart."""
+    far = np.linalg.norm(cells[:, None] - cells[None], axis=-1) >= 1.0
+    return far.sum(1).astype(float)
+
+
+def test_starts_and_goals_are_uniform_among_pairs_a_metre_apart(built, draws):
+    _, tables = built
+    cells = np.asarray(tables.start_xy_w[0])[: int(tables.num_starts[0])]
+    shares = pair_shares(cells)
+    assert uniform_p_value(draws.start_xy_w, shares, cells, tables.fine_m) > 1e-3
+    assert uniform_p_value(draws.goal_xy_w, shares, cells, tables.fine_m) > 1e-3
+    # The test can fail: half as much again in one room than in the other would be seen.
+    skewed = shares * np.where(cells[:, 0] > 0, 1.5, 1.0)
+    assert uniform_p_value(draws.start_xy_w, skewed, cells, tables.fine_m) < 1e-6
+    # Goals lie anywhere inside their cells, not on centres.
+    within = (draws.goal_xy_w - cells.min(0)) / tables.fine_m % 1.0
+    assert stats.kstest(within.ravel(), "uniform").pvalue > 1e-3
+
+
+def test_the_first_small_object_is_uniform_given_start_and_goal(built, draws):
+    world, tables = built
+    cells = np.asarray(tables.clutter_xy_w[0])[: int(tables.num_clutter[0])]
+    reach = world.robot.footprint_radius_m + world.small_objects[0].radius_m + CLEARANCE_M
+    few = slice(0, 4000)
+    taken = np.zeros(len(cells))
+    for start, goal in zip(draws.start_xy_w[few], draws.goal_xy_w[few], strict=True):
+        ok = (np.linalg.norm(cells - start, axis=-1) > reach) & (np.linalg.norm(cells - goal, axis=-1) > reach)
+        taken += ok / ok.sum()
+    assert uniform_p_value(draws.small_xy_w[few, 0], taken, cells, tables.fine_m) > 1e-3
+
+
+def test_yaws_are_uniform(draws):
+    turn = (draws.start_yaw_rad + np.pi) / (2 * np.pi)
+    assert stats.kstest(turn, "uniform").pvalue > 1e-3
+    assert stats.kstest((draws.small_yaw_rad[:, 3] + np.pi) / (2 * np.pi), "uniform").pvalue > 1e-3
+
+
+def test_nothing_overlaps_and_all_is_far_enough_apart(built, draws):
+    world, tables = built
+    apart = np.linalg.norm(draws.start_xy_w - draws.goal_xy_w, axis=-1)
+    assert apart.min() >= 1.0
+    radii = np.array([o.radius_m for o in world.small_objects])
+    robot = world.robot.footprint_radius_m
+    assert draws.small_placed.mean() > 0.99
+    xy = np.where(draws.small_placed[..., None], draws.small_xy_w, np.arange(10)[:, None] * 100.0 + 1e4)
+    for place in (draws.start_xy_w, draws.goal_xy_w):
+        gap = np.linalg.norm(xy - place[:, None], axis=-1) - radii - robot
+        assert gap.min() > CLEARANCE_M - 1e-4
+    between = np.linalg.norm(xy[:, :, None] - xy[:, None], axis=-1) - radii[:, None] - radii[None]
+    assert between[:, ~np.eye(10, dtype=bool)].min() > CLEARANCE_M - 1e-4
+    # Walls and furniture: the fixture's cubes of 0.4 m and its room of 5 x 4 m.
+    cubes = np.array([[1.2, 0.0], [-1.2, 1.0]])
+    for place, radius in ((draws.start_xy_w, robot), (draws.goal_xy_w, robot), (xy[draws.small_placed], radii.min())):
+        off = np.maximum(np.abs(place[:, None] - cubes) - 0.2, 0.0)
+        assert np.linalg.norm(off, axis=-1).min() >= radius
+        assert (np.abs(place) <= np.array([2.5, 2.0]) - radius).all()
+
+
+def test_a_largest_distance_holds(built):
+    world, tables = built
+
+    def draw(key):
+        return draw_episode(key, tables, jnp.zeros(0), world.robot.footprint_radius_m, 1.0, 2.0)
+
+    drawn = jax.tree.map(np.asarray, jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(1), 200)))
+    free = np.asarray(tables.free[0])
+    origin = tuple(np.asarray(tables.grid_origin_w[0]).tolist())
+    field = jax.jit(lambda goal: geodesic.distance_field(free, tables.fine_m, goal, origin))  # the other solver
+    for i in range(0, 200, 40):
+        distances = np.asarray(field(drawn.goal_xy_w[i]))
+        c, r = np.floor((drawn.start_xy_w[i] - origin) / tables.fine_m).astype(int)
+        assert distances[r, c] <= 2.0 * 1.02 + 0.05
+    assert np.linalg.norm(drawn.start_xy_w - drawn.goal_xy_w, axis=-1).min() >= 1.0
