@@ -9,6 +9,8 @@ from interactive_nav.robots.ant import ant
 from interactive_nav.robots.humanoid import humanoid
 from interactive_nav.robots.minitaur import minitaur
 from interactive_nav.robots.quadrotor import quadrotor
+from interactive_nav.robots.fetch import fetch
+from interactive_nav.robots.freight import freight
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.robots.turtlebot import turtlebot
 
@@ -17,6 +19,8 @@ _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "humanoid": humanoid,
     "minitaur": minitaur,
     "quadrotor": quadrotor,
+    "fetch": fetch,
+    "freight": freight,
     "turtlebot": turtlebot,
 }
 """Name -> control mode -> spec."""
