@@ -11,7 +11,11 @@ from interactive_nav.robots.minitaur import minitaur
 from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.fetch import fetch
 from interactive_nav.robots.freight import freight
+from interactive_nav.robots.husky import husky
+from interactive_nav.robots.jackrabbot1 import jackrabbot1
+from interactive_nav.robots.jackrabbot2 import jackrabbot2
 from interactive_nav.robots.spec import RobotSpec
+from interactive_nav.robots.ttbot import ttbot
 from interactive_nav.robots.turtlebot import turtlebot
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
@@ -21,6 +25,10 @@ _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "quadrotor": quadrotor,
     "fetch": fetch,
     "freight": freight,
+    "husky": husky,
+    "jackrabbot1": jackrabbot1,
+    "jackrabbot2": jackrabbot2,
+    "ttbot": ttbot,
     "turtlebot": turtlebot,
 }
 """Name -> control mode -> spec."""

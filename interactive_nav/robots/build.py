@@ -24,7 +24,7 @@ FLOOR = "floor"
 """The world's floor geom."""
 _ADVANCE_S = 0.1
 """Position mode: a wheel's largest advance per command is its largest speed times this."""
-_WHEEL_STIFFNESS = 15.0
+_WHEEL_STIFFNESS = 8.0
 """1/s: position gain of a wheel over its velocity gain; critically damped within a factor of 2 on all our robots."""
 _SPEED_ERROR = 0.05
 """Velocity mode: a joint's torque limit is reached when its speed is off by this fraction of its largest."""
@@ -66,6 +66,8 @@ class WheeledBase:
     min_linear_m_s: float | None = None
     """Most negative base speed of mode `twist`; none: minus the largest."""
     native_torque: bool = False
+    yaw_gain: float = 0.0
+    """Mode `twist` of a skid steer: the commanded turn is raised by this times its error, as a gyro reads it."""
     whole_body: tuple[str, ...] = ()
     """Joints that mode `whole_body` drives by velocity, beside the wheels."""
     gripper: tuple[str, ...] = ()
@@ -163,11 +165,19 @@ def _set_servo(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high
         actuator.ctrlrange = list(low_high)
 
 
-def _affine_law(matrix: np.ndarray, offset: np.ndarray, relative: np.ndarray, address: np.ndarray) -> ControlLaw:
-    """controls = matrix @ command + offset, plus the joint's position where the command is an advance."""
+def _affine_law(
+    matrix: np.ndarray, offset: np.ndarray, relative: np.ndarray, address: np.ndarray, yaw_gain: float
+) -> ControlLaw:
+    """controls = matrix @ command + offset, plus the joint's position where the command is an advance.
+
+    With a yaw gain the command is a twist, whose turn is raised by the gain times its error.
+    """
     moved = bool(relative.any())
 
     def law(command, state, xp):
+        if yaw_gain:
+            turn = command[..., 1] + yaw_gain * (command[..., 1] - state.qvel[..., 5])
+            command = xp.stack([command[..., 0], turn], -1)
         controls = command @ xp.asarray(matrix).T + xp.asarray(offset)
         if moved:
             controls = controls + xp.asarray(relative) * state.qpos[..., address]
@@ -250,7 +260,7 @@ class _Mode:
             rows = driven + ((0.0, 0.0),) * (len(self.actions) - len(driven))
         return TwistMap(rows, base.max_linear_m_s, base.max_angular_rad_s)
 
-    def law(self) -> ControlLaw | None:
+    def law(self, mode: str) -> ControlLaw | None:
         count = len(self.base.joints)
         matrix = np.zeros((count, len(self.actions)))
         for a, action in enumerate(self.actions):
@@ -261,7 +271,8 @@ class _Mode:
         if matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(count)) and not self.relative:
             return None
         relative = np.asarray([float(i in self.relative) for i in range(count)])
-        return _affine_law(matrix, offset, relative, self.qpos_address)
+        gain = self.base.yaw_gain if mode == "twist" else 0.0
+        return _affine_law(matrix, offset, relative, self.qpos_address, gain)
 
     qpos_address: np.ndarray = np.zeros(0, np.int64)
     """[joints] addresses among the robot's own qpos."""
@@ -344,7 +355,7 @@ def wheeled_robot(
         rolling_bodies=tuple(f"{prefix}{name}" for name in wheels),
         control_mode=control_mode,
         control_modes=base.modes,
-        control=mode.law(),
+        control=mode.law(control_mode),
         twist=mode.twist_map(control_mode),
         **figures,
     )
