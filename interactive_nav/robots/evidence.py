@@ -146,9 +146,7 @@ class _Manoeuvre:
 def _manoeuvres(robot: RobotSpec) -> tuple[_Manoeuvre, ...]:
     assert robot.twist is not None
     v, w = robot.twist.max_linear_m_s, robot.twist.max_angular_rad_s
-    push = tuple(
-        _Manoeuvre(load.name, 20.0 * (i + 1), lambda t: (PUSH_SPEED_M_S, 0.0)) for i, load in enumerate(LOADS)
-    )
+    push = tuple(_Manoeuvre(load.name, 20.0 * (i + 1), lambda t: (PUSH_SPEED_M_S, 0.0)) for i, load in enumerate(LOADS))
     return (
         _Manoeuvre("stand", -20.0, lambda t: (0.0, 0.0)),
         _Manoeuvre("straight", 0.0, lambda t: (v if t < 4 else 0.0, 0.0)),

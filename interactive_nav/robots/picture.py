@@ -25,9 +25,18 @@ def stage(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.visual.global_.offwidth, spec.visual.global_.offheight = _SIZE
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
-    spec.visual.headlight.diffuse = [0.5, 0.5, 0.5]
-    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1])
+    spec.visual.headlight.ambient = [0.3, 0.3, 0.3]
+    spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[1, 1, 1],
+        rgb2=[1, 1, 1],
+        width=8,
+        height=48,
+    )
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[9, 9, 0.1])
     floor.rgba = [0.93, 0.93, 0.95, 1]
     spec.worldbody.add_light(pos=[1, 2, 4], dir=[-0.2, -0.45, -0.9])
     robot.add_to(spec)
@@ -117,7 +126,8 @@ def _faces(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
         flat = size[1] / size[0] if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else 1.0
         ring = np.stack([np.cos(turn), flat * np.sin(turn)], -1)
         grid = np.concatenate(
-            [profile[:, None, :1] * ring[None], np.broadcast_to(profile[:, None, 1:], (len(profile), around + 1, 1))], -1
+            [profile[:, None, :1] * ring[None], np.broadcast_to(profile[:, None, 1:], (len(profile), around + 1, 1))],
+            -1,
         )
         local = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], 2).reshape(-1, 4, 3)
     return local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
