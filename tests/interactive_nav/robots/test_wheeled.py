@@ -152,14 +152,14 @@ def test_joint_limits_hold_under_full_torque(name):
         for sign in (-1.0, 1.0):
             action = neutral.copy()
             action[k] = sign
-            qpos, _ = _simulate(robot, model, data, action, 3.0)
+            qpos, _ = _simulate(robot, model, data, action, 5.0)
             reached.append(qpos[:, at])
         # Soft limits give way while a limb is stopped that full torque has spun up to 20 rad/s ...
         give = 0.015 if slide else 0.5
         assert min(r.min() for r in reached) > low - give, actuator
         assert max(r.max() for r in reached) < high + give, actuator
-        # ... and hold it, pressed on by all of its torque, within 2 degrees or 5 mm.
-        rest = 0.005 if slide else 0.035
+        # ... and hold it, pressed on by all of its torque, within 3 degrees or 5 mm.
+        rest = 0.005 if slide else 0.05
         assert low - rest < reached[0][-1] < low + rest and high - rest < reached[1][-1] < high + rest, actuator
 
 
