@@ -63,6 +63,7 @@ def _print_evidence(names: tuple[str, ...], backend: str, console: Console) -> b
             verdict = "ok" if check.passed else "FAILED"
             table.add_row(check.name, f"{check.value:.4g}", f"{check.low:g} .. {check.high:g}", verdict)
         console.print(table)
+        console.file.flush()
         passed &= own.passed
     console.print("all passed" if passed else "some checks FAILED")
     return passed

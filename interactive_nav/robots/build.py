@@ -74,8 +74,6 @@ class WheeledBase:
     """Finger joints that mode `whole_body` opens and closes together, by position."""
     path: Path | None = None
     """MJCF or URDF; none: our own file of the robot's name."""
-    servo_gains: tuple[tuple[str, tuple[float, float]], ...] = ()
-    """Joint -> (kp, kv) of its position servo where the file has no actuators."""
 
     @property
     def modes(self) -> tuple[str, ...]:
@@ -132,6 +130,20 @@ def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
             condim=condim,
             friction=[slide, slide, spin, roll, roll],
         )
+
+
+def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """(3,) half sizes of a primitive's bounding box in its own frame, m."""
+    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.full(3, size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return np.array([size[0], size[0], size[0] + size[1]])
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return np.array([size[0], size[0], size[1]])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
+    return size
 
 
 def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:
@@ -305,7 +317,7 @@ def wheeled_robot(
     Args:
         base: its driven joints and commands.
         control_mode: one of `base.modes`.
-        prepare: edits the parsed file before it is attached (robots of users' own).
+        prepare: edits the parsed file before it is attached (robots of users' own); its warnings come once.
         base_body: the file's body with the free joint.
         camera: its body without the robot's name.
         rolling: bodies of wheels without the robot's name; by default those of the driven wheels.
@@ -349,7 +361,6 @@ def wheeled_robot(
         action_low=tuple(a.low for a in mode.actions),
         action_high=tuple(a.high for a in mode.actions),
         action_names=tuple(a.name for a in mode.actions),
-        spawn_height_m=0.0,
         camera=dataclasses.replace(camera, body=f"{prefix}{camera.body}"),
         home_qpos=tuple((f"{prefix}{j.name}", j.home) for j in base.joints if j.home),
         rolling_bodies=tuple(f"{prefix}{name}" for name in wheels),
@@ -357,5 +368,5 @@ def wheeled_robot(
         control_modes=base.modes,
         control=mode.law(control_mode),
         twist=mode.twist_map(control_mode),
-        **figures,
+        **{"spawn_height_m": 0.0, **figures},
     )

@@ -20,6 +20,7 @@ import numpy as np
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
+from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.scene import Movable, Scene
 from interactive_nav.world import World, build_world
@@ -168,18 +169,9 @@ def _front_m(world: World) -> float:
     reach = 0.0
     for geom in range(model.ngeom):
         if model.geom_bodyid[geom] in layout.robot_bodies and model.geom_contype[geom]:
-            half = np.abs(data.geom_xmat[geom].reshape(3, 3)[0]) @ _half_extents(model, geom)
+            half = np.abs(data.geom_xmat[geom].reshape(3, 3)[0]) @ half_extents(model, geom)
             reach = max(reach, float(data.geom_xpos[geom, 0] + half))
     return reach
-
-
-def _half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.full(3, size[0])
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return np.array([size[0], size[0], size[0] + size[1]])
-    return size
 
 
 def measure_wheeled(name: str, backend: str = "native") -> Evidence:
@@ -263,10 +255,11 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
         pushed = float(poses[-1, run, slot] - poses[0, run, slot])
         if load.force_n < limit / 1.4:
             checks.append(Check(f"pushes {load.name} m", pushed, 0.5, 2))
-            # The mean of the force's norm: friction on the robot's face and contacts that open and close at the
-            # timestep lie above the horizontal mean, which a test of C MuJoCo's force vectors holds to mu m g.
-            ratio = float(np.median(forces[-10:, run])) / load.force_n
-            checks.append(Check(f"force / mu m g, {load.name}", ratio, 0.9, 2.2))
+            # The mean of the force's norm. Friction on the robot's face (at most 0.5 of the push) lifts or presses
+            # the load, and contacts open and close at the timestep: 0.8 to 1.5 by the first, more by the second.
+            # A test of C MuJoCo's force vectors holds the horizontal mean to mu (m g - lift).
+            ratio = float(forces[-20:, run].mean()) / load.force_n
+            checks.append(Check(f"force / mu m g, {load.name}", ratio, 0.75, 2.2))
         elif load.force_n > limit * 1.4:
             # Soft friction lets a load creep below its limit, here by less than 2 cm/s for 5 s.
             checks.append(Check(f"cannot push {load.name} m", pushed, -0.01, 0.1))

@@ -9,6 +9,7 @@ import pytest
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import evidence, get_robot, robot_names
 from interactive_nav.robots.__main__ import main
+from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.picture import picture, stage
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import build_world
@@ -118,7 +119,7 @@ def test_mass_inertia_and_size_are_the_tables(name):
         if model.geom_bodyid[geom] not in mine or model.geom_group[geom] != 3 or not model.geom_contype[geom]:
             continue
         rotation = data.geom_xmat[geom].reshape(3, 3)
-        half = evidence._half_extents(model, geom)
+        half = half_extents(model, geom)
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
             line, thick = rotation[:, 2] * model.geom_size[geom, 1], model.geom_size[geom, 0]
             points = data.geom_xpos[geom] + np.array([line, -line])

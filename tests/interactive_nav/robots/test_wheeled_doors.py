@@ -129,7 +129,7 @@ def test_fetch_pulls_a_door_open_by_its_handle():
     held = stage.qpos("fetch_finger_left") + stage.qpos("fetch_finger_right")
     assert held == pytest.approx(2 * BAR_HALF_M, abs=0.006) and stage.touched_n > 0.1  # the bar is between them
     # Drive back; the arm gives way sideways as the handle swings about its hinge.
-    for k in range(60):
+    for _ in range(60):
         angle = -stage.door_rad
         go(0.1, wheel_advance=-0.5, finger=0.0, shoulder_pan=min(0.35, 0.7 * (1 - np.cos(angle)) / 1.0))
         if angle > 0.8:
