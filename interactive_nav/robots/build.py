@@ -20,6 +20,8 @@ import numpy as np
 from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, wheel_twist
 
 FOLDER = Path(__file__).parent / "mjcf"
+_OPTIONS = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity")
+"""A robot's file may set them; the world's hold."""
 FLOOR = "floor"
 """The world's floor geom."""
 _ADVANCE_S = 0.1
@@ -120,6 +122,8 @@ def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
         for g in child.geoms
         if g.group == 3 and not g.contype and not g.conaffinity
     ]
+    for option in _OPTIONS:
+        setattr(child.option, option, getattr(world.option, option))
     world.attach(child, prefix=prefix, frame=world.worldbody.add_frame())
     for name, friction, condim in rolling:
         slide, spin, roll = friction
@@ -274,12 +278,12 @@ class _Mode:
 
     def law(self, mode: str) -> ControlLaw | None:
         count = len(self.base.joints)
-        matrix = np.zeros((count, len(self.actions)))
+        matrix = np.zeros((count, len(self.actions)), np.float64)
         for a, action in enumerate(self.actions):
             for i, gain in action.gain.items():
                 matrix[i, a] = gain
-        driven = matrix.any(1)
-        offset = np.asarray([0.0 if driven[i] else joint.home for i, joint in enumerate(self.base.joints)])
+        driven = {i for action in self.actions for i in action.gain}
+        offset = np.asarray([0.0 if i in driven else joint.home for i, joint in enumerate(self.base.joints)])
         if matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(count)) and not self.relative:
             return None
         relative = np.asarray([float(i in self.relative) for i in range(count)])

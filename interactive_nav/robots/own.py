@@ -80,9 +80,6 @@ def _strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
     child.compiler.fusestatic = False
     child.compiler.balanceinertia = True
     child.compiler.boundmass, child.compiler.boundinertia = 1e-4, 1e-7
-    default = mujoco.MjSpec().option
-    for field in ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity", "disableflags"):
-        setattr(child.option, field, getattr(default, field))
     for kind in (child.actuators, child.sensors, child.keys, child.pairs, child.tendons, child.lights):
         for element in list(kind):
             child.delete(element)

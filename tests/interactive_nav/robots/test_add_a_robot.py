@@ -128,6 +128,7 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
     np.testing.assert_allclose(model.joint("cart_mast").range, [-np.pi / 2, np.pi / 2])
     assert model.opt.timestep != 0.001 and model.nu == 5
     # Skid steer: 0.42 + 0.26^2 / 0.42 = 0.581 m.
+    assert robot.twist is not None
     assert robot.twist.matrix[0] == pytest.approx((10.0, -0.581 / 0.2), abs=1e-2)
     checks = {c.name: c for c in evidence.measure("cart").checks}
     for name in ("linear / asked", "stopped mm/s", "straight line deviation %", "standing drift mm", "pushes basket m"):
@@ -164,7 +165,7 @@ def test_a_missing_file_and_a_taken_name_are_refused(tmp_path, registry):
     with pytest.raises(ValueError, match="does not exist"):
         _from_file(tmp_path / "none.urdf", **PORTER)
     with pytest.raises(ValueError, match="exists already"):
-        robots.register("fetch", robots.get_robot("fetch"))
+        robots.register("fetch", lambda mode: robots.get_robot("fetch", mode))
     factory = _from_file(_write(tmp_path, URDF), **PORTER)
     with pytest.raises(ValueError, match="is called 'porter', expected 'other'"):
         robots.register("other", factory)

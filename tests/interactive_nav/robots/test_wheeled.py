@@ -70,7 +70,9 @@ def test_a_broken_robot_fails_its_evidence(monkeypatch):
     import dataclasses
 
     robot = get_robot("turtlebot", "twist")
-    swapped = dataclasses.replace(robot, control=lambda c, s, xp: robot.control(c, s, xp)[..., ::-1] * 0.8)
+    law = robot.control
+    assert law is not None
+    swapped = dataclasses.replace(robot, control=lambda c, s, xp: law(c, s, xp)[..., ::-1] * 0.8)
     monkeypatch.setattr(evidence, "get_robot", lambda name, mode="native": swapped)
     failed = {c.name for c in evidence.measure_wheeled("turtlebot").checks if not c.passed}
     assert {"linear / asked", "angular / asked"} <= failed
@@ -105,6 +107,7 @@ def test_pushing_at_constant_speed_balances_the_floors_friction(name):
 @pytest.mark.parametrize("name", WHEELED)
 def test_mass_inertia_and_size_are_the_tables(name):
     robot = get_robot(name)
+    assert robot.size_m is not None
     model, data = _alone(robot)
     base = model.body(robot.base_body).id
     assert model.body_subtreemass[base] == pytest.approx(robot.mass_kg, rel=2e-3)
@@ -181,6 +184,7 @@ def test_torques_stay_within_their_limits(name):
 def test_skid_steers_effective_track_is_the_measured_one(name):
     # Open loop, without the gyro: wheel speeds +/- s turn the base at 2 s r / track.
     robot, twist = get_robot(name, "velocity"), get_robot(name, "twist")
+    assert twist.twist is not None
     rate = 0.75 * twist.twist.max_angular_rad_s
     model, data = _alone(robot)
     qpos, _ = _simulate(robot, model, data, robot.drive(np.float64(0.0), np.float64(rate)), 5.0)
