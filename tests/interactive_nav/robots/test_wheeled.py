@@ -180,6 +180,24 @@ def test_torques_stay_within_their_limits(name):
             assert limit > 0 and abs(data.qfrc_actuator[model.jnt_dofadr[joint]]) <= limit * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("name", WHEELED)
+def test_no_native_action_tips_it_over(name):
+    # As fast as the action goes, then the inner wheels as far back as it goes: the sharpest turn there is; then
+    # full speed ahead and full speed back.
+    robot = get_robot(name)
+    model, data = _alone(robot)
+    inner = np.array([-1.0 if "left" in action else 1.0 for action in robot.action_names])
+    _simulate(robot, model, data, np.ones(robot.action_size), 4.0)
+    turned, _ = _simulate(robot, model, data, inner, 3.0)
+    _simulate(robot, model, data, np.ones(robot.action_size), 4.0)
+    braked, _ = _simulate(robot, model, data, -np.ones(robot.action_size), 3.0)
+    yaw = np.unwrap(2 * np.arctan2(turned[:, 6], turned[:, 3]))
+    assert abs(yaw[-1] - yaw[0]) > math.pi / 2
+    for qpos in (turned, braked):
+        tilt = np.degrees(np.arccos(1 - 2 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2)))
+        assert tilt.max() < 10.0
+
+
 @pytest.mark.parametrize("name", SKID)
 def test_skid_steers_effective_track_is_the_measured_one(name):
     # Open loop, without the gyro: wheel speeds +/- s turn the base at 2 s r / track.
@@ -307,7 +325,7 @@ def test_pictures_need_no_display():
 def test_command_prints_the_table_and_renders(tmp_path, capsys):
     assert main(["--robots", "husky", "--render", str(tmp_path / "pictures")]) == 0
     text = capsys.readouterr().out
-    assert "skid steer" in text and "0.67" in text and "-7.5..7.5" in text
+    assert "skid steer" in text and "0.67" in text and "-7.5..7.5 N m" in text
     assert (tmp_path / "pictures" / "husky.png").stat().st_size > 1000
 
 
