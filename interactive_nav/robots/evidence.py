@@ -1,8 +1,8 @@
 """What a robot really does, measured on any physics backend: robot name in, a list of checks out.
 
-All manoeuvres of a robot run as one batch in one hall: it stands, drives straight and stops, turns on the
-spot, takes a corner at full speed, and pushes a basket, a table and a sofa. Limits are those of the tests
-and of `python -m interactive_nav.robots evidence`, which runs without pytest, for instance on a GPU machine.
+All manoeuvres of a robot run as one batch in one hall: a wheeled one stands, drives straight and stops, turns
+on the spot, takes a corner at full speed, and pushes a basket, a table and a sofa; a legged or flying one
+stands, moves over a metre, stops and turns. Limits are those of the tests and of `python -m interactive_nav.robots evidence`, which runs without pytest, for instance on a GPU machine.
 """
 
 from __future__ import annotations
@@ -187,8 +187,16 @@ def measure_wheeled(name: str, backend: str = "native") -> Evidence:
     boxes = tuple(_box(load, front + load.half_m[0] + 0.1, 20.0 * (i + 1)) for i, load in enumerate(LOADS))
     config = NavConfig(backend=backend, num_objects=0, sleep=False)
     world = build_world(robot, (hall(boxes),), config)
-    physics = make_physics(world, config)
     runs = _manoeuvres(robot)
+    used, poses, forces = _run(robot, world, config, runs, _STEPS)
+    return _judge(robot, world, used, runs, poses, forces)
+
+
+def _run(
+    robot: RobotSpec, world: World, config: NavConfig, runs: tuple[_Manoeuvre, ...], steps: int
+) -> tuple[str, np.ndarray, np.ndarray]:
+    """All manoeuvres side by side: the backend, states [steps + 1, N, nq], mean contact forces [steps, N]."""
+    physics = make_physics(world, config)
     count, at = len(runs), world.layout.robot_qpos
     qpos = np.repeat(world.rest_qpos[:1], count, 0)
     for row, run in zip(qpos, runs, strict=True):
@@ -198,13 +206,13 @@ def measure_wheeled(name: str, backend: str = "native") -> Evidence:
     step = jax.jit(jax.vmap(physics.step))
     scene = jnp.zeros(count, jnp.int32)
     poses, forces = [qpos], []
-    for k in range(_STEPS):
+    for k in range(steps):
         twist = np.array([run.twist(k * _DT_S) for run in runs])
         command = robot.command(robot.drive(twist[:, 0], twist[:, 1]))
         state, signals = step(scene, state, jnp.asarray(command, jnp.float32), jnp.full(count, k * _DT_S))
         poses.append(np.asarray(state.qpos))
         forces.append(np.asarray(signals.force_n))
-    return _judge(robot, world, physics.name, runs, np.stack(poses), np.stack(forces))
+    return physics.name, np.stack(poses), np.stack(forces)
 
 
 def _yaw(q: np.ndarray) -> np.ndarray:
@@ -278,7 +286,65 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
     )
 
 
-EVIDENCE: dict[str, Callable[[str, str], Evidence]] = {"wheeled": measure_wheeled}
+def measure_walking(name: str, backend: str = "native") -> Evidence:
+    """Runs a legged or flying robot: it stands (hovers), moves well over a metre, stops and turns.
+
+    Args:
+        name: of a registered robot that has mode `twist`.
+        backend: native, jax or warp.
+    """
+    robot = get_robot(name, MODE)
+    assert robot.twist is not None
+    v, w = robot.twist.max_linear_m_s, robot.twist.max_angular_rad_s
+    start_s, going_s, turning_s = 0.5, max(4.0, 1.6 / v), 4.0
+    end_s = start_s + max(going_s, turning_s) + 2.0
+    steps = max(_SETTLE + 50, round(end_s / _DT_S))
+    runs = (
+        _Manoeuvre("stand", -20.0, lambda t: (0.0, 0.0)),
+        _Manoeuvre("straight", 0.0, lambda t: (v if start_s <= t < start_s + going_s else 0.0, 0.0)),
+        _Manoeuvre("turn", -40.0, lambda t: (0.0, w if start_s <= t < start_s + turning_s else 0.0)),
+    )
+    config = NavConfig(backend=backend, num_objects=0, sleep=False)
+    # One box far away: the layouts of all backends expect something that can be touched.
+    world = build_world(robot, (hall((_box(LOADS[0], 50.0, 50.0),)),), config)
+    used, poses, _ = _run(robot, world, config, runs, steps)
+    at = world.layout.robot_qpos
+    xyz = poses[..., at : at + 3]
+    yaw, tilt = _yaw(poses[..., at + 3 : at + 7]), _tilt_deg(poses[..., at + 3 : at + 7])
+    stood = xyz[_SETTLE : _SETTLE + 51, 0, :2]
+    walked = xyz[:, 1] - xyz[:1, 1]
+    stop_k, turn_k = round((start_s + going_s) / _DT_S), round((start_s + turning_s) / _DT_S)
+    turned = float(yaw[turn_k, 2] - yaw[0, 2])
+    checks = (
+        Check("mass kg / table", world.robot_mass_kg / (robot.mass_kg or world.robot_mass_kg), 0.99, 1.01),
+        Check("standing drift m, 5 s", float(np.abs(stood - stood[0]).max()), 0, 0.03),
+        Check("moves m", float(np.linalg.norm(walked[stop_k, :2])), 1.0, 100.0),
+        Check("linear / asked", float(np.linalg.norm(walked[stop_k, :2])) / (v * going_s), 0.65, 1.35),
+        Check("sideways / ahead", float(np.abs(walked[stop_k, 1] / walked[stop_k, 0])), 0, 0.5),
+        Check("stopped: last second moves m", float(np.linalg.norm(walked[-1] - walked[-11])), 0, 0.05),
+        Check("angular / asked", turned / (w * turning_s), 0.65, 1.35),
+        Check("turn: centre moves m", float(np.linalg.norm(xyz[:, 2, :2] - xyz[:1, 2, :2], axis=-1).max()), 0, 0.5),
+        Check("largest tilt deg", float(tilt.max()), 0, 30),
+    )
+    asked = np.array([[run.twist(k * _DT_S) for run in runs] for k in range(steps)])
+    speed = np.diff(xyz[:, 1, 0], axis=0) / _DT_S
+    return Evidence(
+        robot=robot.name,
+        backend=used,
+        checks=checks,
+        time_s=_DT_S * (np.arange(steps) + 0.5),
+        speed_m_s=speed,
+        commanded_m_s=asked[:, 1, 0],
+        turn_rad_s=np.diff(yaw[:, 2], axis=0) / _DT_S,
+        commanded_rad_s=asked[:, 2, 1],
+    )
+
+
+EVIDENCE: dict[str, Callable[[str, str], Evidence]] = {
+    "wheeled": measure_wheeled,
+    "legged": measure_walking,
+    "flying": measure_walking,
+}
 """Kind of robot -> its evidence, (name, backend) -> `Evidence`."""
 
 
