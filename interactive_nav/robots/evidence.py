@@ -2,7 +2,8 @@
 
 All manoeuvres of a robot run as one batch in one hall: a wheeled one stands, drives straight and stops, turns
 on the spot, takes a corner at full speed, and pushes a basket, a table and a sofa; a legged or flying one
-stands, moves over a metre, stops and turns. Limits are those of the tests and of `python -m interactive_nav.robots evidence`, which runs without pytest, for instance on a GPU machine.
+stands, moves over a metre, stops and turns. Limits are those of the tests and of
+`python -m interactive_nav.robots evidence`, which runs without pytest, for instance on a GPU machine.
 """
 
 from __future__ import annotations
