@@ -298,7 +298,7 @@ def measure_walking(name: str, backend: str = "native") -> Evidence:
     assert robot.twist is not None
     v, w = robot.twist.max_linear_m_s, robot.twist.max_angular_rad_s
     start_s, going_s, turning_s = 0.5, max(4.0, 1.6 / v), 4.0
-    end_s = start_s + max(going_s, turning_s) + 2.0
+    end_s = start_s + max(going_s, turning_s) + 3.0
     steps = max(_SETTLE + 50, round(end_s / _DT_S))
     runs = (
         _Manoeuvre("stand", -20.0, lambda t: (0.0, 0.0)),

@@ -140,6 +140,54 @@ def test_mass_inertia_and_size_are_the_tables(name):
     assert radius <= robot.footprint_radius_m <= radius + 0.05
 
 
+# Robot, body: mass (kg) and principal moments (kg m^2) of the sources; and wheel radius, y and x of a front left wheel.
+INERTIA = {
+    ("turtlebot", "base"): (2.473, (0.0200, 0.0200, 0.0368)),
+    ("freight", "base"): (70.139, (1.225, 1.285, 0.987)),
+    ("freight", "wheel_left"): (4.354, (0.0045, 0.005, 0.0045)),
+    ("fetch", "torso"): (10.780, (0.3354, 0.3354, 0.0954)),
+    ("fetch", "torso_fixed"): (13.278, (0.3861, 0.3388, 0.1018)),
+    ("fetch", "shoulder_lift"): (2.662, (0.0028, 0.0111, 0.0112)),
+    ("fetch", "wrist_flex"): (1.725, (0.0018, 0.0042, 0.0042)),
+    ("husky", "base"): (30.455, (0.602, 1.739, 2.030)),
+    ("husky", "wheel_rear_right"): (2.637, (0.0247, 0.0441, 0.0247)),
+    ("jackrabbot2", "base"): (103.827, (5.383, 5.383, 5.383)),
+    ("jackrabbot2", "wheel_left"): (20.0, (0.304, 0.579, 0.304)),
+}
+WHEELS = {
+    "turtlebot": (0.0352, 0.115, 0.0),
+    "freight": (0.0613, 0.18738, 0.0013),
+    "fetch": (0.0613, 0.18738, 0.0013),
+    "husky": (0.17775, 0.2854, 0.256),
+    "jackrabbot1": (0.2406, 0.2712, 0.0),
+    "jackrabbot2": (0.2406, 0.27105, 0.0),
+}
+
+
+@pytest.mark.parametrize(("name", "body"), list(INERTIA))
+def test_inertias_are_the_sources(name, body):
+    mass, moments = INERTIA[name, body]
+    own = _alone(get_robot(name))[0].body(f"{name}_{body}")
+    assert own.mass[0] == pytest.approx(mass)
+    np.testing.assert_allclose(sorted(own.inertia), sorted(moments))
+
+
+@pytest.mark.parametrize("name", list(WHEELS))
+def test_wheels_are_where_and_as_large_as_the_sources_say(name):
+    radius, y, x = WHEELS[name]
+    robot = get_robot(name)
+    model, data = stage(robot)
+    front_left = next(b for b in robot.rolling_bodies if b.endswith("left"))
+    np.testing.assert_allclose(data.body(front_left).xpos, [x, y, radius], atol=1e-4)
+    geom = next(g for g in range(model.ngeom) if model.geom(g).name == front_left)
+    assert model.geom_size[geom, 0] == radius
+    # And the twist map of a differential drive is the one of these figures.
+    twist = get_robot(name, "velocity").twist
+    assert twist is not None and twist.matrix[0][0] == pytest.approx(1 / radius)
+    if name not in SKID:
+        assert twist.matrix[0][1] == pytest.approx(-y / radius, rel=2e-3)
+
+
 @pytest.mark.parametrize("name", [n for n in WHEELED if len(get_robot(n).home_qpos)])
 def test_joint_limits_hold_under_full_torque(name):
     robot = get_robot(name, "torque")
