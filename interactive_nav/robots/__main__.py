@@ -66,7 +66,7 @@ def _print_evidence(names: tuple[str, ...], backend: str, console: Console) -> b
         table = Table("check", "value", "limits", "", title=f"[{k + 1}/{len(names)}] {name} on {own.backend}")
         for check in own.checks:
             verdict = "ok" if check.passed else "FAILED"
-            table.add_row(check.name, f"{check.value:.4g}", f"{check.low:g} .. {check.high:g}", verdict)
+            table.add_row(check.name, f"{check.value:.4g}", f"{check.low:.3g} .. {check.high:.3g}", verdict)
         console.print(table)
         console.file.flush()
         passed &= own.passed

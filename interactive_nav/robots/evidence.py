@@ -259,16 +259,24 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
         Check("corner: largest tilt deg", float(tilt[:, corner].max()), 0, 5),
     ]
     limit = push_limit_n(robot, world)
+    model = world.models[0]
+    solid = [
+        g for g in range(model.ngeom) if model.geom_bodyid[g] in world.layout.robot_bodies and model.geom_contype[g]
+    ]
+    face_friction = float(model.geom_friction[solid, 0].max())
     for i, load in enumerate(LOADS):
         run, slot = index[load.name], world.layout.slot_qpos[i]
         pushed = float(poses[-1, run, slot] - poses[0, run, slot])
         if load.force_n < limit / 1.4:
             checks.append(Check(f"pushes {load.name} m", pushed, 0.5, 2))
-            # The mean of the force's norm. Friction on the robot's face (at most 0.5 of the push) lifts or presses
-            # the load, and contacts open and close at the timestep: 0.8 to 1.5 by the first, more by the second.
-            # A test of C MuJoCo's force vectors holds the horizontal mean to mu (m g - lift).
+            # The mean of the force's norm. With friction f between the robot's face and the load, the face lifts or
+            # presses it: the push is mu m g / (1 -+ f mu), its norm at most sqrt(1 + f^2) of that; 7 % for contacts
+            # that open and close. A test of C MuJoCo's force vectors holds the push to mu (m g - lift).
+            face = max(load.friction, face_friction)
+            low = 0.93 / (1 + face * load.friction)
+            high = 1.07 * math.hypot(1, face) / max(1 - face * load.friction, 0.1)
             ratio = float(forces[-20:, run].mean()) / load.force_n
-            checks.append(Check(f"force / mu m g, {load.name}", ratio, 0.75, 1.6))
+            checks.append(Check(f"force / mu m g, {load.name}", ratio, low, high))
         elif load.force_n > limit * 1.4:
             # Soft friction lets a load creep below its limit, here by less than 2 cm/s for 5 s.
             checks.append(Check(f"cannot push {load.name} m", pushed, -0.01, 0.1))
