@@ -260,9 +260,8 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
     ]
     limit = push_limit_n(robot, world)
     model = world.models[0]
-    solid = [
-        g for g in range(model.ngeom) if model.geom_bodyid[g] in world.layout.robot_bodies and model.geom_contype[g]
-    ]
+    base = model.body(robot.base_body).id
+    solid = [g for g in range(model.ngeom) if model.geom_bodyid[g] == base and model.geom_contype[g]]
     face_friction = float(model.geom_friction[solid, 0].max())
     for i, load in enumerate(LOADS):
         run, slot = index[load.name], world.layout.slot_qpos[i]
