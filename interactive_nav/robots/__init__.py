@@ -6,29 +6,29 @@ import difflib
 from collections.abc import Callable
 
 from interactive_nav.robots.ant import ant
-from interactive_nav.robots.humanoid import humanoid
-from interactive_nav.robots.minitaur import minitaur
-from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.fetch import fetch
 from interactive_nav.robots.freight import freight
+from interactive_nav.robots.humanoid import humanoid
 from interactive_nav.robots.husky import husky
 from interactive_nav.robots.jackrabbot1 import jackrabbot1
 from interactive_nav.robots.jackrabbot2 import jackrabbot2
+from interactive_nav.robots.minitaur import minitaur
 from interactive_nav.robots.own import from_file
+from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.robots.ttbot import ttbot
 from interactive_nav.robots.turtlebot import turtlebot
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "ant": ant,
-    "humanoid": humanoid,
-    "minitaur": minitaur,
-    "quadrotor": quadrotor,
     "fetch": fetch,
     "freight": freight,
+    "humanoid": humanoid,
     "husky": husky,
     "jackrabbot1": jackrabbot1,
     "jackrabbot2": jackrabbot2,
+    "minitaur": minitaur,
+    "quadrotor": quadrotor,
     "ttbot": ttbot,
     "turtlebot": turtlebot,
 }
