@@ -6,17 +6,30 @@ import difflib
 from collections.abc import Callable
 
 from interactive_nav.robots.ant import ant
+from interactive_nav.robots.fetch import fetch
+from interactive_nav.robots.freight import freight
 from interactive_nav.robots.humanoid import humanoid
+from interactive_nav.robots.husky import husky
+from interactive_nav.robots.jackrabbot1 import jackrabbot1
+from interactive_nav.robots.jackrabbot2 import jackrabbot2
 from interactive_nav.robots.minitaur import minitaur
+from interactive_nav.robots.own import from_file
 from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.spec import RobotSpec
+from interactive_nav.robots.ttbot import ttbot
 from interactive_nav.robots.turtlebot import turtlebot
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "ant": ant,
+    "fetch": fetch,
+    "freight": freight,
     "humanoid": humanoid,
+    "husky": husky,
+    "jackrabbot1": jackrabbot1,
+    "jackrabbot2": jackrabbot2,
     "minitaur": minitaur,
     "quadrotor": quadrotor,
+    "ttbot": ttbot,
     "turtlebot": turtlebot,
 }
 """Name -> control mode -> spec."""
@@ -44,4 +57,22 @@ def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
     return _FACTORIES[name](control_mode)
 
 
-__all__ = ["RobotSpec", "get_robot", "robot_names"]
+def register(name: str, factory: Callable[[str], RobotSpec]) -> None:
+    """Makes a robot of the user's own known to `make`, for this process.
+
+    Args:
+        name: what `make` and `get_robot` call it; must be new.
+        factory: control mode -> spec; the mode `native` must exist. `from_file` makes one.
+
+    Raises:
+        ValueError: a name that is taken, or a factory whose spec has another name.
+    """
+    if name in _FACTORIES:
+        raise ValueError(f"robot '{name}' exists already; choose another name")
+    spec = factory("native")
+    if spec.name != name:
+        raise ValueError(f"the factory's robot is called '{spec.name}', expected '{name}'")
+    _FACTORIES[name] = factory
+
+
+__all__ = ["RobotSpec", "from_file", "get_robot", "register", "robot_names"]

@@ -162,4 +162,4 @@ def test_warp_is_refused_with_the_remedy_where_it_is_missing(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match="install the gpu extra"):
         resolve_backend("warp")
-    assert interactive_nav.robot_names() == ("turtlebot",)
+    assert "turtlebot" in interactive_nav.robot_names()

@@ -38,8 +38,10 @@ def test_twist_mode_makes_the_same_wheel_speeds():
 
 
 def test_unknown_control_mode_lists_the_known_ones():
-    with pytest.raises(ValueError, match="no control mode 'position'; it has native, twist"):
-        get_robot("turtlebot", "position")
+    with pytest.raises(
+        ValueError, match="no control mode 'sideways'; it has native, twist, velocity, position, torque"
+    ):
+        get_robot("turtlebot", "sideways")
 
 
 def test_a_robot_without_twist_cannot_be_driven():
