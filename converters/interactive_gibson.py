@@ -239,7 +239,8 @@ def plane_patch(
     points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
     cell, first = np.unique(_cells(points), axis=0, return_index=True)
     middle = (cell + 0.5) * PLANE_CELL_M
-    wanted = np.array([tuple(c) not in seen for c in cell]) & ((middle > low) & (middle < high)).all(axis=1)
+    wanted: np.ndarray = np.array([tuple(c) not in seen for c in cell], bool)
+    wanted &= ((middle > low) & (middle < high)).all(axis=1)
     if given is not None:
         index = np.floor((middle - given.origin) / given.resolution_m).astype(np.int64)
         on = ((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1)

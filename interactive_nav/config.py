@@ -21,6 +21,7 @@ CHOICES = {
     "backend": BACKENDS,
     "collision": COLLISIONS,
     "cone": CONES,
+    "small_objects": ("train", "test"),
     "interaction_with": ("movables", "anything"),
     "kinematic_sum": ("all", "touched"),
     "force_part": ("full", "normal"),
@@ -62,6 +63,8 @@ class NavConfig:
     """What an action commands: a control mode of the robot; `native` is the original benchmark's."""
     num_objects: int = 10
     """Small objects strewn about at random each episode."""
+    small_objects: str = "train"
+    """Whose models the small objects are: train, or test, which no training episode shows."""
     observations: tuple[str, ...] = OBSERVATIONS
     """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
     odometry, collision, joints, lidar. With images (depth, segmentation) the observation is a dict."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import threading
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -153,7 +154,7 @@ class NativePhysics(Physics):
             ),
         )
 
-    def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[Any, Any]:
         """Runs the substeps; sensor readings [N, substeps, ...] and the most solver iterations [N]."""
         rounds = self._substeps if self._robot.control_every_substep else 1
         sensed, layout = [], self._layout

@@ -3,12 +3,12 @@
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import skfmm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -87,7 +87,7 @@ def tables_of(graph: geodesic.CornerGraph) -> SceneTables:
     )
     assert len(graph.corner_xy_w) <= MOST_CORNERS and graph.seen.shape[1] <= MOST_SEEN
     values = navigation_tables([graph, filler])
-    others = {field.name: None for field in dataclasses.fields(SceneTables) if field.name not in values}
+    others: dict[str, Any] = {field.name: None for field in dataclasses.fields(SceneTables) if field.name not in values}
     return SceneTables(**values, **others)
 
 
@@ -109,6 +109,7 @@ def fast_marching(
     free: np.ndarray, goal_xy: np.ndarray, fold: int = 4, radius_m: float = RADIUS_M
 ) -> np.ma.MaskedArray:
     """[80 fold, 100 fold] m, masked: second-order fast marching of a disc's centre, `fold` times as fine."""
+    skfmm = pytest.importorskip("skfmm", reason="scikit-fmm could not be built here")
     fine = np.kron(free, np.ones((fold, fold), bool))
     side = 0.05 / fold
     room = geodesic.clearance(fine, side) < radius_m

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ def moment(world):
     qpos[at + 7 : at + 9] = [7.0, -0.5]
     qvel = np.zeros(world.models[0].nv, np.float32)
     qvel[layout.robot_qvel + 6 : layout.robot_qvel + 8] = [3.0, -2.0]
-    zeros = {field.name: jnp.zeros((), jnp.int32) for field in dataclasses.fields(NavInfo)}
+    zeros: dict[str, Any] = {field.name: jnp.zeros((), jnp.int32) for field in dataclasses.fields(NavInfo)}
     told = {
         "goal_xy_w": jnp.zeros(2),
         "robot_pos_w": jnp.asarray([-1.0, 0.2, 0.0]),

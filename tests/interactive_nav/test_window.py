@@ -1,6 +1,7 @@
 """The window's numbers are those of each scene's own model; it holds what is near, and leaves the rest at rest."""
 
 import importlib.util
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ FURNITURE = (
     ("table", 0.0, 1.5, 9.0, 0.5),
     ("table", -3.0, 0.0, 9.0, 0.5),
 )
-ALL = {"active_furniture": 0, "active_small": 0, "active_doors": 0, "active_walls": 0}
+ALL: dict[str, Any] = {"active_furniture": 0, "active_small": 0, "active_doors": 0, "active_walls": 0}
 
 
 @pytest.fixture(scope="module")

@@ -52,6 +52,7 @@ def test_training_begins_at_the_script_and_exports_what_it_acts(env, tmp_path):
     parts = ppo.make_parts(config.ppo, env.observation_size, env.action_size)
     callbacks = GaitCallbacks("ant", tmp_path, float("inf"), parts)
     snapshot = callbacks.restore(ppo.start(parts, env, 0))
+    assert snapshot is not None
     callbacks.on_checkpoint(snapshot)
     network = load_network(tmp_path / "ant.npz")
     observation = np.random.default_rng(0).normal(size=(5, env.observation_size)).astype(np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -123,5 +124,5 @@ def test_names_and_weights_are_checked(env):
         Planner(env, 1.5)
     with pytest.raises(TrainError, match="expected a choice from learned, random, follower, avoider, namo:W"):
         make_yardstick("greedy", env)
-    action = jax.vmap(make_yardstick("random", env))(jnp.zeros((3, 29)), episode_keys(0, 3))
+    action = jax.vmap(cast(Any, make_yardstick("random", env)))(jnp.zeros((3, 29)), episode_keys(0, 3))
     assert action.shape == (3, 2)

@@ -26,6 +26,9 @@ from tests.interactive_nav.robots.motion import extents, hall_world, home_data, 
 LEGGED = ("ant", "humanoid", "minitaur")
 
 
+NOTHING = RobotState(None, None, None)
+
+
 def gait_of(name: str) -> Gait:
     return importlib.import_module(f"interactive_nav.robots.{name}").GAIT
 
@@ -159,13 +162,13 @@ def test_minitaur_chains_start_closed_and_stay_closed():
 def test_minitaur_leg_coordinates_by_hand():
     robot = get_robot("minitaur", "leg")
     command = np.array([0.4, 0.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.5])
-    angles = robot.controls(command, None)
+    angles = robot.controls(command, NOTHING)
     quarter = math.pi / 4
     # pi - pi/4 (0.5 + 1.5) = pi/2; swing 0.4 adds pi/10 fore and takes it aft; extension 0: pi - 1.5 pi/4.
     expected = [math.pi / 2 + 0.4 * quarter, math.pi / 2 - 0.4 * quarter, *[math.pi / 2] * 2]
     expected += [math.pi - 1.5 * quarter] * 2 + [math.pi / 2] * 2
     np.testing.assert_allclose(angles, expected)
-    np.testing.assert_allclose(robot.controls(jnp.asarray(command)[None], None, jnp)[0], expected, rtol=1e-6)
+    np.testing.assert_allclose(robot.controls(jnp.asarray(command)[None], NOTHING, jnp)[0], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", LEGGED)
