@@ -3,7 +3,8 @@
     python -m benchmarks.steps_per_second --backend warp --num-envs 4096 --mode simulation ppo
 
 `simulation` drives random wheel commands through `AutoResetEnv.step`; new episodes are drawn as old ones
-end. `ppo` trains with `python -m train`'s own code and a preset, and reads the rate that it logs, compiling
+end. `physics`, `task` and `observed` are the same with parts left out, for their shares of a step.
+`ppo` trains with `python -m train`'s own code and a preset, and reads the rate that it logs, compiling
 and checkpoints apart. Rows carry device, versions and commit, and are appended to
 `benchmarks/results/steps_per_second.jsonl`.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import functools
 import importlib.metadata
 import json
 import os
@@ -27,10 +29,14 @@ from rich.console import Console
 
 import interactive_nav
 from interactive_nav.physics import resolve_backend
+from interactive_nav.sharding import ShardedEnv
 from interactive_nav.wrappers import AutoResetEnv
 from train import config_io
 from train.run import train_run
 
+MODES = ("physics", "task", "observed", "simulation", "ppo")
+COUNTED = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
+"""Failures summed over ended episodes."""
 PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
 
 
@@ -52,20 +58,81 @@ def _commit() -> str:
     return out.stdout.strip()
 
 
-def simulation(scenes: list[str], backend: str, num_envs: int, steps: int, settings: dict[str, Any]) -> dict[str, Any]:
-    """Rate of random driving: chunks of 20 steps, each one compiled scan; the first chunk is not counted."""
-    env = interactive_nav.make("turtlebot", scenes, backend=backend, **settings)
-    batch = AutoResetEnv(env)
+@functools.lru_cache(maxsize=1)
+def _make(robot: str, scenes: tuple[str, ...], backend: str, settings: str):
+    """The environment; kept for the next mode, since the tables of many large scenes take a minute."""
+    return interactive_nav.make(robot, scenes, backend=backend, **json.loads(settings))
+
+
+def _gpu_memory_mib() -> float | None:
+    """Memory in use on the first GPU, by everything (Warp allocates beside JAX), or None without one."""
+    command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "-i", "0"]
+    try:
+        return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0])
+    except (OSError, subprocess.CalledProcessError, ValueError, IndexError):
+        return None
+
+
+def _physics_only(env, num_envs: int):
+    """State and step of the physics backend alone."""
+
+    def step(state, action):
+        command = jnp.asarray(env.robot.command(action, jnp), jnp.float32)
+        nav = state.info["nav"]
+        physics, _ = jax.vmap(env.physics.step)(nav.scene_index, state.pipeline_state, command, jnp.zeros(num_envs))
+        return state.replace(pipeline_state=physics)
+
+    return step
+
+
+def _without_reset(env, num_envs: int, observe: bool):
+    """The task, with or without observing, but without new episodes."""
+
+    def step(state, action):
+        state = jax.vmap(env.advance)(state, action)
+        return jax.vmap(env.observe)(state) if observe else state
+
+    return step
+
+
+def simulation(
+    robot: str,
+    scenes: list[str],
+    backend: str,
+    num_envs: int,
+    steps: int,
+    settings: dict[str, Any],
+    part: str = "simulation",
+    devices: int = 1,
+) -> dict[str, Any]:
+    """Rate of random driving: chunks of 20 steps, each one compiled scan; the first chunk is not counted.
+
+    `part` leaves things out: `physics` steps the backend alone, `task` adds scores and rewards, `observed` adds the
+    observation, `simulation` adds new episodes.
+    """
+    env = _make(robot, tuple(scenes), backend, json.dumps(settings))
+    batch: Any = AutoResetEnv(env)
+    if devices > 1:
+        batch = ShardedEnv(batch, jax.devices()[:devices])
+    parts = {
+        "physics": _physics_only(env, num_envs),
+        "task": _without_reset(env, num_envs, observe=False),
+        "observed": _without_reset(env, num_envs, observe=True),
+        "simulation": batch.step,
+    }
+    step = parts[part]
     chunk = 20
 
     def advance(state, key):
         def one(state, key):
             action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
-            state = batch.step(state, action)
+            state = step(state, action)
             finished = state.info["episode_metrics"]
-            ended = state.done > 0
-            seen = {k: jnp.sum(jnp.where(ended, finished[k], 0.0)) for k in ("nonfinite", "overflow_steps")}
-            return state, {**seen, "episodes": ended.sum()}
+            ended = state.info["episode_done"] > 0
+            seen = {k: jnp.sum(jnp.where(ended, finished[k], 0.0)) for k in COUNTED}
+            obs = jax.tree.leaves(state.obs)
+            bad = sum(jnp.sum(~jnp.isfinite(x.astype(jnp.float32))) for x in obs)
+            return state, {**seen, "episodes": ended.sum(), "nonfinite_observations": bad}
 
         return jax.lax.scan(one, state, jax.random.split(key, chunk))
 
@@ -75,24 +142,30 @@ def simulation(scenes: list[str], backend: str, num_envs: int, steps: int, setti
     program = jax.jit(advance).lower(state, jax.random.PRNGKey(1)).compile()
     state, _ = jax.block_until_ready(program(state, jax.random.PRNGKey(1)))
     compile_s = time.perf_counter() - clock
-    rates, totals = [], {"nonfinite": 0.0, "overflow_steps": 0.0, "episodes": 0.0}
+    rates, totals = [], {name: 0.0 for name in (*COUNTED, "episodes", "nonfinite_observations")}
+    memory = [_gpu_memory_mib()]
     for i in range(max(1, steps // chunk)):
         clock = time.perf_counter()
         state, seen = jax.block_until_ready(program(state, jax.random.PRNGKey(2 + i)))
         rates.append(chunk * num_envs / (time.perf_counter() - clock))
         for name in totals:
             totals[name] += float(seen[name].sum())
+        if i % 10 == 0:
+            memory.append(_gpu_memory_mib())
     nav = state.info["nav"]
     physics = env.physics
     return {
         "env_steps_per_s": round(statistics.median(rates)),
         "compile_s": round(compile_s, 1),
         "steps": chunk * len(rates),
+        "env_steps": chunk * len(rates) * num_envs,
         **totals,
-        "overflow_steps_running": int(nav.overflow_steps.sum()),
+        "running": {name: int(getattr(nav, name).sum()) for name in COUNTED if hasattr(nav, name)},
+        "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "contacts_per_env": getattr(physics, "contacts_per_env", None),
         "constraints_per_env": getattr(physics, "constraints_per_env", None),
-        "nv": physics.nv,
+        "nv": getattr(physics, "window", physics).model.nv if hasattr(physics, "window") else physics.nv,
+        "movables": int(env.world.occupied.sum(1).max()),
     }
 
 
@@ -132,10 +205,12 @@ def main() -> None:
     """Measures and appends rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
+    parser.add_argument("--robot", default="turtlebot")
     parser.add_argument("--backend", default="auto")
+    parser.add_argument("--devices", type=int, default=1, help="spread the environments over this many")
     parser.add_argument("--num-envs", type=int, nargs="+", default=[64])
     parser.add_argument("--steps", type=int, default=200, help="control steps of every environment")
-    parser.add_argument("--mode", nargs="+", choices=("simulation", "ppo"), default=["simulation"])
+    parser.add_argument("--mode", nargs="+", choices=MODES, default=["simulation"])
     parser.add_argument("--preset", default="turtlebot_ppo", help="of `python -m train`, for ppo")
     parser.add_argument("--set", nargs="*", default=[], metavar="key=value", help="environment settings")
     parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
@@ -157,7 +232,11 @@ def main() -> None:
                 "date": datetime.date.today().isoformat(),
             }
             measure = (args.scenes, args.backend, num_envs, args.steps, settings)
-            row |= simulation(*measure) if mode == "simulation" else ppo(*measure, args.preset)
+            if mode == "ppo":
+                row |= ppo(*measure, args.preset)
+            else:
+                row |= {"robot": args.robot, "devices": args.devices}
+                row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
             with open(args.out, "a", encoding="utf-8") as out:
                 out.write(json.dumps(row) + "\n")
             print(json.dumps(row), flush=True)

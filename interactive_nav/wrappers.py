@@ -12,6 +12,9 @@ from brax.envs.base import Env, State
 
 from interactive_nav.env import EPISODE_METRICS, InteractiveNav
 
+DRAW_SHARE = 16
+"""New episodes are drawn for this fraction of the batch at a time."""
+
 
 class AutoResetEnv(Env):
     """N environments as one natively batched Brax environment (`wrap_env=False` for Brax's learners).
@@ -72,11 +75,8 @@ class AutoResetEnv(Env):
         last = state.info["episode_metrics"]
         episode_metrics = {name: jnp.where(done, finished[name], last[name]) for name in last}
 
-        def draw(current):
-            return self._with_new_episodes(current, done)
-
         moving = (stepped.pipeline_state, stepped.info["nav"], stepped.info["rng"])
-        physics, nav, rng = jax.lax.cond(done.any(), draw, lambda x: x, moving)
+        physics, nav, rng = self._with_new_episodes(moving, done)
         info = {
             **stepped.info,
             "nav": nav,
@@ -90,14 +90,20 @@ class AutoResetEnv(Env):
         return jax.vmap(self.env.observe)(stepped.replace(pipeline_state=physics, info=info))
 
     def _with_new_episodes(self, current, done: jax.Array):
-        nav, rng = current[-2:]
-        if self.env.config.scene_choice == "slot":
-            fresh = jax.vmap(self.env.draw)(rng, nav.scene_index)
-        else:
-            fresh = jax.vmap(self.env.draw)(rng)
-        new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
+        """Draws new episodes where `done`, a part of the batch at a time: few end in one step."""
+        n = done.shape[0]
+        share = max(1, n // DRAW_SHARE)
 
-        def choose(a, b):
-            return jnp.where(done.reshape(done.shape + (1,) * (a.ndim - 1)), a, b)
+        def some(carry):
+            current, pending = carry
+            index = jnp.nonzero(pending, size=share, fill_value=n)[0]
+            nav, rng = (jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], x) for x in current[-2:])
+            if self.env.config.scene_choice == "slot":
+                fresh = jax.vmap(self.env.draw)(rng, nav.scene_index)
+            else:
+                fresh = jax.vmap(self.env.draw)(rng)
+            new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
+            current = jax.tree.map(lambda old, x: old.at[index].set(x, mode="drop"), current, new)
+            return current, pending.at[index].set(False, mode="drop")
 
-        return jax.tree.map(choose, new, current)
+        return jax.lax.while_loop(lambda carry: carry[1].any(), some, (current, done))[0]

@@ -49,7 +49,8 @@ def moment(world):
         "odometry": jnp.asarray([0.5, -0.1, 4.0]),
         "touching": jnp.asarray([True, False]),
     }
-    nav = NavInfo(**(zeros | told))
+    fields: dict[str, Any] = zeros | told
+    nav = NavInfo(**fields)
     return PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(qvel)), nav, jax.random.PRNGKey(5)
 
 
