@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.objects import MODELS, SmallObject
+from interactive_nav.objects import SmallObject
 from interactive_nav.observation import rotation_from_quat
 from interactive_nav.scene import Movable
 from interactive_nav.world import World, sorted_movables
@@ -103,11 +103,6 @@ def _small_boxes(obj: SmallObject) -> np.ndarray:
     return np.asarray([[*b.centre_m, 1.0, 0.0, 0.0, 0.0, *b.half_m] for b in obj.boxes])
 
 
-def _small_id(obj: SmallObject) -> int:
-    first = next(m for m in MODELS if m.category == obj.category)
-    return 8 if obj.category == "basket" and obj != first else class_id(obj.category)
-
-
 def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
@@ -124,7 +119,7 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
         column: list[tuple[np.ndarray, int, Movable | None]] = []
         for i, kind in enumerate(layout.slot_kind):
             if kind == "small":
-                column.append((_small_boxes(world.small_objects[i]), _small_id(world.small_objects[i]), None))
+                column.append((_small_boxes(world.small_objects[i]), world.small_objects[i].segmentation_id, None))
                 continue
             movable = next(own[kind], None)
             boxes = np.zeros((0, 10)) if movable is None else movable.boxes
