@@ -24,14 +24,15 @@ HAS_WARP = importlib.util.find_spec("warp") is not None
 STEPS, PUSH_STEPS = 20, 40
 STEADY = slice(15, PUSH_STEPS)
 """Control steps in which the last scenario's robot pushes at constant speed."""
-BLOCK_KG, BLOCK_FRICTION = 1.0, 0.5
+BLOCK_KG, BLOCK_FRICTION = 1.0, 0.2
+"""Of the block that it pushes: one that slides steadily; with much friction a block rocks and sticks now and then."""
 # float32 against float64 over 100 substeps of stick and slip: free driving agrees to 1 mm, a push to 2 cm.
 FREE_M, PUSH_M = 1e-3, 2e-2
 
-# Scenarios: scene, wheel commands (rad/s), start along x. Scene 0 has a 1 kg block 0.5 m ahead, scene 1 a wall. The last
-# robot starts 2 cm from the block and pushes slowly: without stick and slip.
-SCENE = np.array([0, 0, 0, 1, 1, 0])
-CTRL = np.array([[0, 0], [-5, 5], [10, 10], [14, 14], [6, 10], [5, 5]], np.float32)
+# Scenarios: scene, wheel commands (rad/s), start along x. Scene 0 has a 1 kg block 0.5 m ahead, scene 1 a wall. In
+# scene 2 the robot starts 2 cm from a block that slides easily.
+SCENE = np.array([0, 0, 0, 1, 1, 2])
+CTRL = np.array([[0, 0], [-5, 5], [10, 10], [14, 14], [6, 10], [8, 8]], np.float32)
 START_X = np.array([0, 0, 0, 0, 0, 0.17])
 FIRST = slice(0, 5)
 CONTACTS = {"interaction_with": "anything"}
@@ -40,10 +41,11 @@ CONTACTS = {"interaction_with": "anything"}
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    base = tmp_path_factory.mktemp("backends")
-    a = write_room(base / "a", (4.0, 3.0), (("basket", 0.55, 0.0, BLOCK_KG, BLOCK_FRICTION),))
-    b = write_room(base / "b", (1.6, 3.0), ())
-    scenes = (load_scene(a), load_scene(b))
+    folder = tmp_path_factory.mktemp("backends")
+    a = write_room(folder / "a", (4.0, 3.0), (("basket", 0.55, 0.0, 1.0, 0.5),))
+    b = write_room(folder / "b", (1.6, 3.0), ())
+    c = write_room(folder / "c", (4.0, 3.0), (("basket", 0.55, 0.0, BLOCK_KG, BLOCK_FRICTION),))
+    scenes = (load_scene(a), load_scene(b), load_scene(c))
     return build_world(get_robot("turtlebot"), scenes, NavConfig(num_objects=0, **CONTACTS))
 
 
@@ -134,10 +136,10 @@ def assert_force_is_what_pushing_takes(world, run):
     force_w = run.force_w[STEADY, -1, :, 0].mean((0, 1))
     force_w = force_w * np.sign(force_w[0])
     speed = run.qvel[STEADY, -1, world.layout.slot_qvel[0]]
-    assert speed.mean() > 0.12 and speed.std() < 0.02  # at constant speed
+    assert speed.mean() > 0.25 and speed.std() < 0.1 * speed.mean()  # at constant speed
     horizontal = np.hypot(force_w[0], force_w[1])
     load = BLOCK_KG * 9.81 - force_w[2]
-    assert load > BLOCK_KG * 9.81 * 1.05  # the face does press down: without that part the balance would not close
+    assert load > BLOCK_KG * 9.81 * 1.03  # the face does press down: without that part the balance would not close
     assert horizontal == pytest.approx(BLOCK_FRICTION * load, rel=0.05)
     # What the score sees is the norm.
     norm = np.sqrt((run.force_w[STEADY, -1].sum(-2) ** 2).sum(-1)).mean()
