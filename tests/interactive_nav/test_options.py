@@ -12,6 +12,7 @@ import pytest
 
 import interactive_nav
 from interactive_nav.config import ORIGINAL_CODE, make_config, original_code
+from interactive_nav.contacts import from_sensors, rolling_geoms, sensor_addresses
 from interactive_nav.env import SETTLE_STEPS
 from interactive_nav.types import EpisodeStart
 from interactive_nav.wrappers import AutoResetEnv
@@ -190,8 +191,6 @@ def test_full_force_is_friction_and_more_and_its_normal_part_is_less(pushed, pap
 
 def test_the_listed_contacts_sum_to_the_net_force(pushed):
     """With friction the vector sum of the listed forces has the horizontal part of the net force's normal part."""
-    from interactive_nav.contacts import from_sensors, sensor_addresses
-
     env = make(pushed, force_part="normal")
     model = env.world.models[0]
     data = mujoco.MjData(model)
@@ -209,6 +208,32 @@ def test_the_listed_contacts_sum_to_the_net_force(pushed):
     assert abs(vector[0]) == pytest.approx(abs(net[0]), rel=0.01)  # the robot pitches a little
     assert touch == pytest.approx(np.abs(vector).max(), rel=0.05)
     assert norm >= np.linalg.norm(net) - 1e-6
+
+
+def test_wheels_and_casters_are_exempt_where_the_original_exempts_them(pushed):
+    """A robot that stands on the block touches it with two wheels and a caster only."""
+    for settings, force_n, cost in (
+        ({}, 2.673 * 9.81, -0.1),
+        ({"force_part": "normal"}, 0.0, -0.1),
+        ({"interaction_with": "anything"}, 2.673 * 9.81, 0.0),
+    ):
+        env = make(pushed, **settings)
+        state, step = begin(env), stepper(env)
+        pose = jnp.array([0.0, 0.0, 0.4])
+        physics = state.pipeline_state.replace(qpos=state.pipeline_state.qpos.at[:, :3].set(pose))
+        state = state.replace(pipeline_state=physics)
+        forces_n = [0.0]
+        for _ in range(12):
+            state = step(state, jnp.full((N, 2), STILL))
+            forces_n.append(float(state.info["nav"].force_sum_n[0]))
+        assert np.abs(np.asarray(state.info["nav"].robot_pos_w[0]) - pose).max() < 0.01  # stands there
+        assert np.diff(forces_n)[-3:].mean() == pytest.approx(force_n, rel=0.03, abs=1e-3)
+        assert float(state.metrics["reward/interaction"][0]) == pytest.approx(cost)
+    # Each of the four is told apart from the body by name.
+    model = make(pushed, force_part="normal").world.models[0]
+    layout, robot = env.world.layout, env.robot
+    named = {model.geom(int(g)).name for g in np.flatnonzero(rolling_geoms(model, robot, layout.robot_bodies))}
+    assert len(named) == 4 and all("wheel" in name or "caster" in name for name in named)
 
 
 def test_robot_mass_variants_and_gravity(pushed, paper):
