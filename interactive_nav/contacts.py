@@ -1,9 +1,11 @@
 """Single contacts of the robot, for the options that each body's net force does not answer.
 
 The original's code leaves out friction and wheels, and could sum the contacts' norms instead of their vectors
-(reference benchmark, section 11, rows 4, 6 and 7). MuJoCo's contact sensors list contacts by body, so wheels are
-taken off again: what the whole robot does to a body, less what its rolling bodies do to it. These sensors are
-added only when an option asks for them.
+(reference benchmark, section 11, rows 4, 6 and 7). MuJoCo's contact sensors list contacts of a whole robot, so wheels
+are taken off again: what the robot does to a body, less what its rolling parts do to it. These sensors are added only
+when an option asks for them.
+
+What rolls are a robot's `rolling_bodies` and its casters: frictionless geoms (condim 1) of other bodies.
 """
 
 from __future__ import annotations
@@ -32,7 +34,13 @@ _ROLLING = "contacts_of_rolling"
 
 
 def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]) -> None:
-    """Lists the robot's and its rolling bodies' contacts with each of the bodies."""
+    """Lists the robot's and its rolling parts' contacts with each of the bodies."""
+
+    casters = [
+        geom.name
+        for geom in spec.body(robot.base_body).find_all("geom")
+        if geom.condim == 1 and geom.parent.name not in robot.rolling_bodies
+    ]
 
     def add(name: str, objtype: mujoco.mjtObj, objname: str, body: str) -> None:
         spec.add_sensor(
@@ -49,10 +57,19 @@ def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]
         add(f"{_ALL}_{i}", mujoco.mjtObj.mjOBJ_XBODY, robot.base_body, body)
         for wheel in robot.rolling_bodies:
             add(f"{_ROLLING}_{i}_{wheel}", mujoco.mjtObj.mjOBJ_BODY, wheel, body)
+        for caster in casters:
+            add(f"{_ROLLING}_{i}_{caster}", mujoco.mjtObj.mjOBJ_GEOM, caster, body)
+
+
+def rolling_geoms(model: mujoco.MjModel, robot: RobotSpec, robot_bodies: np.ndarray) -> np.ndarray:
+    """[ngeom] bool: parts of the robot that roll, as the sensors know them."""
+    wheels = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in robot.rolling_bodies]
+    own = np.isin(model.geom_bodyid, robot_bodies)
+    return own & (np.isin(model.geom_bodyid, wheels) | (model.geom_condim == 1))
 
 
 def sensor_addresses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Addresses in sensordata of the whole robot's lists and of its rolling bodies': [a, SLOTS, 7], [b, SLOTS, 7]."""
+    """Addresses in sensordata of the whole robot's lists and of its rolling parts': [a, SLOTS, 7], [b, SLOTS, 7]."""
     names = [(model.sensor(i).name, int(model.sensor_adr[i])) for i in range(model.nsensor)]
 
     def of(prefix: str) -> np.ndarray:
@@ -82,7 +99,7 @@ def part_of_contacts(force_c: Any, normal_w: Any, part: str, xp: Any) -> tuple[A
 
 def from_sensors(data: Any, addresses: tuple[np.ndarray, np.ndarray], part: str, xp: Any) -> tuple[Any, Any, Any]:
     """`part_of_contacts` of a record of sensordata [..., nsensordata]: over all listed contacts, without the rolling
-    bodies' in the first and third, and in the second too where `part` is `normal`."""
+    parts' in the first and third, and in the second too where `part` is `normal`."""
     sums = []
     for where in addresses:
         listed = data[..., where.reshape(-1, _FIELDS)]

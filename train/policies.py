@@ -107,8 +107,9 @@ def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
     kind, _, weight = name.partition(":")
     if kind == "namo":
         try:
-            return Planner(env, float(weight))
+            share = float(weight)
         except ValueError:
             raise TrainError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
+        return Planner(env, share)
     known = ", ".join(("learned", *YARDSTICKS, *PLANNERS))
     raise TrainError(f"--policies: got {name!r}, expected a choice from {known}")

@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.config import NavConfig
-from interactive_nav.contacts import from_sensors, part_of_contacts, sensor_addresses
+from interactive_nav.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
 from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
@@ -55,8 +55,7 @@ class MjxPhysics(Physics):
         self._slot_of_geom = _slot_of_geom(layout, host)
         self._forces = forces
         self._contacts = sensor_addresses(host) if impl == "warp" and forces.needs_contacts else None
-        rolling = [mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_BODY, name) for name in world.robot.rolling_bodies]
-        self._rolls = np.isin(host.geom_bodyid, rolling)
+        self._rolls = rolling_geoms(host, world.robot, layout.robot_bodies)
 
     def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]

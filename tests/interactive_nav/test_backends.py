@@ -1,5 +1,6 @@
 """C MuJoCo, MJX-JAX and MJX-Warp step the same toy scenes alike; the two upstream limits that we work round."""
 
+import dataclasses
 import importlib.util
 
 import jax
@@ -11,44 +12,96 @@ from mujoco import mjx
 
 import interactive_nav
 from interactive_nav.config import NavConfig
-from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
+from interactive_nav.contacts import combine
+from interactive_nav.physics import PhysicsState, StepSignals, base, make_physics, mjx_batch, resolve_backend
+from interactive_nav.physics import native as native_backend
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from interactive_nav.world import build_world
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
-STEPS = 20
+STEPS, PUSH_STEPS = 20, 40
+STEADY = slice(15, PUSH_STEPS)
+"""Control steps in which the last scenario's robot pushes at constant speed."""
+BLOCK_KG, BLOCK_FRICTION = 1.0, 0.2
+"""Of the block that it pushes: one that slides steadily; with much friction a block rocks and sticks now and then."""
 # float32 against float64 over 100 substeps of stick and slip: free driving agrees to 1 mm, a push to 2 cm.
 FREE_M, PUSH_M = 1e-3, 2e-2
 
-# Scenarios: scene, wheel commands (rad/s). Scene 0 has a 1 kg block 0.5 m ahead, scene 1 a wall and an 8 kg door.
-SCENE = np.array([0, 0, 0, 1, 1])
-CTRL = np.array([[0, 0], [-5, 5], [10, 10], [14, 14], [6, 10]], np.float32)
+# Scenarios: scene, wheel commands (rad/s), start along x. Scene 0 has a 1 kg block 0.5 m ahead, scene 1 a wall. In
+# scene 2 the robot starts 2 cm from a block that slides easily.
+SCENE = np.array([0, 0, 0, 1, 1, 2])
+CTRL = np.array([[0, 0], [-5, 5], [10, 10], [14, 14], [6, 10], [8, 8]], np.float32)
+START_X = np.array([0, 0, 0, 0, 0, 0.17])
+FIRST = slice(0, 5)
+CONTACTS = {"interaction_with": "anything"}
+"""A setting that needs single contacts: forces by all options come from one run."""
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    base = tmp_path_factory.mktemp("backends")
-    a = write_room(base / "a", (4.0, 3.0), (("basket", 0.55, 0.0, 1.0, 0.5),))
-    b = write_room(base / "b", (1.6, 3.0), ())
-    scenes = (load_scene(a), load_scene(b))
-    return build_world(get_robot("turtlebot"), scenes, NavConfig(num_objects=0))
+    folder = tmp_path_factory.mktemp("backends")
+    a = write_room(folder / "a", (4.0, 3.0), (("basket", 0.55, 0.0, 1.0, 0.5),))
+    b = write_room(folder / "b", (1.6, 3.0), ())
+    c = write_room(folder / "c", (4.0, 3.0), (("basket", 0.55, 0.0, BLOCK_KG, BLOCK_FRICTION),))
+    scenes = (load_scene(a), load_scene(b), load_scene(c))
+    return build_world(get_robot("turtlebot"), scenes, NavConfig(num_objects=0, **CONTACTS))
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """PUSH_STEPS control steps of all scenarios under constant commands, heading along x."""
+
+    qpos: np.ndarray
+    """[T, N, nq]."""
+    qvel: np.ndarray
+    signals: StepSignals
+    """Leaves [T, N, ...]."""
+    force_w: np.ndarray
+    """[T, N, substeps, slots + 1, 3] of the robot on each body."""
+    contacts: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """As `contacts.from_sensors`, leaves [T, N, substeps, (3)]."""
+
+    def force_n(self, part: str, how: str) -> np.ndarray:
+        """[T, N] F_t under the options."""
+        # The sum of the normal forces' norms, wheels exempt, is what touches.
+        norms = self.contacts[2] if part == "normal" else self.contacts[1]
+        return combine(self.force_w.sum(-2), (self.contacts[0], norms, self.contacts[2]), part, how, np)[0]
 
 
 def trajectory(world, backend):
-    """[STEPS, N, ...] positions and forces under constant commands, from the room's centre heading along x."""
-    physics = make_physics(world, NavConfig(backend=backend, num_objects=0, sleep=False))
-    qpos = world.rest_qpos[SCENE].copy()
-    qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
-    still = jnp.zeros((len(SCENE), world.models[0].nv), jnp.float32)
-    state = PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
-    step = jax.jit(jax.vmap(physics.step))
-    out = []
-    for _ in range(STEPS):
-        state, signals = step(jnp.asarray(SCENE), state, jnp.asarray(CTRL))
-        out.append((state.qpos, signals.force_n, signals.slot_force_n, signals.structure_force_n, signals.overflow))
-    return [np.stack([np.asarray(o[i]) for o in out]) for i in range(5)]
+    seen = []
+    real = base.summarise_forces
+
+    def watched(force_w, xp=jnp, contacts=None, options=base.PAPER_FORCE):
+        if xp is np:
+            seen.append((force_w, contacts))
+        else:
+            jax.debug.callback(lambda *x: seen.append(jax.tree.map(np.asarray, x)), force_w, contacts)
+        return real(force_w, xp, contacts, options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native_backend, "summarise_forces", watched)
+        patch.setattr(mjx_batch, "summarise_forces", watched)
+        config = NavConfig(backend=backend, num_objects=0, sleep=False, **CONTACTS)
+        step = jax.jit(jax.vmap(make_physics(world, config).step))
+        qpos = world.rest_qpos[SCENE].copy()
+        qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
+        qpos[:, 0] = START_X
+        still = jnp.zeros((len(SCENE), world.models[0].nv), jnp.float32)
+        state = PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
+        out = []
+        for _ in range(PUSH_STEPS):
+            state, signals = step(jnp.asarray(SCENE), state, jnp.asarray(CTRL))
+            jax.block_until_ready(state)
+            jax.effects_barrier()
+            out.append((state.qpos, state.qvel, signals))
+    assert len(seen) == PUSH_STEPS
+    stack = jax.tree.map(
+        lambda *x: np.stack([np.asarray(v) for v in x]), *[(*o, *s) for o, s in zip(out, seen, strict=True)]
+    )
+    return Run(*stack)
 
 
 @pytest.fixture(scope="module")
@@ -56,49 +109,109 @@ def native(world):
     return trajectory(world, "native")
 
 
+@pytest.fixture(scope="module")
+def mjx_jax(world):
+    return trajectory(world, "jax")
+
+
+@pytest.fixture(scope="module")
+def mjx_warp(world):
+    return trajectory(world, "warp")
+
+
 def test_native_scenarios_do_what_they_should(world, native):
-    qpos, force, slots, structure, _ = native
-    box = world.layout.slot_qpos[0]
+    qpos, structure, box = native.qpos[:STEPS], native.signals.structure_force_n[:STEPS], world.layout.slot_qpos[0]
     np.testing.assert_allclose(qpos[-1, 0, :2], 0, atol=2e-3)  # stands
     np.testing.assert_allclose(qpos[-1, 1, :2], 0, atol=1e-2)  # turns in place
     assert abs(qpos[-1, 1, 3]) < 0.9  # ... and does turn
     # Drives 0.35 m/s for 2 s and pushes the block ahead of it.
     pushed = qpos[-1, 2, box] - qpos[0, 2, box]
-    assert pushed > 0.2 and slots[-1, 2, 0] > 1.0
-    # Pushing at constant speed: the horizontal force is the floor's friction, 0.5 * 1 kg * 9.81 = 4.9 N;
-    # friction on the robot's face may add a vertical part of up to 0.5 of it.
-    assert 4.9 * 0.95 < np.median(force[-6:, 2]) < 4.9 * 1.2
-    assert (force[:, :2] == 0).all()  # touching nothing gives exactly 0
+    assert pushed > 0.2 and native.signals.slot_force_n[STEPS - 1, 2, 0] > 1.0
     assert structure[-1, 3] > 1.0 and (structure[:, 2] == 0).all()  # only the narrow room's wall is met
 
 
-def assert_agree(world, native, other, force_rtol):
-    box = world.layout.slot_qpos[0]
-    np.testing.assert_allclose(other[0][:, :2, :7], native[0][:, :2, :7], atol=FREE_M)
-    np.testing.assert_allclose(other[0][:, 2:, :2], native[0][:, 2:, :2], atol=PUSH_M)
-    np.testing.assert_allclose(other[0][:, 2, box], native[0][:, 2, box], atol=PUSH_M)
-    # Sideways, a face pushed at its middle is unstable: rounding decides, so only the size is bounded.
-    assert np.abs(other[0][:, 2, box + 1]).max() < 0.1
-    np.testing.assert_allclose(other[1].sum(0), native[1].sum(0), rtol=force_rtol, atol=0.5)
-    assert other[4].sum() == 0  # no buffer overflowed
+def assert_force_is_what_pushing_takes(world, run):
+    """The push balances the floor's friction, mu times the block's weight and what the pusher's face presses down."""
+    # Substeps' mean of the force on the block, in all steady steps.
+    force_w = run.force_w[STEADY, -1, :, 0].mean((0, 1))
+    force_w = force_w * np.sign(force_w[0])
+    speed = run.qvel[STEADY, -1, world.layout.slot_qvel[0]]
+    assert speed.mean() > 0.25 and speed.std() < 0.1 * speed.mean()  # at constant speed
+    horizontal = np.hypot(force_w[0], force_w[1])
+    load = BLOCK_KG * 9.81 - force_w[2]
+    assert load > BLOCK_KG * 9.81 * 1.03  # the face does press down: without that part the balance would not close
+    assert horizontal == pytest.approx(BLOCK_FRICTION * load, rel=0.05)
+    # What the score sees is the norm.
+    norm = np.sqrt((run.force_w[STEADY, -1].sum(-2) ** 2).sum(-1)).mean()
+    assert run.signals.force_n[STEADY, -1].mean() == pytest.approx(norm, rel=1e-4)
+    # Standing, turning in place and driving freely (0.35 m/s, before the block is met) give exactly 0.
+    assert (run.signals.force_n[:, :2] == 0).all() and (run.signals.body_force_n[:, :2] == 0).all()
+    assert run.qpos[3, 2, 0] > 0.05 and (run.signals.force_n[:4, 2] == 0).all()
+    assert (run.signals.body_force_n[:4, 2] == 0).all()
+
+
+def assert_options_order_as_they_must(world, run):
+    full, normal = run.force_n("full", "vector")[STEADY, -1], run.force_n("normal", "vector")[STEADY, -1]
+    contacts, last = run.force_n("full", "contacts")[STEADY, -1], run.force_n("full", "last_substep")[STEADY, -1]
+    # The block's face is vertical: the normal part is the horizontal part.
+    force_w = run.force_w[STEADY, -1, :, 0].mean((0, 1))
+    assert normal.mean() == pytest.approx(np.hypot(force_w[0], force_w[1]), rel=0.03)
+    assert (full >= normal - 1e-3).all() and full.mean() > 1.02 * normal.mean()
+    assert (contacts >= full - 1e-3).all() and contacts.mean() < 1.5 * full.mean()
+    assert run.force_n("normal", "contacts")[STEADY, -1].mean() == pytest.approx(normal.mean(), rel=0.05)
+    np.testing.assert_allclose(last, np.sqrt((run.force_w[STEADY, -1, -1].sum(-2) ** 2).sum(-1)), rtol=1e-4)
+    # Against the wall: touches count for `anything`, and the block and the wall are told apart.
+    assert run.signals.body_force_n[STEPS - 1, 3] > 1.0 and run.signals.slot_force_n[:STEPS, 3].max() == 0
+
+
+def test_the_force_on_a_pushed_block_on_native(world, native):
+    assert_force_is_what_pushing_takes(world, native)
+    assert_options_order_as_they_must(world, native)
 
 
 @pytest.mark.slow
-def test_mjx_jax_agrees_with_c_mujoco(world, native):
-    # MJX-JAX keeps other contact points of two boxes, so friction on the pusher's face differs.
-    assert_agree(world, native, trajectory(world, "jax"), force_rtol=0.15)
+def test_the_force_on_a_pushed_block_on_jax(world, mjx_jax):
+    assert_force_is_what_pushing_takes(world, mjx_jax)
+    assert_options_order_as_they_must(world, mjx_jax)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_WARP, reason="the package warp-lang (extra 'warp') is not installed")
-def test_mjx_warp_agrees_with_c_mujoco(world, native):
-    assert_agree(world, native, trajectory(world, "warp"), force_rtol=0.05)
+def test_the_force_on_a_pushed_block_on_warp(world, mjx_warp):
+    assert_force_is_what_pushing_takes(world, mjx_warp)
+    assert_options_order_as_they_must(world, mjx_warp)
+
+
+def assert_agree(world, native, other, force_rtol):
+    box = world.layout.slot_qpos[0]
+    ours, theirs = native.qpos[:STEPS, FIRST], other.qpos[:STEPS, FIRST]
+    np.testing.assert_allclose(theirs[:, :2, :7], ours[:, :2, :7], atol=FREE_M)
+    np.testing.assert_allclose(theirs[:, 2:, :2], ours[:, 2:, :2], atol=PUSH_M)
+    np.testing.assert_allclose(theirs[:, 2, box], ours[:, 2, box], atol=PUSH_M)
+    # Sideways, a face pushed at its middle is unstable: rounding decides, so only the size is bounded.
+    assert np.abs(theirs[:, 2, box + 1]).max() < 0.1
+    for part, how in (("full", "vector"), ("normal", "vector"), ("normal", "contacts")):
+        ours, theirs = (run.force_n(part, how)[:STEPS, FIRST].sum(0) for run in (native, other))
+        np.testing.assert_allclose(theirs, ours, rtol=force_rtol, atol=0.5)
+    assert other.signals.overflow.sum() == 0  # no buffer overflowed
+
+
+@pytest.mark.slow
+def test_mjx_jax_agrees_with_c_mujoco(world, native, mjx_jax):
+    # MJX-JAX keeps other contact points of two boxes, so friction on the pusher's face differs.
+    assert_agree(world, native, mjx_jax, force_rtol=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not HAS_WARP, reason="the package warp-lang (extra 'warp') is not installed")
+def test_mjx_warp_agrees_with_c_mujoco(world, native, mjx_warp):
+    assert_agree(world, native, mjx_warp, force_rtol=0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_WARP, reason="the package warp-lang (extra 'warp') is not installed")
 def test_overflowing_buffers_are_counted(world):
-    config = NavConfig(backend="warp", num_objects=0, contacts_per_env=2, constraints_per_env=16)
+    config = NavConfig(backend="warp", num_objects=0, contacts_per_env=2, constraints_per_env=16, **CONTACTS)
     physics = make_physics(world, config)
     still = jnp.zeros((len(SCENE), world.models[0].nv), jnp.float32)
     state = PhysicsState(jnp.asarray(world.rest_qpos[SCENE], jnp.float32), still, still)
@@ -107,15 +220,16 @@ def test_overflowing_buffers_are_counted(world):
 
 
 def test_sleep_changes_nothing_that_moves(world, native):
-    physics = make_physics(world, NavConfig(backend="native", num_objects=0, sleep=True))
+    physics = make_physics(world, NavConfig(backend="native", num_objects=0, sleep=True, **CONTACTS))
     qpos = world.rest_qpos[SCENE].copy()
     qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
+    qpos[:, 0] = START_X
     still = jnp.zeros((len(SCENE), world.models[0].nv), jnp.float32)
     state = PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
     step = jax.jit(jax.vmap(physics.step))
     for _ in range(STEPS):
         state, _ = step(jnp.asarray(SCENE), state, jnp.asarray(CTRL))
-    np.testing.assert_allclose(np.asarray(state.qpos)[:, :2], native[0][-1][:, :2], atol=PUSH_M)
+    np.testing.assert_allclose(np.asarray(state.qpos)[:, :2], native.qpos[STEPS - 1, :, :2], atol=PUSH_M)
 
 
 def test_auto_picks_native_on_a_cpu():

@@ -50,6 +50,8 @@ class ToyNav:
     object_pos_w: jax.Array
     robot_path_m: jax.Array
     step_count: jax.Array
+    velocity: jax.Array
+    """[2] speed along heading (m/s) and turning (rad/s) in the last step."""
 
 
 class ToyEnv(Env):
@@ -76,7 +78,7 @@ class ToyEnv(Env):
     def backend(self) -> str:
         return "native"
 
-    def _observe(self, nav: ToyNav, speed_m_s: jax.Array, turn_rad_s: jax.Array) -> jax.Array:
+    def _observe(self, nav: ToyNav) -> jax.Array:
         offset = nav.goal_xy_w - nav.robot_pos_w[:2]
         cos, sin = jnp.cos(nav.yaw_rad), jnp.sin(nav.yaw_rad)
         goal_b = jnp.stack([cos * offset[0] + sin * offset[1], -sin * offset[0] + cos * offset[1]])
@@ -84,7 +86,7 @@ class ToyEnv(Env):
         along = jnp.minimum(0.2 * jnp.arange(1, 11), distance)
         waypoints_b = along[:, None] * goal_b / jnp.maximum(distance, 1e-6)
         zero = jnp.zeros(1)
-        velocity = jnp.concatenate([speed_m_s[None], zero, zero, zero, zero, turn_rad_s[None]])
+        velocity = jnp.concatenate([nav.velocity[:1], zero, zero, zero, zero, nav.velocity[1:]])
         return jnp.concatenate([waypoints_b.ravel(), goal_b, zero, velocity])
 
     def _metrics(self, nav: ToyNav, success: jax.Array, done: jax.Array) -> dict[str, jax.Array]:
@@ -117,13 +119,22 @@ class ToyEnv(Env):
             object_pos_w=jnp.array([[3.0, 3.0, 0.0]]),
             robot_path_m=jnp.zeros(()),
             step_count=jnp.zeros((), jnp.int32),
+            velocity=jnp.zeros(2),
         )
         zero = jnp.zeros(())
         info = {"nav": nav, "rng": rng, "truncation": zero, "time_out": zero}
-        obs = self._observe(nav, zero, zero)
-        return State(None, obs, zero, zero, self._metrics(nav, zero, zero), info)
+        return State(None, self._observe(nav), zero, zero, self._metrics(nav, zero, zero), info)
+
+    def draw(self, rng: jax.Array) -> State:
+        return self.reset(rng)
+
+    def observe(self, state: State) -> State:
+        return state.replace(obs=self._observe(state.info["nav"]))  # type: ignore[attr-defined]
 
     def step(self, state: State, action: jax.Array) -> State:
+        return self.observe(self.advance(state, action))
+
+    def advance(self, state: State, action: jax.Array) -> State:
         nav: ToyNav = state.info["nav"]
         low, high = jnp.asarray(self.robot.action_low), jnp.asarray(self.robot.action_high)
         wheels = low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
@@ -146,10 +157,10 @@ class ToyEnv(Env):
             yaw_rad=yaw,
             robot_path_m=nav.robot_path_m + jnp.linalg.norm(move),
             step_count=steps,
+            velocity=jnp.stack([speed, turn]),
         )
         info = {**state.info, "nav": nav, "truncation": truncation, "time_out": truncation}
         return state.replace(  # type: ignore[attr-defined]
-            obs=self._observe(nav, speed, turn),
             reward=reward,
             done=done,
             metrics=self._metrics(nav, success, done),

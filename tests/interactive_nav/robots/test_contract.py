@@ -26,7 +26,7 @@ FAST = ("fetch",)
 )
 def test_every_robot_is_an_environment(name, big_room):
     env = interactive_nav.make(
-        name, [big_room], backend="native", num_objects=1, episode_steps=STEPS, max_goals=32, nav_cell_m=0.2, threads=1
+        name, [big_room], backend="native", num_objects=1, episode_steps=STEPS, nav_cell_m=0.2, threads=1
     )
     robot = env.robot
     assert (

@@ -25,7 +25,6 @@ def test_the_follower_reaches_its_goal(name, room):
         episode_steps=400,
         min_goal_distance_m=1.9,
         max_goal_distance_m=2.3,
-        max_goals=64,
     )
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
     follow = jax.vmap(make_follower(env))
