@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,7 @@ SCENE = np.array([0, 0, 0, 1, 1, 2])
 CTRL = np.array([[0, 0], [-5, 5], [10, 10], [14, 14], [6, 10], [8, 8]], np.float32)
 START_X = np.array([0, 0, 0, 0, 0, 0.17])
 FIRST = slice(0, 5)
-CONTACTS = {"interaction_with": "anything"}
+CONTACTS: dict[str, Any] = {"interaction_with": "anything"}
 """A setting that needs single contacts: forces by all options come from one run."""
 
 
