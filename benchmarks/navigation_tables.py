@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -158,13 +159,13 @@ def look_up_ms(values: dict[str, Any], graphs: list[CornerGraph], rounds: int = 
     return 1e3 * float(np.median(times[1:]))
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Prints a line a scene and the totals."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE_DIR")
     parser.add_argument("--plans", type=int, default=0, metavar="N")
     parser.add_argument("--accuracy", type=int, default=0, metavar="ROOMS")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     if not (arguments.scenes or arguments.plans or arguments.accuracy):
         parser.error("nothing to measure: name scene folders, --plans or --accuracy")
     if arguments.accuracy:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,7 @@ SCENE = np.array([0, 0, 0, 1, 1, 2])
 CTRL = np.array([[0, 0], [-5, 5], [10, 10], [14, 14], [6, 10], [8, 8]], np.float32)
 START_X = np.array([0, 0, 0, 0, 0, 0.17])
 FIRST = slice(0, 5)
-CONTACTS = {"interaction_with": "anything"}
+CONTACTS: dict[str, Any] = {"interaction_with": "anything"}
 """A setting that needs single contacts: forces by all options come from one run."""
 
 
@@ -70,7 +71,7 @@ class Run:
         return combine(self.force_w.sum(-2), (self.contacts[0], norms, self.contacts[2]), part, how, np)[0]
 
 
-def trajectory(world, backend):
+def trajectory(world, backend, settings=CONTACTS):
     seen = []
     real = base.summarise_forces
 
@@ -84,7 +85,7 @@ def trajectory(world, backend):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_backend, "summarise_forces", watched)
         patch.setattr(mjx_batch, "summarise_forces", watched)
-        config = NavConfig(backend=backend, num_objects=0, sleep=False, **CONTACTS)
+        config = NavConfig(backend=backend, num_objects=0, sleep=False, **settings)
         step = jax.jit(jax.vmap(make_physics(world, config).step))
         qpos = world.rest_qpos[SCENE].copy()
         qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
@@ -180,6 +181,23 @@ def test_the_force_on_a_pushed_block_on_jax(world, mjx_jax):
 def test_the_force_on_a_pushed_block_on_warp(world, mjx_warp):
     assert_force_is_what_pushing_takes(world, mjx_warp)
     assert_options_order_as_they_must(world, mjx_warp)
+
+
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "native",
+        pytest.param("jax", marks=pytest.mark.slow),
+        pytest.param("warp", marks=[pytest.mark.slow, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
+    ],
+)
+def test_the_chosen_force_is_what_the_signals_hold(world, native, backend):
+    run = trajectory(world, backend, {"force_part": "normal", "force_sum": "contacts"})
+    force_n = run.signals.force_n
+    np.testing.assert_allclose(force_n, run.contacts[1].mean(-1), rtol=1e-4, atol=1e-3)
+    # Wheels touch no object here: the normal forces' norms are all that touches.
+    np.testing.assert_allclose(force_n, run.contacts[2].mean(-1), rtol=1e-3, atol=1e-2)
+    assert force_n[STEADY, -1].mean() == pytest.approx(native.force_n("normal", "contacts")[STEADY, -1].mean(), rel=0.1)
 
 
 def assert_agree(world, native, other, force_rtol):

@@ -40,6 +40,19 @@ def test_round_trip_and_the_same_episodes_as_reset(env, made, tmp_path):
     assert episodes.draw(env, 2, seed=4).episodes == made.episodes[:2]
 
 
+@pytest.mark.parametrize("backend", ["jax", "warp"])
+def test_the_same_file_gives_the_same_episodes_on_every_backend(env, made, room, two_rooms, backend):
+    if backend == "warp":
+        pytest.importorskip("warp", reason="the package warp-lang (extra 'warp') is not installed")
+    other = interactive_nav.make("turtlebot", [room, two_rooms], backend=backend, num_objects=3)
+    keys = jax.random.split(jax.random.PRNGKey(0), 6)
+    want, got = (jax.jit(jax.vmap(e._begin))(episodes.starts_of(made, e), keys) for e in (env, other))
+    assert other.backend == backend
+    np.testing.assert_array_equal(got.pipeline_state.qpos, want.pipeline_state.qpos)
+    for name in ("scene_index", "goal_xy_w", "shortest_path_m", "object_pos_w"):
+        np.testing.assert_allclose(getattr(got.info["nav"], name), getattr(want.info["nav"], name), atol=1e-6)
+
+
 def test_scenes_are_found_by_content_not_by_place(env, made, room, two_rooms):
     turned = interactive_nav.make("turtlebot", [two_rooms, room], backend="native", num_objects=3)
     starts = episodes.starts_of(made, turned)

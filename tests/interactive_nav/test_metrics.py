@@ -107,7 +107,8 @@ def test_alpha_1_is_spl_and_alpha_0_is_effort(episode):
     """SPL: Anderson et al. 2018, S L / max(L, l)."""
     spl = episode["success"] * episode["shortest"] / max(episode["shortest"], episode["paths"][0])
     assert score(episode, 1.0) == pytest.approx(spl)
-    e_eff = metrics.effort_efficiency(*(np.array(episode[name]) for name in ("masses", "paths", "forces")), 5)
+    masses, paths, forces = (np.array(episode[name]) for name in ("masses", "paths", "forces"))
+    e_eff = metrics.effort_efficiency(masses, paths, forces, 5)
     assert score(episode, 0.0) == pytest.approx(float(e_eff))
 
 
