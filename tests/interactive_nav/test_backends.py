@@ -26,7 +26,7 @@ STEPS, PUSH_STEPS = 20, 40
 STEADY = slice(15, PUSH_STEPS)
 """Control steps in which the last scenario's robot pushes at constant speed."""
 BLOCK_KG, BLOCK_FRICTION = 1.0, 0.2
-"""Of the block that it pushes: one that slides steadily; with much friction a block rocks and sticks now and then."""
+"""Of the block that it pushes; slower pushes and more friction gave means below mu N (docs/navigation.md)."""
 # float32 against float64 over 100 substeps of stick and slip: free driving agrees to 1 mm, a push to 2 cm.
 FREE_M, PUSH_M = 1e-3, 2e-2
 
