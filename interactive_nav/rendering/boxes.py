@@ -29,9 +29,9 @@ CLASS_IDS = {
     "desk": 4,
     "door": 5,
     "basket": 6,
-    "shoe": 7,
+    "pot": 7,
     "toy": 9,
-    "pot": 10,
+    "shoe": 10,
 }
 """Segmentation ids of Interactive Gibson's code (reference benchmark, section 1.4); the second basket model is 8.
 

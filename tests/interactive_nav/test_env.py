@@ -124,7 +124,7 @@ def test_starts_and_goals_keep_their_distance_and_nothing_touches_at_the_start(e
 
 def test_following_the_path_succeeds_and_the_reward_adds_up(programs):
     reset, step = programs
-    state = reset(keys(5))
+    state = reset(keys(9))
     total, potential, ended = np.zeros(N), np.zeros(N), np.zeros(N, bool)
     start = np.asarray(state.info["nav"].geodesic_m)
     success = np.zeros(N, bool)

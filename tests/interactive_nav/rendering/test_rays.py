@@ -38,11 +38,12 @@ def c_mujoco(world, scene, qpos, pos, axes, lens):
     unit = (ray / length[..., None]).ravel()
     mujoco.mj_multiRay(model, data, np.asarray(pos, float), unit, None, 1, -1, geom, distance, None, length.size, 400.0)
     categories = {m.name: m.category for m in world.scenes[scene].movables}
-    categories |= {n: n.split("_")[0] for n in world.names[scene] if "small" in n}
     ids = np.zeros(model.ngeom, np.uint8)
     for slot, name in enumerate(world.names[scene]):
         if name:
-            ids[model.geom_bodyid == layout.slot_body[slot]] = class_id(categories[name])
+            small = layout.slot_kind[slot] == "small"
+            own = world.small_objects[slot].segmentation_id if small else class_id(categories[name])
+            ids[model.geom_bodyid == layout.slot_body[slot]] = own
     depth = distance.reshape(length.shape) / length
     met = (distance.reshape(length.shape) > 0) & (depth < 100)
     return np.where(met, depth, 0.0), np.where(met, ids[geom.reshape(length.shape)], 0)
