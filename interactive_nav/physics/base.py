@@ -88,6 +88,11 @@ class Physics(abc.ABC):
         return _step_single(self, scene, state, command, jnp.asarray(time_s, jnp.float32))
 
 
+def uncommitted(tree: Any) -> Any:
+    """The tree with its arrays on no device in particular, as constants of a program on several must be."""
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)) if isinstance(x, jax.Array) else x, tree)
+
+
 def _flatten(tree, outer: int, inner: int):
     return jax.tree.map(lambda x: x.reshape((outer * inner, *x.shape[2:])), tree)
 

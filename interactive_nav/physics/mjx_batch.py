@@ -15,7 +15,15 @@ from mujoco import mjx
 
 from interactive_nav.config import NavConfig
 from interactive_nav.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
-from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.physics.base import (
+    PAPER_FORCE,
+    ForceOptions,
+    Physics,
+    PhysicsState,
+    StepSignals,
+    summarise_forces,
+    uncommitted,
+)
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.world import Layout, World
@@ -46,7 +54,7 @@ class MjxPhysics(Physics):
             # MJX-JAX has no contact sensors between bodies: forces are summed from its contacts instead.
             host = _without_sensors(self.window.spec)
         self._host = host
-        self._model = mjx.put_model(host, impl=impl)
+        self._model = uncommitted(mjx.put_model(host, impl=impl))
         if impl == "warp":
             # Warp prints a line per overflow or unconverged solve: ours are counted instead.
             self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})

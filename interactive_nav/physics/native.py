@@ -149,7 +149,7 @@ class NativePhysics(Physics):
                 **forces,
                 overflow=raised[:, [int(w) for w in _OVERFLOWS]].any(1).astype(np.int32),
                 left_out=np.zeros(size, np.int32),
-                unconverged=(iterations >= self._models[0].opt.iterations).astype(np.int32),
+                unconverged=np.greater_equal(iterations, self._models[0].opt.iterations).astype(np.int32),
                 nonfinite=nonfinite.astype(np.int32),
             ),
         )

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from interactive_nav.physics.base import uncommitted
 from interactive_nav.rendering.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
 from interactive_nav.rendering.boxes import BoxTables, box_poses
 
@@ -31,7 +32,7 @@ class WarpRenderer(Renderer):
     def __init__(self, tables: BoxTables, lens: Lens):
         self.lens, self._tables = lens, tables
         self._host = _box_model(tables.num_boxes, lens)
-        self._model = mjx.put_model(self._host, impl="warp")
+        self._model = uncommitted(mjx.put_model(self._host, impl="warp"))
         self._contexts: dict[int, object] = {}
 
     def _context(self, n: int):
@@ -108,7 +109,7 @@ class WarpColour:
         model = copy.copy(model)
         model.cam_fovy[:] = lens.fov_deg
         self._host, self._lens = model, lens
-        self._model = mjx.put_model(model, impl="warp")
+        self._model = uncommitted(mjx.put_model(model, impl="warp"))
         self._context = mjx.create_render_context(
             model,
             nworld=n,
