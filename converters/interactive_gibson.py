@@ -239,12 +239,11 @@ def plane_patch(
     points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
     cell, first = np.unique(_cells(points), axis=0, return_index=True)
     middle = (cell + 0.5) * PLANE_CELL_M
-    wanted = np.flatnonzero(
-        [tuple(c) not in seen and bool(np.all((m > low) & (m < high))) for c, m in zip(cell, middle, strict=True)]
-    )
+    inside = np.atleast_1d(((middle > low) & (middle < high)).all(axis=1))
+    wanted = np.flatnonzero([tuple(c) not in seen and bool(i) for c, i in zip(cell, inside, strict=True)])
     if given is not None:
         index = np.floor((middle - given.origin) / given.resolution_m).astype(np.int64)
-        on = ((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1)
+        on = np.atleast_1d(((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1))
         index = np.where(on[:, None], index, 0)
         wanted = wanted[on[wanted] & given.traversable[index[wanted, 1], index[wanted, 0]]]
     cell, face = cell[wanted], face[first[wanted]]

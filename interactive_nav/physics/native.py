@@ -65,6 +65,7 @@ class NativePhysics(Physics):
         self._robot, self._layout = world.robot, world.layout
         self._threads, self._sleep = threads, sleep
         self._models = tuple(copy.copy(m) for m in world.models)
+        self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must be seen, not silently replaced by the model's default.
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -149,7 +150,7 @@ class NativePhysics(Physics):
                 **forces,
                 overflow=raised[:, [int(w) for w in _OVERFLOWS]].any(1).astype(np.int32),
                 left_out=np.zeros(size, np.int32),
-                unconverged=np.greater_equal(iterations, self._models[0].opt.iterations).astype(np.int32),
+                unconverged=(iterations >= self._iterations).astype(np.int32),
                 nonfinite=nonfinite.astype(np.int32),
             ),
         )
