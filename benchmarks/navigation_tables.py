@@ -51,7 +51,7 @@ def fast_marching(
     free: np.ndarray, goal_xy: np.ndarray, fold: int = 4, radius_m: float = RADIUS_M
 ) -> np.ma.MaskedArray:
     """[80 fold, 100 fold] m, masked: second-order fast marching of a disc's centre, `fold` times as fine."""
-    import skfmm
+    import skfmm  # pyright: ignore[reportMissingImports]
 
     fine = np.kron(free, np.ones((fold, fold), bool))
     side = FINE_M / fold

@@ -44,7 +44,7 @@ class BulletScene:
 
     def __init__(self, world, qpos: np.ndarray):
         """Builds everything from the world's first scene at a given state [nq]."""
-        import pybullet as bullet
+        import pybullet as bullet  # pyright: ignore[reportMissingImports]
 
         self.bullet = bullet
         bullet.connect(bullet.DIRECT)

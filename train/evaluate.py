@@ -28,7 +28,7 @@ from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_learned, make_ya
 from train.rollout import Episodes, episode_keys, run_episodes
 from train.rows import episode_table, score_table, write_parquet
 from train.run import check_fits, make_env
-from train.run_folder import RunFolder, claim, commit
+from train.run_folder import FAILURES, RunFolder, claim, commit
 
 LEARNED = "learned"
 
@@ -256,7 +256,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         print(f"train.evaluate: {error}", file=sys.stderr)
         return 2
     console.print(score_table(rows, f"{config.run.name}: {', '.join(scene.name for scene in env.scenes)}"))
-    for name in ("nonfinite", "overflow_steps"):
+    for name in FAILURES:
         bad = int((rows[name].to_numpy() > 0).sum())
         if bad:
             console.print(f"[yellow]{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt[/]")

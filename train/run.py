@@ -28,7 +28,7 @@ from train.errors import CheckpointError, ConfigError, TrainError
 from train.files import write_text
 from train.learner import Snapshot, TrainResult, Update
 from train.progress import TrainingDisplay, describe
-from train.run_folder import RunFolder, claim, read_metrics
+from train.run_folder import FAILURES, RunFolder, claim, read_metrics
 
 LEARNERS = {"ppo": ppo.train}
 
@@ -232,6 +232,10 @@ def train_run(
         highlight=False,
         soft_wrap=True,
     )
+    lost = failures(folder)
+    if lost:
+        told = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
+        console.print(f"[yellow]what physics lost, summed over ended episodes: {told}[/]", soft_wrap=True)
     return result, folder, stops[0] if stops else None
 
 
@@ -239,6 +243,15 @@ def last_metrics(folder: RunFolder) -> dict[str, Any]:
     """The last logged line, without its step; empty if there is none."""
     lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
     return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
+
+
+def failures(folder: RunFolder) -> dict[str, float]:
+    """Steps (episodes for `nonfinite`) in which physics failed, over all logged episodes; those that are not 0."""
+    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    totals = {
+        name: sum(line.get(f"episode/{name}", 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES
+    }
+    return {name: round(total, 3) for name, total in totals.items() if total > 0}
 
 
 def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics: dict[str, Any]) -> dict[str, Any]:
@@ -254,6 +267,7 @@ def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics
         "completed": result.completed,
         "env_steps": result.snapshot.env_steps,
         "wall_s": saved[-1].wall_s if saved else None,
+        "failures": failures(folder),
         "best": dataclasses.asdict(best) if best else None,
         "metrics": metrics,
     }

@@ -38,6 +38,9 @@ MAY_CHANGE = (
 """Settings that a run may be continued with at other values: they do not change what an update does."""
 HEADROOM_MB = 64.0
 
+FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
+"""Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
+
 
 class RunFolder:
     """Paths of a run, and the small files in it."""

@@ -23,7 +23,7 @@ from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import checkpoint, run_folder
 from train.config_io import from_yaml
 from train.errors import CheckpointError, ConfigError, DivergedError, RunFolderError
-from train.run import check_fits, mean_score, train_run
+from train.run import check_fits, failures, mean_score, train_run
 from train.run_folder import RunFolder, claim, read_metrics
 
 
@@ -259,3 +259,15 @@ def test_sigterm_saves_and_kill_loses_one_interval_at_most(tmp_path):
     result, _, _ = train_run(toy_config(tmp_path, updates=total // UPDATE_STEPS), quiet(), build_env=build_toy)
     assert result.completed and result.snapshot.env_steps == total
     assert [line["env_steps"] for line in read_metrics(folder.metrics)] == list(range(256, total + 1, 256))
+
+
+def test_failures_are_summed_over_logged_episodes(tmp_path):
+    folder = RunFolder(tmp_path)
+    assert failures(folder) == {}
+    lines = [
+        {"env_steps": 10, "episodes": 4, "episode/overflow_steps": 0.25, "episode/nonfinite": 0.0},
+        {"env_steps": 20, "episodes": 2, "episode/overflow_steps": 1.5, "episode/unconverged_steps": 2.0},
+    ]
+    folder.metrics.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    # 4 x 0.25 + 2 x 1.5 = 4 and 2 x 2 = 4; what is 0 is left out.
+    assert failures(folder) == {"overflow_steps": 4.0, "unconverged_steps": 4.0}
