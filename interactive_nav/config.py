@@ -61,6 +61,8 @@ class NavConfig:
     """Physics: warp (MJX-Warp, NVIDIA), jax (MJX-JAX), native (C MuJoCo on CPU threads), or auto."""
     control_mode: str = "native"
     """What an action commands: a control mode of the robot; `native` is the original benchmark's."""
+    symmetric_actions: bool = False
+    """Action 0 commands nothing; the original's ranges are lopsided (TurtleBot's wheels: -12.5 to 25 rad/s)."""
     num_objects: int = 10
     """Small objects strewn about at random each episode."""
     small_objects: str = "train"

@@ -85,6 +85,7 @@ class InteractiveNav(Env):
             ValueError: settings that do not fit each other or the backend.
             SceneError: a scene with no room.
         """
+        robot = robot.symmetric() if config.symmetric_actions else robot
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
         self.tables = build_tables(self.world, config)

@@ -273,6 +273,11 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
         conaffinity=_FLOOR,
     )
     robot.add_to(spec)
+    if config.symmetric_actions:
+        for actuator in spec.actuators:
+            low, high = actuator.ctrlrange
+            if actuator.ctrllimited and low < 0 < high:
+                actuator.ctrlrange = [-max(-low, high), max(-low, high)]
     for geom in spec.geoms:
         if geom.name != "floor" and (geom.contype or geom.conaffinity):
             geom.contype |= _FLOOR

@@ -111,6 +111,11 @@ class RobotSpec:
         """Number of actions."""
         return len(self.action_low)
 
+    def symmetric(self) -> RobotSpec:
+        """The robot with action 0 meaning no command: each range widened to plus and minus its larger end."""
+        largest = tuple(max(abs(a), abs(b)) for a, b in zip(self.action_low, self.action_high, strict=True))
+        return dataclasses.replace(self, action_low=tuple(-x for x in largest), action_high=largest)
+
     def command(self, action, xp=np):
         """Maps actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
         low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import interactive_nav
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
@@ -21,6 +22,21 @@ def test_turtlebot_commands_and_actions_are_inverse():
     np.testing.assert_allclose(robot.command([-1.0, 1.0]), [-12.5, 25.0])
     np.testing.assert_allclose(robot.command([0.0, 5.0]), [6.25, 25.0])
     np.testing.assert_allclose(robot.action([6.25, 40.0]), [0.0, 1.0])
+
+
+def test_symmetric_actions_drive_backwards_as_fast_as_forwards(tmp_path):
+    scene = write_room(tmp_path / "room", (6.0, 3.0), ())
+    still = {"num_objects": 0, "sleep": False}
+    for symmetric, metres in ((True, -0.88), (False, -0.44)):
+        env = interactive_nav.make("turtlebot", [scene], backend="native", symmetric_actions=symmetric, **still)
+        step = jax.jit(env.step)
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+        zero = env.robot.command(np.zeros(2))
+        np.testing.assert_allclose(zero, 0.0 if symmetric else 6.25)
+        for _ in range(8):
+            state = step(state, jnp.full(2, -1.0))
+        # 25 rad/s x 0.0352 m = 0.88 m/s, 12.5 rad/s half of that; the wheels slip a little.
+        assert float(state.obs[23]) == pytest.approx(metres, rel=0.05)
 
 
 def test_turtlebot_drives_by_hand():
