@@ -295,7 +295,7 @@ def report(rows: list[dict], figure: Path) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Measures, or reports what was measured."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", default="native")
@@ -303,7 +303,7 @@ def main() -> None:
     parser.add_argument("--scene", default=SCENE)
     parser.add_argument("--scenarios", nargs="*", type=int, default=None, help="by number, 0 to 4")
     parser.add_argument("--report", action="store_true")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     console = Console()
     if args.report:
         rows = [json.loads(line) for line in RESULTS.read_text(encoding="utf-8").splitlines()]

@@ -71,6 +71,10 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
         ) from error
     if not parts:
         raise SceneRejected(f"{path}: no faces, expected a triangle mesh; fetch the model again")
+    if any(np.shape(m.vertices)[1:] != (3,) or np.shape(m.faces)[1:] != (3,) for m in parts):
+        raise SceneRejected(
+            f"{path}: vertices without three coordinates or faces that are no triangles; fetch it again"
+        )
     offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
     vertices = np.vstack([np.asarray(m.vertices, float) for m in parts])
     faces = np.vstack([np.asarray(m.faces, np.int64) + o for m, o in zip(parts, offsets, strict=True)])

@@ -256,7 +256,8 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         print(f"train.evaluate: {error}", file=sys.stderr)
         return 2
     console.print(score_table(rows, f"{config.run.name}: {', '.join(scene.name for scene in env.scenes)}"))
-    for name in FAILURES:
+    # A solve that met its iteration limit is inexact, not lost.
+    for name in FAILURES[:3]:
         bad = int((rows[name].to_numpy() > 0).sum())
         if bad:
             console.print(f"[yellow]{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt[/]")
