@@ -116,7 +116,8 @@ def test_distances_are_within_2_percent_of_fast_marching(seed):
     got = np.asarray(distances(tables, jnp.asarray(goal), jnp.asarray(xy)))
     error = got[sure] / want[sure] - 1.0
     assert np.abs(error[far[sure]]).max(initial=0.0) < 0.02
-    np.testing.assert_allclose(got[sure], want[sure], atol=0.05)
+    near = sure & ~far  # where 2 % is less than the reference's own cells
+    np.testing.assert_allclose(got[near], want[near], rtol=0.0, atol=0.05)
 
 
 @settings(max_examples=8, deadline=None)
