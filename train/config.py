@@ -36,6 +36,43 @@ class EnvConfig(NavConfig):
 
 
 @dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Encoders of observations with images (reference benchmark, section 8.1); a vector alone needs none."""
+
+    conv_channels: tuple[int, ...] = (32, 64, 64)
+    """Channels of the convolutions."""
+    conv_kernels: tuple[int, ...] = (8, 4, 3)
+    """Sides of their kernels, pixels."""
+    conv_strides: tuple[int, ...] = (4, 2, 1)
+    """Their strides, pixels."""
+    image_features: int = 256
+    """Width of the layer behind the convolutions."""
+    state_features: int = 256
+    """Width of the layer that takes the vector."""
+    action_features: int = 256
+    """Width of the layer that takes the action of a critic."""
+    share_encoder: bool = False
+    """Actor and critic look through one encoder; SAC and DDPG train it with the critic."""
+    critic_inputs: Literal["all", "state"] = "all"
+    """state: the critic takes the vector alone, the actor everything (not with share_encoder)."""
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of the image encoder; parameters stay float32."""
+
+    def __post_init__(self) -> None:
+        _require(self, "conv_channels conv_kernels conv_strides image_features state_features action_features", 1)
+        if not len(self.conv_channels) == len(self.conv_kernels) == len(self.conv_strides) > 0:
+            raise ValueError(
+                f"conv_channels, conv_kernels and conv_strides have {len(self.conv_channels)}, "
+                f"{len(self.conv_kernels)} and {len(self.conv_strides)} entries, expected the same number, at least 1"
+            )
+        if self.share_encoder and self.critic_inputs != "all":
+            raise ValueError(
+                f"share_encoder is true and critic_inputs is {self.critic_inputs!r}, expected 'all': "
+                "who shares an encoder sees the same"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
 class PPOConfig:
     """Proximal policy optimisation; names as in Brax's `ppo.train`."""
 
@@ -74,9 +111,9 @@ class PPOConfig:
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
     policy_hidden_layer_sizes: tuple[int, ...] = (256, 256)
-    """Widths of the policy network."""
+    """Widths of the policy network, behind its encoder if there are images."""
     value_hidden_layer_sizes: tuple[int, ...] = (256, 256)
-    """Widths of the value network."""
+    """Widths of the value network, behind its encoder if there are images."""
 
     def __post_init__(self) -> None:
         _require(self, "num_envs unroll_length batch_size num_minibatches num_updates_per_batch", 1)
@@ -134,6 +171,8 @@ class TrainConfig:
     """The task."""
     algorithm: Literal["ppo"] = "ppo"
     """Learner."""
+    network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+    """Encoders of images."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
     """The learner's settings."""
     run: RunConfig = dataclasses.field(default_factory=RunConfig)
