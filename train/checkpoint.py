@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ class CheckpointMeta:
     algorithm: str
     robot: str
     observations: tuple[str, ...]
-    observation_size: int
+    observation_size: int | dict[str, list[int]]
+    """Length of the vector, or with images the shape under each key."""
     action_size: int
 
 
@@ -160,6 +162,11 @@ def load_env_state(folder: Path, template: Any) -> Any | None:
         for array, leaf in zip(arrays, leaves, strict=True)
     ]
     return jax.tree.unflatten(structure, restored)
+
+
+def plain_size(size: int | Mapping[str, tuple[int, ...]]) -> int | dict[str, list[int]]:
+    """An observation's size as JSON holds it."""
+    return {name: list(shape) for name, shape in size.items()} if isinstance(size, Mapping) else int(size)
 
 
 def megabytes(tree: Any) -> float:

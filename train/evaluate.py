@@ -18,7 +18,8 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
 from interactive_nav.episodes import load as load_episodes
-from train import checkpoint, config_io, ppo
+from train import checkpoint, config_io
+from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig
 from train.errors import ConfigError, TrainError
@@ -43,10 +44,9 @@ def load_policy(
     """
     path, meta = checkpoint.find(folder.checkpoints, which)
     check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)
-    parts = ppo.make_parts(config.ppo, int(env.observation_size), env.action_size)
-    key = jax.random.PRNGKey(0)  # only shapes matter: every number is replaced
-    learner = checkpoint.load_learner(path, ppo.init(parts, key, key))
-    return make_learned(ppo.make_policy(parts, learner, deterministic)), meta
+    algorithm = ALGORITHMS[config.algorithm]
+    learner = checkpoint.load_learner(path, algorithm.template(env, config))
+    return make_learned(algorithm.policy(env, config, learner, deterministic)), meta
 
 
 def evaluate(

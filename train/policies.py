@@ -1,13 +1,14 @@
 """Observation and key in, action out: the learned policy and two yardsticks that never learned.
 
-Every policy is a pure function (observation (O,), key) -> action (A,) in [-1, 1] of one environment; batch it
-with `jax.vmap` and a key for each, so that an episode does not depend on which others run beside it.
+Every policy is a pure function (observation, key) -> action (A,) in [-1, 1] of one environment, its observation
+a vector (O,) or a dict with images; batch it with `jax.vmap` and a key for each, so that an episode does not
+depend on which others run beside it.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -17,7 +18,8 @@ from interactive_nav.robots import RobotSpec
 from train.errors import TrainError
 from train.planners import Planner
 
-PolicyFn = Callable[[jax.Array, jax.Array], jax.Array]
+Observation = jax.Array | Mapping[str, jax.Array]
+PolicyFn = Callable[[Observation, jax.Array], jax.Array]
 
 LOOK_AHEAD_M = 0.4
 CRUISE_M_S = 0.5
@@ -27,7 +29,7 @@ ALIGNED_RAD = jnp.pi / 3
 """Beyond this bearing the follower turns on the spot."""
 
 
-def random_policy(action_size: int, observation: jax.Array, key: jax.Array) -> jax.Array:
+def random_policy(action_size: int, observation: Observation, key: jax.Array) -> jax.Array:
     """Uniform over all actions."""
     del observation
     return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
@@ -52,10 +54,11 @@ def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
     return robot.drive(speed_m_s, turn_rad_s, jnp)
 
 
-def waypoint_follower(robot: RobotSpec, waypoint: int, observation: jax.Array, key: jax.Array) -> jax.Array:
+def waypoint_follower(robot: RobotSpec, waypoint: int, observation: Observation, key: jax.Array) -> jax.Array:
     """Steers to one of the waypoints that lead the observation (numbers 2i and 2i + 1); sees no object."""
     del key
-    return steer(robot, observation[2 * waypoint : 2 * waypoint + 2])
+    vector = observation["state"] if isinstance(observation, Mapping) else observation
+    return steer(robot, vector[2 * waypoint : 2 * waypoint + 2])
 
 
 def make_random(env: Any) -> PolicyFn:

@@ -25,13 +25,25 @@ import jax.numpy as jnp
 import optax
 from brax.envs import Env
 from brax.training import acting, gradients, types
-from brax.training.acme import running_statistics, specs
+from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import optimizer as ppo_optimizer
 
-from train.config import PPOConfig, TrainConfig
+from train import networks as nets
+from train.config import NetworkConfig, PPOConfig, TrainConfig
 from train.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
+
+
+@flax.struct.dataclass
+class SharedParams:
+    """Parameters of an actor and a critic that look through one encoder."""
+
+    encoder: Any
+    policy: Any
+    """Head of the policy."""
+    value: Any
+    """Head of the value."""
 
 
 @flax.struct.dataclass
@@ -39,7 +51,7 @@ class PPOState:
     """All that learning changes."""
 
     optimizer_state: optax.OptState
-    params: ppo_losses.PPONetworkParams
+    params: ppo_losses.PPONetworkParams | SharedParams
     normalizer_params: running_statistics.RunningStatisticsState
     key: jax.Array
 
@@ -49,9 +61,16 @@ class PPOParts:
     """All that learning does not change."""
 
     config: PPOConfig
-    networks: ppo_networks.PPONetworks
+    nets: nets.ActorCritic
     optimizer: optax.GradientTransformation
-    observation_size: int
+    observation_size: nets.ObservationSize
+    shared: bool = False
+    """Actor and critic have one encoder."""
+
+    @property
+    def networks(self) -> ppo_networks.PPONetworks:
+        """As Brax takes them, of observations."""
+        return self.nets.networks
 
     @property
     def steps_per_update(self) -> int:
@@ -61,43 +80,70 @@ class PPOParts:
         return c.batch_size * c.num_minibatches * c.unroll_length
 
 
-def make_parts(config: PPOConfig, observation_size: int, action_size: int) -> PPOParts:
-    """Networks and optimiser for a flat observation of the given size."""
-    normalize = running_statistics.normalize if config.normalize_observations else lambda x, y: x
-    networks = ppo_networks.make_ppo_networks(
+def make_parts(
+    config: PPOConfig,
+    observation_size: nets.ObservationSize,
+    action_size: int,
+    network: NetworkConfig | None = None,
+) -> PPOParts:
+    """Networks and optimiser for observations of the given size.
+
+    Args:
+        config: resolved or not; sizes of batches are not read.
+        observation_size: length of the vector, or with images the shape under each key.
+        action_size: number of actions.
+        network: encoders of images.
+
+    Raises:
+        ValueError: the encoders do not fit the images.
+    """
+    network = network or NetworkConfig()
+    made = nets.make_ppo_networks(
+        network,
         observation_size,
         action_size,
-        preprocess_observations_fn=normalize,  # type: ignore[arg-type]
-        policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
-        value_hidden_layer_sizes=config.value_hidden_layer_sizes,
+        config.policy_hidden_layer_sizes,
+        config.value_hidden_layer_sizes,
+        config.normalize_observations,
     )
     adam = optax.adam(config.learning_rate)
     if config.learning_rate_schedule == "adaptive_kl":
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
-    return PPOParts(config, networks, optimizer, observation_size)
+    return PPOParts(config, made, optimizer, observation_size, network.share_encoder and made.policy is not None)
 
 
 def init(parts: PPOParts, key_networks: jax.Array, key: jax.Array) -> PPOState:
     """A learner that has learned nothing; `key` is what its updates will draw from."""
     key_policy, key_value = jax.random.split(key_networks)
-    params = ppo_losses.PPONetworkParams(
-        policy=parts.networks.policy_network.init(key_policy),  # type: ignore[call-arg]
-        value=parts.networks.value_network.init(key_value),  # type: ignore[call-arg]
-    )
-    observation = specs.Array((parts.observation_size,), jnp.dtype("float32"))
+    policy = parts.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
+    value = parts.networks.value_network.init(key_value)  # type: ignore[call-arg]
+    if parts.shared:
+        params: Any = SharedParams(encoder=policy["encoder"], policy=policy["head"], value=value["head"])
+    else:
+        params = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
     return PPOState(
-        optimizer_state=parts.optimizer.init(params),  # type: ignore[arg-type]
+        optimizer_state=parts.optimizer.init(params),
         params=params,
-        normalizer_params=running_statistics.init_state(observation),
+        normalizer_params=nets.init_normalizer(parts.observation_size),
         key=key,
     )
 
 
+def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[Any, Any]:
+    """Parameters of the policy and the value network as `PPOParts.networks` take them."""
+    if isinstance(params, SharedParams):
+        return (
+            {"encoder": params.encoder, "head": params.policy},
+            {"encoder": params.encoder, "head": params.value},
+        )
+    return params.policy, params.value
+
+
 def make_policy(parts: PPOParts, state: PPOState, deterministic: bool) -> types.Policy:
-    """(observation [N, O], key) -> (action [N, A] in [-1, 1], extras)."""
+    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
     make = ppo_networks.make_inference_fn(parts.networks)
-    return make((state.normalizer_params, state.params.policy, state.params.value), deterministic)
+    return make((state.normalizer_params, *whole_params(state.params)), deterministic)
 
 
 def collect(
@@ -108,7 +154,7 @@ def collect(
     Returns:
         The environments' new state; transitions with leaves [sequences, time, ...]; sums over ended episodes.
     """
-    policy, config = make_policy(parts, state, deterministic=False), parts.config
+    act, config = make_policy(parts, state, deterministic=False), parts.config
     assert config.batch_size and config.num_minibatches and config.num_envs
 
     def unroll(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], Any]:
@@ -117,7 +163,7 @@ def collect(
         env_state, data = acting.generate_unroll(
             env,
             env_state,
-            policy,
+            act,
             key,
             config.unroll_length or 0,
             extra_fields=("truncation", "episode_metrics", "episode_done"),
@@ -140,6 +186,29 @@ def collect(
     return env_state, data, jax.tree.map(jnp.sum, sums)
 
 
+def _heads(parts: PPOParts) -> ppo_networks.PPONetworks:
+    assert parts.nets.policy and parts.nets.value
+    return parts.networks.replace(policy_network=parts.nets.policy.head, value_network=parts.nets.value.head)
+
+
+def shared_loss(
+    params: SharedParams,
+    normalizer_params: Any,
+    data: types.Transition,
+    key: jax.Array,
+    *,
+    encode: Any,
+    **settings: Any,
+) -> tuple[jax.Array, types.Metrics]:
+    """Brax's loss of the two heads, on features that are computed once."""
+    data = data._replace(
+        observation=encode(normalizer_params, params.encoder, data.observation),
+        next_observation=encode(normalizer_params, params.encoder, data.next_observation),
+    )
+    heads = ppo_losses.PPONetworkParams(policy=params.policy, value=params.value)  # type: ignore[call-arg]
+    return ppo_losses.compute_ppo_loss(heads, None, data, key, **settings)
+
+
 def minibatch_step(
     parts: PPOParts, normalizer_params: Any, carry: tuple[Any, Any, jax.Array], data: types.Transition
 ) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
@@ -148,8 +217,9 @@ def minibatch_step(
     key, key_loss = jax.random.split(key)
     config = parts.config
     loss_fn = functools.partial(
-        ppo_losses.compute_ppo_loss,
-        ppo_network=parts.networks,
+        shared_loss if parts.shared else ppo_losses.compute_ppo_loss,
+        ppo_network=_heads(parts) if parts.shared else parts.networks,
+        **({"encode": parts.nets.policy.encoder.apply} if parts.shared and parts.nets.policy else {}),
         entropy_cost=config.entropy_cost,
         discounting=config.discounting,
         reward_scaling=config.reward_scaling,
@@ -203,7 +273,7 @@ def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[
     env_state, data, sums = collect(parts, env, state, env_state, key_unroll)
     # As in Brax: with adaptive_kl the old policy's outputs must stay comparable, so normalise afterwards.
     late = parts.config.learning_rate_schedule == "adaptive_kl"
-    seen = running_statistics.update(state.normalizer_params, data.observation)
+    seen = nets.update_normalizer(state.normalizer_params, data.observation)
     normalizer_params = state.normalizer_params if late else seen
     (optimizer_state, params, _), losses = jax.lax.scan(
         functools.partial(sgd_pass, parts, data, normalizer_params),
@@ -230,6 +300,22 @@ def reset_envs(parts: PPOParts, env: Env, key: jax.Array) -> Any:
     return jax.jit(env.reset)(jax.random.split(key, parts.config.num_envs or 1))
 
 
+def parts_of(env: Any, config: TrainConfig) -> PPOParts:
+    """`make_parts` for an environment and a whole config."""
+    return make_parts(config.ppo, env.observation_size, env.action_size, config.network)
+
+
+def template(env: Any, config: TrainConfig) -> PPOState:
+    """A learner in the shapes that its checkpoints have."""
+    key = jax.random.PRNGKey(0)
+    return init(parts_of(env, config), key, key)
+
+
+def policy(env: Any, config: TrainConfig, learner: PPOState, deterministic: bool) -> types.Policy:
+    """What a learner has learned: see `make_policy`."""
+    return make_policy(parts_of(env, config), learner, deterministic)
+
+
 def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
     """Trains a policy.
 
@@ -238,7 +324,7 @@ def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
         config: resolved, see `train.config.resolve`.
         callbacks: progress, files and signals.
     """
-    parts = make_parts(config.ppo, int(env.observation_size), env.action_size)  # type: ignore[arg-type]
+    parts = parts_of(env, config)
     begin = start(parts, env, config.run.seed)
     restored = callbacks.restore(begin)
     if restored is not None:

@@ -21,7 +21,8 @@ from tensorboardX import SummaryWriter
 
 import interactive_nav
 from interactive_nav.wrappers import AutoResetEnv
-from train import checkpoint, ppo
+from train import checkpoint
+from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
 from train.errors import CheckpointError, ConfigError, TrainError
@@ -29,8 +30,6 @@ from train.files import write_text
 from train.learner import Snapshot, TrainResult, Update
 from train.progress import TrainingDisplay, describe
 from train.run_folder import FAILURES, RunFolder, claim, read_metrics
-
-LEARNERS = {"ppo": ppo.train}
 
 
 def make_env(config: EnvConfig) -> Any:
@@ -133,7 +132,7 @@ class FolderCallbacks:
             algorithm=self._config.algorithm,
             robot=self._config.env.robot,
             observations=self._config.env.observations,
-            observation_size=int(self._env.observation_size),
+            observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
         )
         checkpoint.save(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
@@ -166,7 +165,7 @@ def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) ->
     facts = (
         ("robot", meta.robot, config.robot),
         ("observations", meta.observations, config.observations),
-        ("observation size", meta.observation_size, int(env.observation_size)),
+        ("observation size", meta.observation_size, checkpoint.plain_size(env.observation_size)),
         ("action size", meta.action_size, int(env.action_size)),
     )
     for name, got, expected in facts:
@@ -211,14 +210,14 @@ def train_run(
     exists = folder.open(config)
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
-        f"{len(config.env.scenes)} scene(s), backend {env.backend}, {config.ppo.num_envs} environments",
+        f"{len(config.env.scenes)} scene(s), backend {env.backend}, {num_envs(config)} environments",
         highlight=False,
         soft_wrap=True,
     )
     with stop_signals() as stops, TrainingDisplay(console) as display:
         callbacks = FolderCallbacks(folder, config, env, display, stops)
         try:
-            result = LEARNERS[config.algorithm](wrap_env(env), config, callbacks)
+            result = ALGORITHMS[config.algorithm].train(wrap_env(env), config, callbacks)
         finally:
             callbacks.close()
     metrics = result.metrics or last_metrics(folder)
@@ -237,6 +236,11 @@ def train_run(
         told = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
         console.print(f"[yellow]what physics lost, summed over ended episodes: {told}[/]", soft_wrap=True)
     return result, folder, stops[0] if stops else None
+
+
+def num_envs(config: TrainConfig) -> int:
+    """Environments that the config's learner steps together."""
+    return getattr(config, config.algorithm).num_envs
 
 
 def last_metrics(folder: RunFolder) -> dict[str, Any]:
