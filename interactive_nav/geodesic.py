@@ -262,6 +262,10 @@ def _corners(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points).astype(float), np.concatenate(into).astype(float)
 
 
+_CELLS_APART = 2**0.5
+"""The middles of two points' cells lie at most this much farther apart than the points, in cells."""
+
+
 def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Which pairs of points see each other over free cells.
 
@@ -271,23 +275,26 @@ def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         b: [P, 2] likewise.
 
     Returns:
-        [P] bool. Halving: the middle first, so that most blocked pairs cost a few samples.
+        [P] bool. Halving: the middle first, so that most blocked pairs cost a few samples; a part that lies
+        within what is known to be free around its middle is not halved further.
     """
-    rows, columns = free.shape
+    free = np.pad(free, 1)
+    columns = free.shape[1]
+    flat, clear = free.ravel(), clearance(free, 1.0).ravel()
+    step = b - a
+    length = np.linalg.norm(step, axis=-1)
     out = np.ones(len(a), bool)
-    length = np.linalg.norm(b - a, axis=-1)
-    alive, parts = np.arange(len(a)), 1
-    while len(alive):
-        shares = (np.arange(parts) + 0.5) / parts
-        for share in shares:
-            at = a[alive] + share * (b[alive] - a[alive])
-            c, r = np.floor(at).astype(int).T
-            inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
-            ok = inside & free[np.clip(r, 0, rows - 1), np.clip(c, 0, columns - 1)]
-            out[alive[~ok]] = False
-            alive = alive[ok]
-        parts *= 2
-        alive = alive[length[alive] > _SIGHT_STEP * parts / 2]
+    low, high = -1.0, np.asarray(free.shape[::-1], float) - 2.0
+    pair, middle, half = np.arange(len(a)), np.full(len(a), 0.5), 0.5
+    while len(pair):
+        at = np.clip(a[pair] + middle[:, None] * step[pair], low, high)
+        cell = np.floor(at).astype(np.intp) + 1
+        index = cell[:, 1] * columns + cell[:, 0]
+        out[pair[~flat[index]]] = False
+        reach = length[pair] * half
+        open_ = out[pair] & (2 * reach > _SIGHT_STEP) & (reach + _CELLS_APART >= clear[index])
+        pair, middle, half = pair[open_], middle[open_], half / 2
+        pair, middle = np.repeat(pair, 2), np.stack([middle - half, middle + half], -1).ravel()
     return out
 
 

@@ -64,6 +64,29 @@ def test_field_is_vmappable_over_goals_and_refuses_bad_maps():
         geodesic.distance_field(free, 0, (0.5, 0.5))
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_sight_is_that_of_samples_all_along_the_line(seed):
+    """Against every line sampled one by one, where its middle halves fall, at most a cell apart."""
+    rng = np.random.default_rng(seed)
+    free = np.ones((30, 40), bool)
+    for _ in range(5):
+        row, column, height, width = (int(rng.integers(*span)) for span in ((0, 30), (0, 40), (1, 12), (1, 6)))
+        free[row : row + height, column : column + width] = False
+    a, b = rng.uniform(-1.0, (41.0, 31.0), (2, 200, 2))
+    want = []
+    for start, end in zip(a, b, strict=True):
+        parts = 1
+        while np.linalg.norm(end - start) > parts:
+            parts *= 2
+        shares = np.concatenate([(np.arange(2**k) + 0.5) / 2**k for k in range(parts.bit_length())])
+        column, row = np.floor(start + shares[:, None] * (end - start)).astype(int).T
+        inside = (row >= 0) & (row < 30) & (column >= 0) & (column < 40)
+        want.append(bool((inside & free[row.clip(0, 29), column.clip(0, 39)]).all()))
+    np.testing.assert_array_equal(geodesic.sees(free, a, b), want)
+    assert 0.05 < np.mean(want) < 0.95
+
+
 MOST_CORNERS, MOST_SEEN, CELLS = 160, 80, (40, 50)
 
 
