@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax.numpy as jnp
@@ -180,7 +181,8 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
     Raises:
         SceneError: a scene with no room for the robot, or for a start and a goal.
     """
-    places = [_scene_places(world, i, config) for i in range(len(world.scenes))]
+    with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
+        places = list(pool.map(lambda i: _scene_places(world, i, config), range(len(world.scenes))))
     layout, slots = world.layout, world.layout.num_slots
     com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
     hinge = {
