@@ -76,6 +76,8 @@ def build_visual(world: World, scene: int) -> VisualModel:
                 rgba=[*PALETTE[class_id(obj.category)], 1.0],
             )
     spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
+    for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
+        spec.delete(camera)
     spec.worldbody.add_camera(name="view", fovy=60.0)
     spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
     # The clipping planes are given as shares of the extent.

@@ -1,6 +1,7 @@
 """C MuJoCo, MJX-JAX and MJX-Warp step the same toy scenes alike; the two upstream limits that we work round."""
 
 import dataclasses
+import functools
 import importlib.util
 from typing import Any
 
@@ -19,6 +20,7 @@ from interactive_nav.physics import native as native_backend
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from interactive_nav.world import build_world
+from interactive_nav.wrappers import AutoResetEnv
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
@@ -295,3 +297,61 @@ def test_warp_is_refused_with_the_remedy_where_it_is_missing(monkeypatch):
     with pytest.raises(ValueError, match="install the gpu extra"):
         resolve_backend("warp")
     assert "turtlebot" in interactive_nav.robot_names()
+
+
+HOST_PRIMITIVES = ("callback", "outside_call", "infeed", "outfeed")
+
+
+def host_primitives(jaxpr) -> set[str]:
+    """Names of what leaves the device in a program, its inner programs included."""
+    found = set()
+    for equation in jaxpr.eqns:
+        name = equation.primitive.name
+        if any(word in name for word in HOST_PRIMITIVES):
+            found.add(name)
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                found |= host_primitives(inner)
+    return found
+
+
+@pytest.mark.slow
+def test_the_loop_is_traced_once_and_never_leaves_the_device(tmp_path):
+    """Steps with episodes ending among them: one program, and nothing passes between host and device."""
+    room = write_room(tmp_path / "room", (3.0, 3.0), ())
+    traced = []
+
+    class Counted(AutoResetEnv):
+        def step(self, state, action):
+            traced.append(1)
+            return super().step(state, action)
+
+    env = Counted(interactive_nav.make("turtlebot", [room], backend="jax", num_objects=1, episode_steps=2))
+    native = AutoResetEnv(interactive_nav.make("turtlebot", [room], backend="native", num_objects=1, episode_steps=2))
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    state, action = jax.jit(env.reset)(keys), jnp.full((2, 2), 0.3)
+
+    def loop(env, state, action):
+        def one(state, _):
+            state = env.step(state, action)
+            return state, state.info["episode_done"]
+
+        return jax.lax.scan(one, state, None, length=3)
+
+    # The measure sees what it looks for: C MuJoCo is called from the host.
+    seen = jax.make_jaxpr(functools.partial(loop, native))(jax.jit(native.reset)(keys), action)
+    assert host_primitives(seen.jaxpr) == {"pure_callback"}
+    assert host_primitives(jax.make_jaxpr(functools.partial(loop, env))(state, action).jaxpr) == set()
+
+    traced.clear()
+    run = jax.jit(functools.partial(loop, env)).lower(state, action).compile()
+    assert "callback" not in run.as_text()
+    state, done = run(state, action)  # takes the scenes' tables to the device
+    ended = [done]
+    with jax.transfer_guard("disallow"):
+        for _ in range(2):
+            state, done = run(state, action)
+            ended.append(done)
+    assert len(traced) == 1
+    np.testing.assert_array_equal(np.concatenate(ended)[:, 0], [0, 1, 0, 1, 0, 1, 0, 1, 0])

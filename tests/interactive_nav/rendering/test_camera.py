@@ -1,5 +1,6 @@
 """Pictures for people, drawn by rays: they run everywhere, so do these tests."""
 
+import importlib.util
 import types
 
 import jax
@@ -92,3 +93,16 @@ def test_normals_and_colours_of_boxes(world, boxes):
     # The floor is lit fully by the sun (0.9 / |l| of 0.4) and not by the lamp.
     sun = 0.9 / np.linalg.norm([0.35, 0.25, 0.9])
     np.testing.assert_allclose(rgb[-1, 20], 255 * PALETTE[FLOOR] * (0.45 + 0.4 * sun), atol=1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="the package warp-lang (extra 'warp') is absent")
+def test_mjx_warp_draws_the_same_colours(scene_and_state):
+    """Lamps and the floor differ between the two; what is where, and in which colour, does not."""
+    env, state = scene_and_state
+    drawn = Camera(env, "warp").frame(state, 32, 24, ("rgb",), view="top")["rgb"]
+    rays = Camera(env, "rays").frame(state, 32, 24, ("rgb", "segmentation"), view="top")
+    assert drawn.shape == (24, 32, 3) and drawn.dtype == np.uint8
+    chair, table = rays["segmentation"] == 2, rays["segmentation"] == 4
+    got, want = (picture[chair].mean(0) - picture[table].mean(0) for picture in (drawn.astype(float), rays["rgb"]))
+    assert got @ want / (np.linalg.norm(got) * np.linalg.norm(want)) > 0.95
