@@ -12,6 +12,7 @@ from rich.console import Console
 
 from interactive_nav import replay
 from tests.toys import write_room
+from tests.train.toy_pixels import SMALL
 from tests.train.toy_run import UPDATE_STEPS, toy_config
 from train import checkpoint, evaluate
 from train import replay as replay_program
@@ -69,6 +70,35 @@ def test_train_resume_and_evaluate(tmp_path, capsys):
     assert "observations of the checkpoint: " in capsys.readouterr().err
     assert evaluate.main([str(folder.path), "--scenes", str(tmp_path / "absent")]) == 2
     assert str(tmp_path / "absent") in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_policy_that_sees_trains_and_is_scored(tmp_path, capsys):
+    room = write_room(tmp_path / "room")
+    toy = toy_config(tmp_path / "runs", updates=1)
+    env = EnvConfig(
+        scenes=(str(room),),
+        backend="native",
+        episode_steps=6,
+        num_objects=1,
+        observations=("waypoints", "goal", "velocity", "depth", "segmentation"),
+        image_size=12,
+        image_dtype="uint8",
+    )
+    config = TrainConfig(env=env, network=SMALL, ppo=toy.ppo, run=toy.run)
+    result, folder, _ = train_run(config, Console(file=io.StringIO()))
+    assert result.completed
+    meta = checkpoint.list_checkpoints(folder.checkpoints)[-1]
+    images = {"pixels/depth": [12, 12, 1], "pixels/segmentation": [12, 12, 1]}
+    assert meta.observation_size == {"state": [29], **images}
+    assert evaluate.main([str(folder.path), "--episodes", "2", "--policies", "learned,follower"]) == 0
+    rows = pq.read_table(folder.path / "evaluation" / "episodes.parquet").to_pydict()
+    assert rows["policy"] == ["learned", "learned", "follower", "follower"]
+    assert (np.array(rows["nonfinite"]) == 0).all()
+    # Another eye does not fit what was learned.
+    capsys.readouterr()
+    assert evaluate.main([str(folder.path), "--episodes", "2", "env.image_size=16"]) == 2
+    assert "observation size of the checkpoint: {'state': [29], 'pixels/depth': [12, 12, 1]" in capsys.readouterr().err
 
 
 def test_a_run_that_cannot_begin_leaves_no_folder(tmp_path, capsys):
