@@ -1,4 +1,4 @@
-"""Imports run one way: converters and interactive_nav know only the schema; train knows interactive_nav."""
+"""Imports run one way: converters and interactive_nav know only the schema; train knows interactive_nav; and so on."""
 
 import ast
 from pathlib import Path
@@ -9,6 +9,7 @@ MAY_IMPORT = {
     "converters": {"scenes_mjcf"},
     "interactive_nav": {"scenes_mjcf"},
     "train": {"interactive_nav", "scenes_mjcf"},
+    "topological_nav": {"interactive_nav", "train", "scenes_mjcf"},
 }
 
 
