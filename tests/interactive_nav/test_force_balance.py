@@ -158,13 +158,13 @@ def run(world, config, backend, cases=slice(None)) -> Push:
 
 
 def assert_balanced(push: Push):
-    # Newton's second law in every control step, all three components: 1e-4 of the floor's friction (float32 speeds).
+    # Newton's second law in every control step, all three components, to 0.1 % of the floor's friction.
     weight = np.zeros_like(push.robot_n)
     weight[..., 2] = -(push.kg * G)[:, None]
     gained = push.kg[:, None] * np.diff(push.velocity_m_s, axis=0)
     given = (push.robot_n + push.floor_n + weight).mean(2) * PERIOD_S
     scale = push.friction * push.kg * G * PERIOD_S
-    assert (np.abs(given - gained).max((0, 2)) < 1e-4 * scale).all()
+    assert (np.abs(given - gained).max((0, 2)) < 1e-3 * scale).all()
     # At constant speed the push is the floor's friction.
     assert (push.velocity_m_s.mean(0)[:, 0] > 0.05).all()
     np.testing.assert_allclose(push.horizontal_n(push.robot_n), push.horizontal_n(push.floor_n), rtol=0.05)
