@@ -8,6 +8,7 @@ time shows, whatever the floor's friction happens to be.
 import copy
 import dataclasses
 import importlib.util
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +113,7 @@ def _read_both(physics, world):
         )
 
 
-def run(world, config, backend, cases=slice(None)) -> Push:
+def run(world, config, backend, cases: Sequence[int] = range(len(CASES))) -> Push:
     seen = []
     real = base.summarise_forces
 
@@ -123,6 +124,7 @@ def run(world, config, backend, cases=slice(None)) -> Push:
             jax.debug.callback(lambda f: seen.append(np.asarray(f)), force_w)
         return real(xp.split(force_w, 2, -2)[0], xp, contacts, options)
 
+    cases = list(cases)
     scene, wheel = SCENE[cases], WHEEL[cases]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_backend, "summarise_forces", watched)
@@ -182,6 +184,12 @@ def test_fifteen_pushes_balance_on_native(tmp_path):
     share = push.horizontal_n(push.robot_n) / push.coulomb_n
     assert (np.abs(share[WHEEL > 4.0][FRICTION[WHEEL > 4.0] < 0.8] - 1.0) < 0.05).all()
     assert (share < 1.05).all() and share.min() < 0.9
+    # A force read in the last substep only, or lost in one of them, would be seen.
+    lost = push.robot_n.copy()
+    lost[:, :, 0] = 0.0
+    for wrong in (np.repeat(push.robot_n[:, :, -1:], lost.shape[2], 2), lost):
+        with pytest.raises(AssertionError):
+            assert_balanced(dataclasses.replace(push, robot_n=wrong))
 
 
 def test_small_steps_and_round_cones_give_coulombs_friction(tmp_path):

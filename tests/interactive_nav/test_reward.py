@@ -64,7 +64,7 @@ def test_any_batch_axes_numpy_and_jax_alike():
         0
     ]
     assert want.shape == (5, 4, 3) and want[2, 1, 0] == pytest.approx(one)
-    call = jax.jit(jax.vmap(lambda *x: interactive_navigation_reward(*x, 0.1, 7.0)))
+    call = jax.jit(jax.vmap(lambda s, b, a, t: interactive_navigation_reward(s, b, a, t, 0.1, 7.0)))
     got, got_terms = call(*(jnp.asarray(x) for x in (success, before, after, touching)))
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
     for name, term in terms.items():
