@@ -13,18 +13,42 @@ Array = Any
 
 
 def success_reward(success: Array, success_value: float = 10.0) -> Array:
-    """R_suc: `success_value` on the step that reaches the goal, else 0. Shapes: [...] -> [...]."""
+    """R_suc (paper section V-A): `success_value` on the step that reaches the goal, else 0.
+
+    Args:
+        success: [...] 1 or True on that step.
+        success_value: no unit.
+
+    Returns:
+        [...] 0 or `success_value`.
+    """
     return _xp(success).asarray(success) * success_value
 
 
 def potential_reward(geodesic_before_m: Array, geodesic_after_m: Array) -> Array:
-    """R_pot = GD_{t-1} - GD_t, metres of geodesic progress (static structure only). [...] -> [...]."""
+    """R_pot = GD_{t-1} - GD_t (paper section V-A): geodesic progress among static structure.
+
+    Args:
+        geodesic_before_m: [...] distance to the goal before the step, metres.
+        geodesic_after_m: [...] after it, metres.
+
+    Returns:
+        [...] metres, negative where the robot went away; over an episode it adds up to first less last distance.
+    """
     xp = _xp(geodesic_before_m, geodesic_after_m)
     return xp.asarray(geodesic_before_m) - xp.asarray(geodesic_after_m)
 
 
 def interaction_reward(interacts: Array, k_int: float) -> Array:
-    """R_int = -k_int on a step in which the robot touches a movable object, else 0. [...] -> [...]."""
+    """R_int = -k_int * 1_int (paper section V-A), for a step in which the robot interacts with objects.
+
+    Args:
+        interacts: [...] 1 or True on such a step.
+        k_int: penalty, no unit; the paper's are 0, 0.1 and 1.
+
+    Returns:
+        [...] -k_int or 0.
+    """
     return -k_int * _xp(interacts).asarray(interacts)
 
 

@@ -107,11 +107,13 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
         kind, _, weight = policy.partition(":")
         colour = "0.25" if kind == "namo" else _colour(policy, k)
         axis.errorbar(x.mean(), y.mean(), bars[1], bars[0], fmt="o", color=colour, capsize=2, linewidth=0.9)
+        right = kind == "namo" or x.mean() < 0.2  # the avoider's point lies close to that of w = 1
         axis.annotate(
             f"w = {float(weight):g}" if kind == "namo" else policy,
             (x.mean(), y.mean()),
-            xytext=(6, 5),
+            xytext=(6, 5) if right else (-6, 5),
             textcoords="offset points",
+            ha="left" if right else "right",
             fontsize=8,
             color=colour,
         )
@@ -206,7 +208,8 @@ def figures_of(results: Path) -> Iterator[tuple[str, Figure]]:
             yield f"frontier_{run}", frontier(rows, f"{scenes}, {episodes} episodes a policy")
     for path in records:
         with np.load(path) as stored:
-            if "policies" in stored.files:
+            first = f"{stored['policies'][0]}/goal_xy_w" if "policies" in stored.files else ""
+            if first and len(stored[first]):
                 run = path.parent.parent.name if path.parent.name == "evaluation" else path.stem
                 yield f"trajectories_{run}", trajectories(dict(stored))
 

@@ -86,7 +86,7 @@ def run_episodes(
     finished = np.zeros(count, bool)
     planner = policy if isinstance(policy, Planner) else None
     chunk = None if isinstance(policy, Planner) else jax.jit(functools.partial(_play_chunk, env, policy))
-    one_step = jax.jit(functools.partial(_play_step, env)) if planner else None
+    one_step = _planned_step(env) if planner else None
     step = 0
     while not finished.all():
         ended_here = jnp.asarray(finished[episode_of])
@@ -120,6 +120,12 @@ def run_episodes(
         object_end_w=object_end[:record],
     )
     return Episodes(first.scene_index, metrics, paths)
+
+
+@functools.lru_cache(maxsize=1)
+def _planned_step(env: Any) -> Any:
+    """Compiled once for all planners of an environment: nothing of them is in it."""
+    return jax.jit(functools.partial(_play_step, env))
 
 
 def _play_step(env: Any, carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:

@@ -312,3 +312,15 @@ def test_unchecked_goals_may_lie_under_furniture_and_objects_may_face_alike(push
     env = interactive_nav.make("turtlebot", [pushed], backend="native", num_objects=3, random_object_yaw=False)
     draws = jax.vmap(env.draw_start)(jax.random.split(jax.random.PRNGKey(1), 20))
     assert (np.asarray(draws.small_yaw_rad) == 0).all() and np.asarray(draws.start_yaw_rad).std() > 0.5
+
+
+def test_desks_are_tables_in_the_mask_unless_five_classes_are_asked_for(tmp_path):
+    blocks = (("desk", 0.8, 0.5, 9.0, 0.5), ("table", 0.8, -0.5, 9.0, 0.5))
+    scene = write_room(tmp_path / "desks", (4.0, 3.0), blocks)
+    for classes, ids in ((4, {0, 4}), (5, {0, 4, 11})):
+        env = make(scene, observations=("segmentation",), segmentation_classes=classes, image_size=20)
+        state = jax.jit(jax.vmap(env.reset_to))(start(), jax.random.split(jax.random.PRNGKey(0), N))
+        mask = np.asarray(state.obs["pixels/segmentation"])[0, ..., 0] * 11
+        assert set(np.round(mask).astype(int).ravel()) == ids
+        if classes == 5:  # y to the left: the desk is in the left half of the picture
+            assert (np.round(mask) == 11)[:, :10].any() and not (np.round(mask) == 11)[:, 10:].any()

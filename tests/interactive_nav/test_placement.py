@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from scipy import stats
@@ -73,16 +74,59 @@ def test_starts_and_goals_are_uniform_among_pairs_a_metre_apart(built, draws):
     assert stats.kstest(within.ravel(), "uniform").pvalue > 1e-3
 
 
-def test_the_first_small_object_is_uniform_given_start_and_goal(built, draws):
+@pytest.mark.parametrize("k", [0, 9])
+def test_small_objects_are_uniform_given_what_lies_already(built, draws, k):
     world, tables = built
     cells = np.asarray(tables.clutter_xy_w[0])[: int(tables.num_clutter[0])]
-    reach = world.robot.footprint_radius_m + world.small_objects[0].radius_m + CLEARANCE_M
-    few = slice(0, 4000)
+    radii = np.array([o.radius_m for o in world.small_objects])
+    few = slice(0, 2000)
+    placed = draws.small_placed[few, : k + 1]
     taken = np.zeros(len(cells))
-    for start, goal in zip(draws.start_xy_w[few], draws.goal_xy_w[few], strict=True):
-        ok = (np.linalg.norm(cells - start, axis=-1) > reach) & (np.linalg.norm(cells - goal, axis=-1) > reach)
-        taken += ok / ok.sum()
-    assert uniform_p_value(draws.small_xy_w[few, 0], taken, cells, tables.fine_m) > 1e-3
+    for start, goal, small, there in zip(
+        draws.start_xy_w[few], draws.goal_xy_w[few], draws.small_xy_w[few], placed, strict=True
+    ):
+        if there[k]:
+            others = np.stack([start, goal, *small[:k][there[:k]]])
+            reach = np.array([world.robot.footprint_radius_m] * 2 + radii[:k][there[:k]].tolist())
+            gaps = np.linalg.norm(cells[:, None] - others, axis=-1) - reach
+            ok = (gaps > radii[k] + CLEARANCE_M).all(-1)
+            taken += ok / ok.sum()
+    points = draws.small_xy_w[few, k][placed[:, k]]
+    assert uniform_p_value(points, taken, cells, tables.fine_m) > 1e-3
+    assert uniform_p_value(points, taken * np.where(cells[:, 0] > 0, 1.5, 1.0), cells, tables.fine_m) < 1e-6
+
+
+def test_c_mujoco_finds_no_contact_at_the_start_nor_of_the_robot_at_the_goal(built, draws):
+    """The engine's own collisions, where the other tests measure footprints."""
+    world, _ = built
+    model, layout = world.models[0], world.layout
+    data = mujoco.MjData(model)
+    floor = model.geom("floor").id
+    own = {*layout.robot_bodies.tolist(), *layout.slot_body[:10].tolist()}
+
+    def touches() -> bool:
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        pairs = data.contact.geom
+        bodies = model.geom_bodyid[pairs]
+        return bool(np.any(np.isin(bodies, list(own)).any(1) & (pairs != floor).all(1)))
+
+    def turned(xy, yaw, z):
+        return [*xy, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+
+    robot, height = layout.robot_qpos, world.robot.spawn_height_m
+    for i in range(0, 10_000, 20):
+        data.qpos[:] = world.rest_qpos[0]
+        for k in np.flatnonzero(draws.small_placed[i]):
+            at = layout.slot_qpos[k]
+            data.qpos[at : at + 7] = turned(draws.small_xy_w[i, k], draws.small_yaw_rad[i, k], 0.0)
+        for place in (draws.start_xy_w[i], draws.goal_xy_w[i]):
+            data.qpos[robot : robot + 7] = turned(place, draws.start_yaw_rad[i], height)
+            assert not touches(), i
+    # It would see one: the robot where the last object lies.
+    data.qpos[robot : robot + 2] = draws.small_xy_w[i, k]
+    assert touches()
 
 
 def test_yaws_are_uniform(draws):
