@@ -128,7 +128,12 @@ class DDPG:
     def policy(self, learner: DDPGState) -> types.Policy:
         """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); never random."""
         params = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
-        return lambda observation, _: (self.networks.action(learner.normalizer_params, params, observation), {})
+
+        def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
+            del key
+            return self.networks.action(learner.normalizer_params, params, observation), {}
+
+        return act
 
     def init_noise(self) -> jax.Array:
         """Zeros [envs, A]."""

@@ -105,6 +105,7 @@ def collect(agent: Agent, env: Env, learner: Any, data: OffPolicyData, key: jax.
         The data with `steps_per_update` more steps of every environment in the replay; and those steps without their
         images, leaves [steps, envs, ...], with `sums` over ended episodes.
     """
+    assert agent.config.steps_per_update, "the config must be resolved"
     at_random = learner.gradient_steps == 0
 
     def step(data: OffPolicyData, key: jax.Array) -> tuple[OffPolicyData, Any]:
@@ -219,10 +220,10 @@ def replay_nbytes(config: OffPolicyConfig, env: Env) -> int:
 
 def describe_replay(config: OffPolicyConfig, env: Env) -> str:
     """The replay's memory in one line."""
-    each = replay_nbytes(config, env) / (config.replay_slots * (config.num_envs or 1))
+    total, transitions = replay_nbytes(config, env), config.replay_slots * (config.num_envs or 1)
     return (
-        f"replay of {config.replay_slots * (config.num_envs or 1):,} transitions ({config.replay_slots:,} steps of "
-        f"{config.num_envs:,} environments) of {each:,.0f} bytes: {replay_nbytes(config, env) / 1e9:.2f} GB on the device"
+        f"replay of {transitions:,} transitions ({config.replay_slots:,} steps of {config.num_envs:,} environments) "
+        f"of {total / transitions:,.0f} bytes each takes {total / 1e9:.2f} GB on the device"
     )
 
 
@@ -257,13 +258,13 @@ def train(
     begin = start(agent, env, config.algorithm, config.run.seed)
     restored = callbacks.restore(begin)
     if restored is not None:
-        empty = begin.env_state
+        empty: Any = begin.env_state
         begin = restored
         if begin.env_state is None:
             key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), begin.env_steps)
             env_state = reset_envs(agent, env, key)
             begin = dataclasses.replace(begin, env_state=empty.replace(env_state=env_state))
-        del empty
+        del empty  # two replays might not fit
     steps_per_update = (agent.config.num_envs or 0) * (agent.config.steps_per_update or 0)
     return run_loop(functools.partial(update, agent, env), begin, steps_per_update, config.run, callbacks)
 

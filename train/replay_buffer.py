@@ -159,7 +159,7 @@ def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discou
         extras={
             "policy_extras": {},
             "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)},
-        },
+        },  # type: ignore[arg-type]
     )
 
 

@@ -103,6 +103,7 @@ class SAC:
         """Temperature, critics, policy, targets: Brax's step with its keys split in the same places."""
         c = self.config
         alpha_loss, critic_loss, actor_loss = make_losses(self)
+        alpha_params: Any
         policy_optimizer, q_optimizer, alpha_optimizer = self._optimizers
 
         def own_actor_loss(policy_params: Any, q_params: Any, normalizer_params: Any, *rest: Any) -> jax.Array:
