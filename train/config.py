@@ -190,8 +190,8 @@ class SACConfig(OffPolicyConfig):
     """Adam's step size for the temperature."""
     tau: float = 0.005
     """Share of the critics in their targets at each gradient step."""
-    initial_alpha: float = 1.0
-    """Temperature to begin with."""
+    initial_alpha: float = 0.01
+    """Temperature to begin with; 1 in the original, but rewards are a few centimetres of progress a step here."""
     target_entropy_per_action: float = -1.0
     """Entropy that the temperature aims at, times the number of actions: -1 in the original, -0.5 in Brax."""
 
@@ -304,7 +304,7 @@ AUTO_SAC: dict[str, dict[str, int]] = {
     "native": {
         "num_envs": 32,
         "steps_per_update": 8,
-        "grad_steps_per_update": 32,
+        "grad_steps_per_update": 16,
         "batch_size": 256,
         "min_replay_size": 8_192,
         "max_replay_size": 1_000_000,
@@ -321,7 +321,7 @@ AUTO_SAC: dict[str, dict[str, int]] = {
         "num_envs": 4_096,
         "steps_per_update": 2,
         "grad_steps_per_update": 16,
-        "batch_size": 4_096,
+        "batch_size": 2_048,
         "min_replay_size": 131_072,
         "max_replay_size": 1_048_576,
     },

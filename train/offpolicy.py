@@ -47,6 +47,11 @@ class OffPolicyData:
         """The environments' own `info`."""
         return self.env_state.info
 
+    @property
+    def note(self) -> str:
+        """What a user should know before training starts, in one line."""
+        return replay_buffer.describe(self.replay)
+
 
 class Learner(Protocol):
     """All that learning changes (a flax dataclass), as far as this module knows it."""
@@ -198,12 +203,13 @@ def start(agent: Agent, env: Env, section: str, seed: int) -> Snapshot:
     Raises:
         ConfigError: the replay would take more memory than allowed.
     """
-    key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
-    check_memory(agent, env, section)
-    env_state = reset_envs(agent, env, key_env)
     c = agent.config
-    replay = replay_buffer.init(c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
-    return Snapshot(0, agent.init(key_networks, key_updates), OffPolicyData(env_state, replay, agent.init_noise()))
+    key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
+    env_state = reset_envs(agent, env, key_env)
+    make_replay = functools.partial(replay_buffer.init, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
+    check_memory(c, jax.eval_shape(make_replay), section)
+    data = OffPolicyData(env_state, make_replay(), agent.init_noise())
+    return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
 
 
 def reset_envs(agent: Agent, env: Env, key: jax.Array) -> Any:
@@ -211,30 +217,13 @@ def reset_envs(agent: Agent, env: Env, key: jax.Array) -> Any:
     return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
 
 
-def replay_nbytes(config: OffPolicyConfig, env: Env) -> int:
-    """Device memory that the replay takes, bytes."""
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.PRNGKey(0), config.num_envs or 1))
-    observation = jax.eval_shape(env.reset, keys).obs
-    return replay_buffer.nbytes(config.replay_slots, observation, env.action_size, config.replay_dtype)
-
-
-def describe_replay(config: OffPolicyConfig, env: Env) -> str:
-    """The replay's memory in one line."""
-    total, transitions = replay_nbytes(config, env), config.replay_slots * (config.num_envs or 1)
-    return (
-        f"replay of {transitions:,} transitions ({config.replay_slots:,} steps of {config.num_envs:,} environments) "
-        f"of {total / transitions:,.0f} bytes each takes {total / 1e9:.2f} GB on the device"
-    )
-
-
-def check_memory(agent: Agent, env: Env, section: str) -> None:
-    """Raises `ConfigError` where the replay would take more than `replay_limit_gb`."""
-    c = agent.config
-    if replay_nbytes(c, env) > c.replay_limit_gb * 1e9:
-        images = isinstance(env.observation_size, Mapping)
+def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
+    """Raises `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
+    if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
+        images = isinstance(replay.observation, Mapping)
         smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"
         raise ConfigError(
-            f"{section}.replay_limit_gb is {c.replay_limit_gb:g}, but the {describe_replay(c, env)}; lower "
+            f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {replay_buffer.describe(replay)}; lower "
             f"{section}.max_replay_size, choose {smaller} if it is not chosen yet, or raise the limit"
         )
 

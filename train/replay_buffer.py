@@ -70,10 +70,19 @@ def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "fl
     )
 
 
-def nbytes(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> int:
-    """Device memory of the ring that `init` would make of the same arguments, bytes."""
-    shapes = jax.eval_shape(lambda x: init(slots, x, action_size, vector_dtype), observation)
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+def nbytes(replay: Replay) -> int:
+    """Memory of a ring, or of one with the shapes that `jax.eval_shape` tells beforehand, bytes."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
+
+
+def describe(replay: Replay) -> str:
+    """A ring's memory in one line; as `nbytes`."""
+    slots, envs = replay.reward.shape
+    total, transitions = nbytes(replay), slots * envs
+    return (
+        f"replay of {transitions:,} transitions ({slots:,} steps of {envs:,} environments) of "
+        f"{total / transitions:,.0f} bytes each takes {total / 1e9:.2f} GB on the device"
+    )
 
 
 def insert(

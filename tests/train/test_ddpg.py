@@ -141,7 +141,7 @@ def test_number_of_critics_and_the_same_policy_either_way():
     ("env", "share"), [(ToyEnv(), False), (ToyPixels(), True)], ids=["vector", "picture, shared encoder"]
 )
 def test_learns_the_toy(env, share):
-    """From random (0.03 success) to at least 0.9 in 14,336 steps; of the picture's toy the image alone shows the goal."""
+    """From random (0.03 success) to at least 0.9 in 14,336 steps; in the pictures only the image shows the goal."""
     config = TrainConfig(
         env=EnvConfig(scenes=("toy",)),
         algorithm="ddpg",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,10 +93,15 @@ IMAGES = {
 @pytest.mark.parametrize(("dtype", "vector_bytes"), [("float32", 4), ("float16", 2)])
 def test_memory_is_what_is_told_beforehand(dtype: str, vector_bytes: int):
     """By hand, each step: 32 pixels, 6 numbers, 2 actions and a reward of 4 bytes, two flags of 1; two counters."""
-    replay = replay_buffer.init(SLOTS, IMAGES, 2, dtype)
-    actual = sum(leaf.nbytes for leaf in jax.tree.leaves(replay))
-    assert actual == replay_buffer.nbytes(SLOTS, IMAGES, 2, dtype)
-    assert actual == SLOTS * ENVS * (32 + 6 * vector_bytes + 2 * 4 + 4 + 2) + 8
+    make = functools.partial(replay_buffer.init, SLOTS, IMAGES, 2, dtype)
+    each = 32 + 6 * vector_bytes + 2 * 4 + 4 + 2
+    actual = sum(leaf.nbytes for leaf in jax.tree.leaves(make()))
+    assert actual == replay_buffer.nbytes(jax.eval_shape(make)) == SLOTS * ENVS * each + 8
+    told = replay_buffer.describe(jax.eval_shape(lambda: replay_buffer.init(1000, jnp.zeros((2000, 29)), 2)))
+    assert told == (
+        "replay of 2,000,000 transitions (1,000 steps of 2,000 environments) of 130 bytes each takes "
+        "0.26 GB on the device"
+    )
 
 
 def test_images_stay_bytes_and_half_precision_rounds():
@@ -119,7 +126,7 @@ def test_an_insertion_into_a_donated_ring_copies_nothing():
         .lower(replay, IMAGES, jnp.zeros((ENVS, 2)), one, one, one)
         .compile()
     )
-    size, memory = replay_buffer.nbytes(4096, IMAGES, 2), compiled.memory_analysis()
+    size, memory = replay_buffer.nbytes(replay), compiled.memory_analysis()
     assert memory.alias_size_in_bytes >= size
     assert memory.temp_size_in_bytes < size / 100
 
