@@ -132,7 +132,7 @@ def test_number_of_critics_and_the_same_policy_either_way():
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="ddpg", ddpg=DDPGConfig(**SIZES))
     template = ddpg.template(batched(), config)
     drawn = [ddpg.policy(batched(), config, template, d)(data.observation, KEY)[0] for d in (True, False)]
-    np.testing.assert_array_equal(*drawn)
+    np.testing.assert_array_equal(drawn[0], drawn[1])
     assert drawn[0].shape == (12, 2) and (np.abs(drawn[0]) < 1).all()
 
 

@@ -32,12 +32,14 @@ def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> sac.SA
 def transitions(size: networks.ObservationSize, count: int = 12) -> types.Transition:
     """Made up, the fourth a failure, the eighth cut by the clock."""
 
-    def draw(key: jax.Array, name: str, shape: tuple[int, ...]) -> jax.Array:
+    def draw(key: jax.Array, name: str, shape: tuple[int, ...]) -> Any:
         if name.startswith(networks.PIXELS):
             return jax.random.randint(key, (count, *shape), 0, 256).astype(jnp.uint8)
         return jax.random.normal(key, (count, *shape))
 
     keys = jax.random.split(jax.random.PRNGKey(1), 4)
+    observation: Any
+    following: Any
     if isinstance(size, int):
         observation, following = (draw(key, "", (size,)) for key in keys[:2])
     else:
@@ -217,8 +219,8 @@ def test_policy_and_template_are_those_of_the_config():
     observation = transitions(29).observation
     drawn = [sac.policy(env, config, learner, False)(observation, jax.random.PRNGKey(i))[0] for i in (0, 1)]
     modes = [sac.policy(env, config, learner, True)(observation, jax.random.PRNGKey(i))[0] for i in (0, 1)]
-    assert drawn[0].shape == (12, 2) and not np.array_equal(*drawn)
-    np.testing.assert_array_equal(*modes)
+    assert drawn[0].shape == (12, 2) and not np.array_equal(drawn[0], drawn[1])
+    np.testing.assert_array_equal(modes[0], modes[1])
 
 
 LEARNING: dict[str, Any] = {
