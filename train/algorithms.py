@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from brax.training import types
 
-from train import ppo
+from train import ddpg, ppo, sac
 from train.config import TrainConfig
 from train.learner import Callbacks, TrainResult
 
@@ -27,4 +27,4 @@ class Algorithm(Protocol):
         ...
 
 
-ALGORITHMS: dict[str, Algorithm] = {"ppo": ppo}
+ALGORITHMS: dict[str, Algorithm] = {"ppo": ppo, "sac": sac, "ddpg": ddpg}

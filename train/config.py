@@ -21,6 +21,13 @@ def _require(config: Any, names: str, low: float, high: float = math.inf) -> Non
                 raise ValueError(f"{name} is {value!r}, expected {interval}")
 
 
+def _require_positive(config: Any, names: str) -> None:
+    """Refuses values that are not finite numbers above 0."""
+    for name in names.split():
+        if not 0.0 < getattr(config, name) < math.inf:
+            raise ValueError(f"{name} is {getattr(config, name)!r}, expected a positive number")
+
+
 @dataclasses.dataclass(frozen=True)
 class EnvConfig(NavConfig):
     """The task: every setting of the environment, and which robot and scenes to make it from."""
@@ -120,9 +127,111 @@ class PPOConfig:
         _require(self, "policy_hidden_layer_sizes value_hidden_layer_sizes", 1)
         _require(self, "entropy_cost vf_loss_coefficient", 0.0)
         _require(self, "discounting gae_lambda", 0.0, 1.0)
-        for name in ["learning_rate", "desired_kl", "reward_scaling", "clipping_epsilon", "max_grad_norm"]:
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)!r}, expected a positive number")
+        _require_positive(self, "learning_rate desired_kl reward_scaling clipping_epsilon max_grad_norm")
+
+
+@dataclasses.dataclass(frozen=True)
+class OffPolicyConfig:
+    """What SAC and DDPG share: many environments, a replay on the device, a few large gradient steps an update."""
+
+    num_envs: int | None = None
+    """Environments stepped together."""
+    steps_per_update: int | None = None
+    """Steps of every environment in one update."""
+    grad_steps_per_update: int | None = None
+    """Gradient steps in one update."""
+    batch_size: int | None = None
+    """Transitions in one gradient step."""
+    min_replay_size: int | None = None
+    """Transitions to collect before learning begins; a run that never learned acts at random until then."""
+    max_replay_size: int | None = None
+    """Transitions to keep, rounded down to the same number for each environment."""
+    replay_limit_gb: float = 16.0
+    """A replay that would take more device memory (1e9 bytes) is refused."""
+    replay_dtype: Literal["float32", "float16"] = "float32"
+    """How vectors are stored; images keep their own type (env.image_dtype)."""
+    n_steps: int = 1
+    """Rewards summed before the critic's own estimate takes over."""
+    discounting: float = 0.99
+    """Discount of one control step."""
+    reward_scaling: float = 1.0
+    """Factor on every reward inside the loss."""
+    normalize_observations: bool = True
+    """Normalise observations by their running mean and deviation."""
+    policy_hidden_layer_sizes: tuple[int, ...] = (256, 256)
+    """Widths of the policy network, behind its encoder if there are images."""
+    q_hidden_layer_sizes: tuple[int, ...] = (256, 256)
+    """Widths of each critic, behind its encoder if there are images."""
+    q_layer_norm: bool = False
+    """Layer normalisation in the critics' hidden layers: they stay stable at larger steps."""
+
+    def __post_init__(self) -> None:
+        _require(self, "num_envs steps_per_update grad_steps_per_update batch_size min_replay_size max_replay_size", 1)
+        _require(self, "n_steps policy_hidden_layer_sizes q_hidden_layer_sizes", 1)
+        _require(self, "discounting", 0.0, 1.0)
+        _require_positive(self, "replay_limit_gb reward_scaling")
+
+    @property
+    def replay_slots(self) -> int:
+        """Steps of each environment that the replay keeps."""
+        assert self.max_replay_size and self.num_envs, "the config must be resolved"
+        return self.max_replay_size // self.num_envs
+
+
+@dataclasses.dataclass(frozen=True)
+class SACConfig(OffPolicyConfig):
+    """Soft actor-critic; names as in Brax's `sac.train` where it has them."""
+
+    actor_learning_rate: float = 3e-4
+    """Adam's step size for the policy."""
+    critic_learning_rate: float = 3e-4
+    """Adam's step size for the critics, and for a shared encoder."""
+    alpha_learning_rate: float = 3e-4
+    """Adam's step size for the temperature."""
+    tau: float = 0.005
+    """Share of the critics in their targets at each gradient step."""
+    initial_alpha: float = 0.01
+    """Temperature to begin with; 1 in the original, but rewards are a few centimetres of progress a step here."""
+    target_entropy_per_action: float = -1.0
+    """Entropy that the temperature aims at, times the number of actions: -1 in the original, -0.5 in Brax."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self, "tau", 0.0, 1.0)
+        _require_positive(self, "actor_learning_rate critic_learning_rate alpha_learning_rate initial_alpha")
+        if not math.isfinite(self.target_entropy_per_action):
+            raise ValueError(f"target_entropy_per_action is {self.target_entropy_per_action!r}, expected a number")
+
+
+@dataclasses.dataclass(frozen=True)
+class DDPGConfig(OffPolicyConfig):
+    """Deep deterministic policy gradient; defaults are the original benchmark's."""
+
+    actor_learning_rate: float = 1e-4
+    """Adam's step size for the policy."""
+    critic_learning_rate: float = 1e-3
+    """Adam's step size for the critic, and for a shared encoder."""
+    tau: float = 0.05
+    """Share of the networks in their targets at each target update."""
+    target_update_period: int = 5
+    """Gradient steps between two target updates."""
+    num_critics: int = 1
+    """Critics; the least of several makes the target, the first leads the policy."""
+    noise: Literal["ou", "gaussian"] = "ou"
+    """Exploration: an Ornstein-Uhlenbeck process for each environment, or a new Gaussian at each step."""
+    noise_sd: tuple[float, ...] = (0.2,)
+    """Deviation of what a step adds to the noise: one, or least and largest, spread evenly over environments."""
+    noise_damping: float = 0.15
+    """Share of the Ornstein-Uhlenbeck noise that a step takes away."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require(self, "target_update_period num_critics", 1)
+        _require(self, "noise_sd", 0.0)
+        _require(self, "tau noise_damping", 0.0, 1.0)
+        _require_positive(self, "actor_learning_rate critic_learning_rate")
+        if len(self.noise_sd) not in (1, 2) or tuple(sorted(self.noise_sd)) != self.noise_sd:
+            raise ValueError(f"noise_sd is {self.noise_sd!r}, expected one number, or the least and the largest")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,12 +278,16 @@ class TrainConfig:
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     """The task."""
-    algorithm: Literal["ppo"] = "ppo"
-    """Learner."""
+    algorithm: Literal["ppo", "sac", "ddpg"] = "ppo"
+    """Learner; the section of its name holds its settings."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
     """Encoders of images."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
-    """The learner's settings."""
+    """Settings of PPO."""
+    sac: SACConfig = dataclasses.field(default_factory=SACConfig)
+    """Settings of SAC."""
+    ddpg: DDPGConfig = dataclasses.field(default_factory=DDPGConfig)
+    """Settings of DDPG."""
     run: RunConfig = dataclasses.field(default_factory=RunConfig)
     """The run."""
 
@@ -187,26 +300,63 @@ AUTO_PPO: dict[str, dict[str, int]] = {
 """What None means in `PPOConfig`, per physics backend. A CPU collects a thousand steps a second, so it trains
 on small batches often; Warp is fastest at thousands of worlds and has steps to spare."""
 
+AUTO_SAC: dict[str, dict[str, int]] = {
+    "native": {
+        "num_envs": 32,
+        "steps_per_update": 8,
+        "grad_steps_per_update": 16,
+        "batch_size": 256,
+        "min_replay_size": 8_192,
+        "max_replay_size": 1_000_000,
+    },
+    "jax": {
+        "num_envs": 256,
+        "steps_per_update": 4,
+        "grad_steps_per_update": 32,
+        "batch_size": 1_024,
+        "min_replay_size": 32_768,
+        "max_replay_size": 1_000_000,
+    },
+    "warp": {
+        "num_envs": 4_096,
+        "steps_per_update": 2,
+        "grad_steps_per_update": 16,
+        "batch_size": 2_048,
+        "min_replay_size": 131_072,
+        "max_replay_size": 1_048_576,
+    },
+}
+"""What None means in `SACConfig`. With thousands of environments a gradient step for each env step is neither
+affordable nor needed: a few large ones learn faster in wall-clock time (Li et al. 2023, arXiv:2307.12983; Seo et al.
+2025, arXiv:2505.22642)."""
+AUTO_DDPG = AUTO_SAC
+"""What None means in `DDPGConfig`."""
+AUTO = {"ppo": AUTO_PPO, "sac": AUTO_SAC, "ddpg": AUTO_DDPG}
+"""Section -> backend -> what its None means."""
+
 
 def resolve(config: TrainConfig, backend: str) -> TrainConfig:
-    """The config with the backend named and every None of the learner filled in, checked across fields."""
-    if backend not in AUTO_PPO:
-        raise ConfigError(f"env.backend: no automatic sizes for {backend!r}; known: {', '.join(AUTO_PPO)}")
-    filled = {key: value for key, value in AUTO_PPO[backend].items() if getattr(config.ppo, key) is None}
-    resolved = dataclasses.replace(
-        config,
-        env=dataclasses.replace(config.env, backend=backend),
-        ppo=dataclasses.replace(config.ppo, **filled),
-    )
+    """The config with the backend named and every None of the learners filled in, checked across fields."""
+    sections: dict[str, Any] = {}
+    for name, auto in AUTO.items():
+        if backend not in auto:
+            raise ConfigError(f"env.backend: no automatic sizes for {backend!r}; known: {', '.join(auto)}")
+        section = getattr(config, name)
+        filled = {key: value for key, value in auto[backend].items() if getattr(section, key) is None}
+        sections[name] = dataclasses.replace(section, **filled)
+    resolved = dataclasses.replace(config, env=dataclasses.replace(config.env, backend=backend), **sections)
     validate(resolved)
     return resolved
 
 
 def validate(config: TrainConfig) -> None:
     """Raises `ConfigError` where values exclude each other; what is still None is not looked at."""
-    ppo = config.ppo
     if not config.env.scenes:
         raise ConfigError("env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]")
+    section = getattr(config, config.algorithm)
+    if isinstance(section, OffPolicyConfig):
+        _validate_replay(config.algorithm, section, config.run.num_timesteps)
+    ppo = config.ppo
     if ppo.num_envs and ppo.batch_size and ppo.num_minibatches:
         collected = ppo.batch_size * ppo.num_minibatches
         if collected % ppo.num_envs:
@@ -214,3 +364,23 @@ def validate(config: TrainConfig) -> None:
                 f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
                 f"ppo.num_envs ({ppo.num_envs}); change one of the three"
             )
+
+
+def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> None:
+    """Raises `ConfigError` where the replay could never be learned from."""
+    if config.min_replay_size and config.min_replay_size >= num_timesteps:
+        raise ConfigError(
+            f"{name}.min_replay_size is {config.min_replay_size}, expected less than run.num_timesteps "
+            f"({num_timesteps}): nothing would be learned"
+        )
+    if not (config.num_envs and config.min_replay_size and config.max_replay_size and config.steps_per_update):
+        return
+    slots = config.replay_slots
+    least = max(config.n_steps + 1, config.steps_per_update, -(-config.min_replay_size // config.num_envs))
+    if slots < least:
+        raise ConfigError(
+            f"{name}.max_replay_size is {config.max_replay_size}, {slots} steps of {config.num_envs} environments, "
+            f"expected at least {least * config.num_envs}: it must hold {name}.min_replay_size "
+            f"({config.min_replay_size}), one update ({config.steps_per_update} steps) and n_steps + 1 "
+            f"({config.n_steps + 1} steps)"
+        )

@@ -17,7 +17,8 @@ from typing import Any, Literal
 
 import yaml
 
-from train.config import AUTO_PPO, TrainConfig, validate
+from train.config import AUTO as AUTO_SIZES
+from train.config import TrainConfig, validate
 from train.errors import ConfigError
 
 PRESET_DIR = Path(__file__).parent / "configs"
@@ -152,8 +153,9 @@ def help_text() -> str:
             doc = docs[field.name]
             if typing.get_origin(hints[field.name]) is Literal:
                 doc += f" [{' | '.join(typing.get_args(hints[field.name]))}]"
-            if value is None and field.name in AUTO_PPO["native"]:
-                sizes = (f"{backend}: {auto[field.name]}" for backend, auto in AUTO_PPO.items())
+            by_backend = AUTO_SIZES.get(prefix.rstrip("."), {}).items()
+            sizes = [f"{backend}: {auto[field.name]}" for backend, auto in by_backend if field.name in auto]
+            if value is None and sizes:
                 doc += f" [{', '.join(sizes)}]"
             shown = AUTO if value is None else value
             if isinstance(value, tuple):
@@ -244,7 +246,7 @@ def _scalar(value: Any, kind: type) -> Any:
 
 
 def _nearest(word: str, known: Sequence[str]) -> str:
-    tails = {name.rpartition(".")[2]: name for name in known}
+    tails = {name.rpartition(".")[2]: name for name in reversed(known)}  # of equal names the first section's
     tail = word.rpartition(".")[2]
     if tail in tails:  # the right name in the wrong section, or without its section
         return f", did you mean {tails[tail]!r}?"

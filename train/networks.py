@@ -116,6 +116,7 @@ class Head(linen.Module):
     outputs: int
     action_features: int = 0
     output_init: Callable[..., Any] = GLOROT
+    layer_norm: bool = False
 
     @linen.compact
     def __call__(self, features: jax.Array, action: jax.Array | None = None) -> jax.Array:
@@ -125,6 +126,7 @@ class Head(linen.Module):
             x = jnp.concatenate([x, linen.relu(dense(action))], -1)
         for i, size in enumerate(self.layer_sizes):
             x = linen.relu(linen.Dense(size, kernel_init=GLOROT, name=f"hidden_{i}")(x))
+            x = linen.LayerNorm()(x) if self.layer_norm else x
         return linen.Dense(self.outputs, kernel_init=self.output_init, name="output")(x)
 
 
@@ -134,11 +136,12 @@ class TwinHead(linen.Module):
     layer_sizes: Sequence[int]
     action_features: int
     critics: int = 2
+    layer_norm: bool = False
 
     @linen.compact
     def __call__(self, features: jax.Array, action: jax.Array) -> jax.Array:
         heads = [
-            Head(self.layer_sizes, 1, self.action_features, critic_output_init, name=f"critic_{i}")
+            Head(self.layer_sizes, 1, self.action_features, critic_output_init, self.layer_norm, name=f"critic_{i}")
             for i in range(self.critics)
         ]
         return jnp.concatenate([head(features, action) for head in heads], -1)

@@ -105,6 +105,9 @@ class FolderCallbacks:
         self._folder.cut_metrics(snapshot.env_steps)
         if self._config.run.tensorboard:
             self._events = SummaryWriter(str(self._folder.tensorboard), purge_step=snapshot.env_steps + 1)
+        note = getattr(snapshot.env_state, "note", "")
+        if note:
+            self._display.console.print(note, highlight=False, soft_wrap=True)
         self._display.begin(snapshot.env_steps, total_steps)
 
     def on_update(self, env_steps: int) -> None:

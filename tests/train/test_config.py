@@ -82,7 +82,7 @@ def test_two_words_that_only_fit_together():
         ("run.name=a/b", "run.name is 'a/b', expected one folder name"),
         ("env.k_int=-1", "env.k_int is -1.0, expected 0 or more"),
         ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
-        ("algorithm=pop", "got 'pop' (str), expected one of ppo, did you mean 'ppo'?"),
+        ("algorithm=pop", "got 'pop' (str), expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
         ("ppo=3", "ppo: got 3 (int), expected a mapping"),
         ("ppo.num_envs", "expected key=value"),
         (
