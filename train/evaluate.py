@@ -22,6 +22,7 @@ from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
 from interactive_nav.episodes import load as load_episodes
 from train import checkpoint, config_io
 from train.algorithms import ALGORITHMS
+from train.asked import EvaluationAsked
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig
 from train.errors import ConfigError, TrainError
@@ -29,7 +30,7 @@ from train.files import whole_file
 from train.planners import Planner
 from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
 from train.rollout import Episodes, Player, episode_keys
-from train.rows import EvaluationAsked, episode_table, score_table, write_parquet
+from train.rows import episode_table, score_table, write_parquet
 from train.run import check_fits, make_env
 from train.run_folder import FAILURES, RunFolder, claim, versions
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +14,9 @@ from scipy import stats
 
 from train.errors import RunFolderError
 from train.files import whole_file
-from train.rollout import Episodes
+
+if TYPE_CHECKING:
+    from train.rollout import Episodes
 
 SCORES = {
     "success": "success",
@@ -40,39 +38,6 @@ TYPES: dict[str, pa.DataType] = {
 """Of the constant columns, which are empty where they mean nothing (a yardstick has no seed)."""
 IDENTITY = ("run", "policy", "evaluation_seed", "scene", "episode")
 """Columns that name an episode that was played."""
-
-
-@dataclasses.dataclass(frozen=True)
-class EvaluationAsked:
-    """What an evaluation was asked to play: with the run, it names a file of rows."""
-
-    scenes: tuple[str, ...]
-    policies: tuple[str, ...]
-    episodes: int
-    seed: int
-    balanced: bool
-    """Scenes take turns."""
-    checkpoint: str
-    deterministic: bool
-    settings: tuple[str, ...] = ()
-    """env.key=value words."""
-    episode_file: str = ""
-    """Digest of a file of episodes."""
-
-    def plain(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
-
-    def file_name(self, run: str) -> str:
-        """`<run>-<8 hex>.parquet`: the same question about a run replaces its file, another one adds one."""
-        digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()
-        return f"{run}-{digest[:8]}.parquet"
-
-
-def files_of_run(dataset: Path, run: str) -> list[Path]:
-    """Files of rows in a dataset folder that are of one run."""
-    name = re.compile(re.escape(run) + r"-[0-9a-f]{8}\.parquet")
-    return sorted(path for path in dataset.glob("*.parquet") if name.fullmatch(path.name))
 
 
 def episode_table(episodes: Episodes, scenes: Any, constants: dict[str, Any]) -> pa.Table:
@@ -109,8 +74,11 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
 
 
 def read_notes(path: Path) -> dict[str, str]:
-    """What `write_parquet` kept beside the rows."""
-    found = pq.read_schema(path).metadata or {}
+    """What `write_parquet` kept beside the rows; nothing where the file is damaged."""
+    try:
+        found = pq.read_schema(path).metadata or {}
+    except (OSError, pa.ArrowInvalid):
+        return {}
     return {key.decode(): value.decode() for key, value in found.items()}
 
 
