@@ -46,8 +46,8 @@ class Job:
     @property
     def name(self) -> str:
         """For people."""
-        more = f" and {len(self.runs) - 1} more" if len(self.runs) > 1 else ""
-        return f"{self.kind} {self.runs[0]}{more}"
+        first, *others = self.runs
+        return f"{self.kind} {first}" + (f" and {len(others)} more" if others else "")
 
 
 class Child:

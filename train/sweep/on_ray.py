@@ -64,7 +64,8 @@ class RayLauncher:
             def kill(self) -> None:
                 self._child.kill()
 
-        self._worker: Any = ray.remote(max_concurrency=2, max_restarts=0)(Worker)
+        remote: Any = ray.remote
+        self._worker = remote(max_concurrency=2, max_restarts=0)(Worker)
         self._running: list[tuple[Job, Any, Any, float]] = []
 
     def start(self, job: Job) -> str | None:

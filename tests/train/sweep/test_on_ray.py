@@ -19,6 +19,8 @@ from train.sweep.on_ray import RayLauncher
 from train.sweep.scheduler import Scheduler
 from train.sweep.table import SweepDisplay
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def cluster():
@@ -102,7 +104,7 @@ def test_a_lost_node_is_a_failure_like_another(cluster, tmp_path, monkeypatch):
     import ray
 
     set_fates(tmp_path, {"k_int0-seed0": ["slow"], "k_int1-seed0": ["slow"]})
-    path = write_sweep(tmp_path, steps=2000, seeds=1)
+    path = write_sweep(tmp_path, steps=600, seeds=1)
     logs = [tmp_path / "small" / "runs" / f"k_int{k}-seed0" / "metrics.jsonl" for k in (0, 1)]
     node, killed = cluster.list_all_nodes()[-1], []
     usual = RayLauncher.ended
