@@ -33,6 +33,7 @@ PACKAGES = (
 )
 MAY_CHANGE = (
     *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),
+    *("run.wandb", "run.wandb_project"),
     *("run.env_state_limit_mb", "env.threads"),
 )
 """Settings that a run may be continued with at other values: they do not change what an update does."""
