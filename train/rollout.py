@@ -170,7 +170,9 @@ class Player:
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
         planner = policy if isinstance(policy, Planner) else None
-        act = None if isinstance(policy, Planner) else jax.tree_util.Partial(policy)
+        act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
+        if not isinstance(policy, jax.tree_util.Partial):
+            act = None if isinstance(policy, Planner) else jax.tree_util.Partial(policy)
         step = 0
         while not finished.all():
             ended_here = jnp.asarray(finished[episode_of])

@@ -111,7 +111,8 @@ def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping
                     fillstyle=style.fill_of(k_int, k_ints),
                     linewidth=1.2,
                 )
-                low, high = [point.low for point in points], [point.high for point in points]
+                bounds = (-np.inf, np.inf) if key == "episode/sum_reward" else (0.0, 1.0)
+                low, high = (np.clip([getattr(p, end) for p in points], *bounds) for end in ("low", "high"))
                 axis.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
         for row, robot in zip(grid, robots, strict=True):
             for axis, (key, label) in zip(row, CURVES, strict=True):

@@ -91,6 +91,8 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
         f"{paths[f'scene/{scene}/name']}, episode {i}\nreached by: {', '.join(reached) or 'none'}", fontsize=9
     )
     axis.set_aspect("equal")
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
     axis.tick_params(labelsize=7)
     axis.set_xlabel("x [m]", fontsize=8)
     axis.set_ylabel("y [m]", fontsize=8)

@@ -90,6 +90,8 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
                 axis.fill_between(
                     ALPHAS, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.13, linewidth=0
                 )
+        low, high = grid[0, 0].get_ylim()
+        grid[0, 0].set_ylim(max(low, -0.02), min(high, 1.02))  # no score lies outside, though an interval may
         for axis in grid[:, 0]:
             axis.set_ylabel("INS$_α$")
         for axis in grid[1]:
@@ -186,8 +188,9 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
             )
             axis.set_xlabel("kinematic term of E$_{eff}$")
             axis.set_ylabel("dynamic term of E$_{eff}$")
-            axis.set_xlim(-0.02, 1.03)
-            axis.set_ylim(-0.02, 1.03)
+            low = max(0.0, 0.1 * np.floor(10 * min(x.min(), y.min())))
+            axis.set_xlim(low - 0.02, 1.02)
+            axis.set_ylim(low - 0.02, 1.02)
             axis.set_aspect("equal")
         dot: Any = Line2D([], [], color="0.75", marker=".", linestyle="", label="episode")
         handles = _without_line([*has.algorithm_handles(), *has.k_int_handles()])
@@ -205,7 +208,7 @@ def seen_and_unseen(rows: pa.Table) -> Figure:
     unseen = cells([test for _, test in pairs])
     order = sorted(by_cell, key=lambda c: (has.robots.index(c[0]), has.algorithms.index(c[1]), c[2]))
     with style.applied():
-        size = (max(4.6, 0.62 * len(order) + 1.4), 3.9)
+        size = (max(5.6, 0.62 * len(order) + 1.4), 3.9)
         figure, axis = plt.subplots(figsize=size, layout="constrained")
         for i, cell in enumerate(order):
             colour, marker = style.look(style.ALGORITHMS, cell[1], has.algorithms)
@@ -293,7 +296,7 @@ def _finish_plane(*axes: Axes) -> None:
     for axis in axes:
         equal_ins(axis)
         axis.set_xlim(max(-0.02, x[0] - 0.03), min(1.03, x[1] + 0.03))
-        axis.set_ylim(max(-0.02, y[0] - 0.03), min(1.03, y[1] + 0.03))
+        axis.set_ylim(max(-0.02, y[0] - 0.03), min(1.01, y[1] + 0.03))
         axis.grid(visible=False)
         axis.set_xlabel(style.P_LABEL)
         axis.set_ylabel(style.E_LABEL)
