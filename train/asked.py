@@ -41,3 +41,10 @@ def files_of_run(dataset: Path, run: str) -> list[Path]:
     """Files of rows in a dataset folder that are of one run."""
     name = re.compile(re.escape(run) + r"-[0-9a-f]{8}\.parquet")
     return sorted(path for path in dataset.glob("*.parquet") if name.fullmatch(path.name))
+
+
+def paths_beside(rows: Path) -> Path:
+    """Where the recorded paths of a file of rows lie: in a dataset's `_paths`, which readers of a folder pass over."""
+    in_dataset = re.search(r"-[0-9a-f]{8}\.parquet$", rows.name)
+    folder = rows.parent / "_paths" if in_dataset else rows.parent
+    return folder / f"{rows.stem}.npz"

@@ -22,7 +22,7 @@ from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
 from interactive_nav.episodes import load as load_episodes
 from train import checkpoint, config_io
 from train.algorithms import ALGORITHMS
-from train.asked import EvaluationAsked
+from train.asked import EvaluationAsked, paths_beside
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig
 from train.errors import ConfigError, TrainError
@@ -307,7 +307,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             rows, played = evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch)
             trained_steps = folder.origin().get("env_steps") if folder else None
             write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
-            write_paths(out.with_suffix(".npz"), played, player.env)
+            write_paths(paths_beside(out), played, player.env)
             _tell(console, rows, config, player.env, out)
     except TrainError as error:
         print(f"train.evaluate: {error}", file=sys.stderr)

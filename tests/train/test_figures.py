@@ -11,6 +11,7 @@ import pytest
 
 from tests.train.synthetic import paper_like, run_rows, write_results, yardstick_rows
 from train import figures
+from train.asked import paths_beside
 from train.figures import curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
 from train.rows import write_parquet
@@ -35,8 +36,10 @@ def results(tmp_path_factory):
         (run / "summary.json").write_text(json.dumps(facts))
     for k_int in (0.0, 1.0):
         rows = run_rows("turtlebot", "ppo", k_int, 7, 0.5, (0.9, 0.9))
-        write_parquet(rows, folder / "rows" / f"k{k_int:g}.parquet", {"asked": "x"})
-        np.savez(folder / "rows" / f"k{k_int:g}.npz", **record(shift_m=k_int))  # type: ignore[arg-type]
+        path = folder / "rows" / f"k{k_int:g}-0123abcd.parquet"
+        write_parquet(rows, path, {"asked": "x"})
+        (folder / "rows" / "_paths").mkdir(exist_ok=True)
+        np.savez(paths_beside(path), **record(shift_m=k_int))  # type: ignore[arg-type]
     return folder
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from train.asked import paths_beside
 from train.errors import RunFolderError, TrainError
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
@@ -120,9 +121,10 @@ def _of_sweep(found: Results, split: str | None) -> Iterator[tuple[str, Callable
     if run_means(rows, "train") and run_means(rows, "test"):
         yield "seen_unseen", lambda: seen_and_unseen(rows)
     groups: dict[tuple[str, str, int, int], dict[float, Path]] = {}
-    for path in found.records:
-        table = path.with_suffix(".parquet")
-        if table in found.tables and read_notes(table):
+    records = set(found.records)
+    for table in found.tables:
+        path = paths_beside(table)
+        if path in records and read_notes(table):
             rows_of = read_rows([table]).slice(0, 1).to_pylist()
             if rows_of and rows_of[0]["policy"] == "learned":
                 r = rows_of[0]

@@ -2,7 +2,7 @@
 
 <out_dir>/<name>/configs/<run>.yaml     complete config of a run, as `python -m train --config` takes it
                  runs/<run>/            its run folder
-                 rows/<run>-*.parquet   what it scored, and the paths of some episodes beside
+                 rows/<run>-*.parquet   what it scored; in rows/_paths/ where its robot went in some episodes
                  logs/<run>.log         what its programs printed
                  failed/<run>.json      why it was given up
                  locks/<run>            held by whoever works on it
@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from train.asked import EvaluationAsked, files_of_run
+from train.asked import EvaluationAsked, files_of_run, paths_beside
 from train.config_io import to_yaml
 from train.errors import RunFolderError
 from train.files import write_text
@@ -127,7 +127,7 @@ class SweepFolder:
         for path in files_of_run(self.rows, run.name) if wanted.is_file() else []:
             if path != wanted:
                 path.unlink()
-                path.with_suffix(".npz").unlink(missing_ok=True)
+                paths_beside(path).unlink(missing_ok=True)
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:
         """Notes why a run was given up."""
