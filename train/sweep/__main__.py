@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 
@@ -33,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("sweep", nargs="?", metavar="NAME|PATH", help=f"a sweep ({known}) or a YAML file")
     made.add_argument("--config", metavar="NAME|PATH", help="the same, as `python -m train` takes it")
     made.add_argument("--status", action="store_true", help="print how far every run is, and do nothing")
+    made.add_argument("--export", metavar="DIR", help="copy rows, curves and the best run's checkpoint of each cell")
     made.add_argument("--resume", action="store_true", help="only continue: refuse a sweep that was never begun")
     made.add_argument("--only", choices=STAGES, help="train without evaluating, or evaluate what is trained")
     made.add_argument("--redo", action="store_true", help="evaluate again what is evaluated")
@@ -76,6 +78,14 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
             states = [folder.state(run) for run in sweep.runs]
             console.print(status_table(states))
             console.print(totals(states), highlight=False, soft_wrap=True)
+            return 0
+        if arguments.export:
+            from train.sweep.export import export
+
+            size, best = export(folder, Path(arguments.export))
+            for name in best.values():
+                console.print(f"checkpoint of {name}", highlight=False)
+            console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)
             return 0
         if arguments.resume and not (folder.root / "configs").is_dir():
             raise ConfigError(f"--resume: {folder.root} holds no sweep; leave --resume out to begin it")
