@@ -72,6 +72,8 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
             raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
         if arguments.time_limit is not None and arguments.time_limit <= 0:
             raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
+        if arguments.unfinished and arguments.only != "evaluate":
+            raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
         sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
         folder = SweepFolder(sweep)
         if arguments.status:

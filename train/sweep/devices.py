@@ -104,4 +104,8 @@ def share_env(share: Share, launch: LaunchConfig) -> dict[str, str]:
         cores = max(1, int((os.cpu_count() or 1) * share.fraction))
         return {"OMP_NUM_THREADS": str(cores)} if share.fraction < 1.0 else {}
     memory = USABLE * share.fraction * launch.jax_memory_share
-    return {"CUDA_VISIBLE_DEVICES": share.gpu.name, "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{memory:.3f}"}
+    return {
+        "CUDA_DEVICE_ORDER": "PCI_BUS_ID",  # nvidia-smi's order
+        "CUDA_VISIBLE_DEVICES": share.gpu.name,
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{memory:.3f}",
+    }

@@ -177,9 +177,14 @@ def take_lock(path: Path) -> int | None:
         raise RunFolderError(f"{path}: cannot be made ({error.strerror}); expected a writable folder") from None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         os.close(descriptor)
         return None
+    except OSError as error:
+        os.close(descriptor)
+        raise RunFolderError(
+            f"{path}: its file system has no locks ({error.strerror}); set out_dir to a folder on one that does"
+        ) from None
     return descriptor
 
 

@@ -134,6 +134,7 @@ def test_a_wrong_file_is_one_line_and_exit_2(tmp_path, capsys):
         (["kitn"], "no sweep 'kitn', did you mean 'kint'?"),
         ([str(tmp_path / "no.yaml")], "cannot read"),
         ([], "expected one sweep, by name or path, got 0"),
+        (["kint", "--unfinished"], "expected --only evaluate with it"),
         (["kint", "--time-limit", "0"], "--time-limit is 0.0, expected a positive number"),
     ):
         assert main(words) == 2

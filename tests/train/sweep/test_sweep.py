@@ -242,7 +242,11 @@ def test_shares_of_a_machine():
     # 0.95 * 150.75 GB hold two runs of 60 GB, not four; the emptier GPU comes first.
     assert [s.gpu.name if s and s.gpu else None for s in shares] == ["0", "1", "0", "1", None]
     assert shares[0] is not None
-    assert share_env(shares[0], launch) == {"CUDA_VISIBLE_DEVICES": "0", "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.237"}
+    assert share_env(shares[0], launch) == {
+        "CUDA_DEVICE_ORDER": "PCI_BUS_ID",
+        "CUDA_VISIBLE_DEVICES": "0",
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.237",
+    }
     machine.give_back(shares[0])
     assert machine.take(launch) is not None and machine.take(launch) is None
     cpu = Machine([], 2)
@@ -270,3 +274,23 @@ def test_status_prints_every_run_and_does_nothing(tmp_path, capsys):
     assert main([str(path), "--resume"]) == 2
     assert "holds no sweep; leave --resume out" in capsys.readouterr().err
     assert find_gpus() is not None
+
+
+def test_unfinished_runs_can_be_evaluated_as_far_as_they_are(tmp_path):
+    slow = {f"k_int{k}-seed{s}": ["slow"] for k in (0, 1) for s in (0, 1)}
+    set_fates(tmp_path, slow)
+    path = write_sweep(tmp_path, steps=10_000)
+    logs = [tmp_path / "small" / "runs" / f"k_int0-seed{s}" / "metrics.jsonl" for s in (0, 1)]
+    sweep(path, limit_s=40.0, clock=lambda: 41.0 if all(map(last_line, logs)) else 0.0)
+    outcome, _, folder = sweep(path, stages=("evaluate",))
+    assert not list(folder.rows.glob("*.parquet"))
+    outcome, _, folder = sweep(path, stages=("evaluate",), unfinished=True)
+    assert {p.name.rsplit("-", 1)[0] for p in folder.rows.glob("*.parquet")} == {"k_int0-seed0", "k_int0-seed1"}
+    assert sorted(s.state for s in outcome.states) == ["stopped", "stopped", "waiting", "waiting"]
+    before = {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()}
+    sweep(path, stages=("evaluate",), unfinished=True)
+    assert {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()} == before
+    # Trained further, they are evaluated anew.
+    set_fates(tmp_path, {})
+    outcome, _, folder = sweep(path)
+    assert {s.state for s in outcome.states} == {"done"} and all(p.stat().st_mtime_ns > t for p, t in before.items())
