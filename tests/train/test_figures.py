@@ -17,6 +17,11 @@ from train.figures.cli import chosen_split
 from train.rows import write_parquet
 
 
+def xy(line) -> np.ndarray:
+    """[n, 2] of a drawn line."""
+    return np.asarray(line.get_xydata())
+
+
 @pytest.fixture(autouse=True)
 def closed():
     yield
@@ -88,13 +93,13 @@ def test_ins_over_alpha_shows_means_and_intervals_of_seeds():
     figure = scores.ins_over_alpha(paper_like(), "turtlebot", "test")
     by_title = {axis.get_title(): axis for axis in figure.axes if axis.get_visible()}
     assert list(by_title) == ["PPO", "SAC", "DDPG", "k$_{int}$ = 0", "k$_{int}$ = 0.1", "k$_{int}$ = 1"]
-    ends = sorted((line.get_ydata()[0], line.get_ydata()[-1]) for line in by_title["SAC"].lines)
+    ends = sorted((xy(line)[0, 1], xy(line)[-1, 1]) for line in by_title["SAC"].lines)
     np.testing.assert_allclose(ends, [(0.599, 0.83), (0.699, 0.83), (0.799, 0.63)], atol=1e-6)
-    band = by_title["SAC"].collections[1].get_paths()[0].vertices
+    band = np.asarray(by_title["SAC"].collections[1].get_paths()[0].vertices)
     at_one = band[np.isclose(band[:, 0], 1.0), 1]
     assert np.ptp(at_one) / 2 == pytest.approx(4.3027 * 0.01 / np.sqrt(3), rel=1e-3)
     # The three algorithms keep apart without colour, too.
-    looks = {(line.get_marker(), line.get_color()) for line in by_title["k$_{int}$ = 0"].lines}
+    looks = {(str(line.get_marker()), str(line.get_color())) for line in by_title["k$_{int}$ = 0"].lines}
     assert len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == 3
 
 
@@ -102,9 +107,8 @@ def test_the_plane_has_cells_in_front_of_what_never_learned():
     rows = pa.concat_tables([paper_like(), yardstick_rows()], promote_options="permissive")
     figure = scores.efficiency_plane(rows, "turtlebot", "test")
     (axis,) = figure.axes
-    places = {
-        (round(float(p), 3), round(float(e), 3)) for line in axis.lines for p, e in zip(*line.get_data(), strict=True)
-    }
+    drawn = np.concatenate([xy(line) for line in axis.lines])
+    places = {(round(float(p), 3), round(float(e), 3)) for p, e in drawn}
     assert {(0.83, 0.699), (0.63, 0.799), (0.75, 0.575), (0.5, 0.76)} <= places
     assert {(0.9, 0.6), (0.8, 0.8), (0.6, 0.9), (0.85, 0.55)} <= places
     texts = {text.get_text() for text in axis.texts}
@@ -132,8 +136,8 @@ def test_paths_side_by_side_are_of_the_same_episodes():
     # Most was moved in the last one.
     assert list(paths.spread_episodes(merged, 1)) == [1] and list(paths.spread_episodes(merged, 5)) == [0, 1]
     figure = figures.trajectories(merged, episodes=[1])
-    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 5]
-    assert [float(line.get_xdata()[-1]) for line in lines] == [3.0, 3.0]
+    lines = [line for line in figure.axes[0].lines if len(xy(line)) == 5]
+    assert [xy(line)[-1, 0] for line in lines] == [3.0, 3.0]
     assert lines[0].get_linestyle() != lines[1].get_linestyle()
 
 
