@@ -258,6 +258,10 @@ class RunConfig:
     """Checkpoints hold the environments' state up to this size; beyond it, resuming begins new episodes."""
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""
+    wandb: bool = False
+    """Log to Weights & Biases as well (WANDB_MODE=offline keeps it here)."""
+    wandb_project: str = "interactive-nav"
+    """Project there."""
 
     def __post_init__(self) -> None:
         _require(self, "seed", 0, 2**32 - 1)

@@ -257,3 +257,6 @@ def _nearest(word: str, known: Sequence[str]) -> str:
 
 def _shown(value: Any) -> str:
     return f"{value!r} ({type(value).__name__})"
+
+
+overlay, nearest = _overlay, _nearest  # for configs of other programs (`train.sweep`)

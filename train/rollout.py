@@ -64,68 +64,169 @@ def run_episodes(
     on_progress: Callable[[int, int], None] = lambda finished, step: None,
     starts: Any = None,
 ) -> Episodes:
-    """Plays every episode to its end, all in one batch.
+    """Plays every episode to its end, all in one batch; see `Player.play`."""
+    return Player(env).play(policy, keys, record, on_progress, starts)
+
+
+class Player:
+    """Plays episodes of one environment.
+
+    What is compiled is kept: policies that are `jax.tree_util.Partial`s of one function share it, whatever their
+    numbers, as do chunks of one size.
 
     Args:
         env: one environment, not batched, not resetting itself.
-        policy: see `train.policies`, or a planner.
-        keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
-        record: for how many of the first episodes to return paths.
-        on_progress: told (episodes finished, steps taken) now and then.
-        starts: of `interactive_nav.episodes.starts_of`, leaves [N, ...]: these episodes instead of drawn ones.
     """
-    count, record = len(keys), min(record, len(keys))
-    state = jax.jit(jax.vmap(env.reset))(keys) if starts is None else jax.jit(jax.vmap(env.reset_to))(starts, keys)
-    policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
-    first = jax.tree.map(np.asarray, state.info["nav"])
-    metrics = {name: np.full(count, np.nan, np.float32) for name in state.metrics}
-    object_end = first.object_pos_w.copy()
-    tracks = [[first.robot_pos_w[:record, :2]]]
 
-    episode_of = np.arange(count)  # episode played by each place in the batch
-    finished = np.zeros(count, bool)
-    planner = policy if isinstance(policy, Planner) else None
-    chunk = None if isinstance(policy, Planner) else jax.jit(functools.partial(_play_chunk, env, policy))
-    one_step = _planned_step(env) if planner else None
-    step = 0
-    while not finished.all():
-        ended_here = jnp.asarray(finished[episode_of])
-        if chunk is None:
-            state, ended, final, moved, track = _play_planned(one_step, planner, state, episode_of, ended_here, step)
+    def __init__(self, env: Any):
+        self.env = env
+        self._reset = jax.jit(jax.vmap(env.reset))
+        self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
+        self._chunk = jax.jit(functools.partial(_play_chunk, env))
+        self._step = jax.jit(functools.partial(_play_step, env))
+        self.known: dict[Any, Any] = {}
+        """Functions of learned policies, by kind: see `train.evaluate.load_policy`."""
+
+    def play(
+        self,
+        policy: PolicyFn | Planner,
+        keys: jax.Array,
+        record: int = 0,
+        on_progress: Callable[[int, int], None] = lambda finished, step: None,
+        starts: Any = None,
+        scene_index: np.ndarray | None = None,
+        batch: int | None = None,
+        on_note: Callable[[str], None] = lambda note: None,
+    ) -> Episodes:
+        """Plays every episode to its end.
+
+        Args:
+            policy: see `train.policies`, or a planner.
+            keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
+            record: for how many of the first episodes to return paths.
+            on_progress: told (episodes finished, steps taken in their batch) now and then.
+            starts: of `interactive_nav.episodes.starts_of`, leaves [N, ...]: these episodes instead of drawn ones.
+            scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
+            batch: episodes played at a time; None: all. Where the device's memory does not hold so many, half as
+                many are tried.
+            on_note: told when it does not.
+
+        Returns:
+            The episodes in the order of their keys, whatever the batch.
+        """
+        count = len(keys)
+        size = min(batch or count, count)
+        parts: list[Episodes] = []
+        done = 0
+        while done < count:
+            chosen = np.minimum(np.arange(done, done + size), count - 1)  # the last batch is as large as the others
+            take = functools.partial(jax.tree.map, operator.itemgetter(chosen))
+            try:
+                parts.append(
+                    self._play_batch(
+                        policy,
+                        take(keys),
+                        min(size, count - done),
+                        max(0, min(record - done, size)),
+                        lambda finished, step, before=done: on_progress(before + finished, step),
+                        None if starts is None else take(starts),
+                        None if scene_index is None else np.asarray(scene_index)[chosen],
+                        done,
+                    )
+                )
+            except jax.errors.JaxRuntimeError as error:
+                if "RESOURCE_EXHAUSTED" not in str(error) or size == 1:
+                    raise
+                on_note(f"{size} episodes at a time do not fit into the device's memory, going on with {size // 2}")
+                size //= 2
+                continue
+            done += size
+        return _joined(parts)
+
+    def _play_batch(
+        self,
+        policy: PolicyFn | Planner,
+        keys: jax.Array,
+        count: int,
+        record: int,
+        on_progress: Callable[[int, int], None],
+        starts: Any,
+        scene_index: np.ndarray | None,
+        first_episode: int,
+    ) -> Episodes:
+        """Plays the first `count` of the keys' episodes; the rest fill the batch and are over from the start."""
+        env, size, record = self.env, len(keys), min(record, count)
+        if starts is not None:
+            assert self._reset_to is not None
+            state = self._reset_to(starts, keys)
         else:
-            state, ended, final, moved, track = chunk(state, policy_keys[episode_of], ended_here, step)
-        step += CHUNK_STEPS
-        new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
-        for name, values in final.items():
-            metrics[name][episode_of[new]] = np.asarray(values)[new]
-        object_end[episode_of[new]] = np.asarray(moved)[new]
-        finished[episode_of[new]] = True
-        places = np.full((CHUNK_STEPS, record, 2), np.nan, np.float32)
-        seen = episode_of < record
-        places[:, episode_of[seen]] = np.asarray(track)[:, seen]
-        tracks.append(list(places))
-        on_progress(int(finished.sum()), step)
-        running = np.flatnonzero(~finished[episode_of])
-        if env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
-            state = jax.tree.map(operator.itemgetter(running), state)
-            episode_of = episode_of[running]
-    robot_xy = np.stack([place for part in tracks for place in part], 1)
-    longest = np.isfinite(robot_xy[..., 0]).any(0).sum() if record else 0
-    paths = Paths(
-        scene_index=first.scene_index[:record],
-        start_xy_w=first.start_xy_w[:record],
-        goal_xy_w=first.goal_xy_w[:record],
-        robot_xy_w=robot_xy[:, :longest],
-        object_start_w=first.object_pos_w[:record],
-        object_end_w=object_end[:record],
+            state = self._reset(keys) if scene_index is None else self._reset(keys, jnp.asarray(scene_index))
+        policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
+        first = jax.tree.map(np.asarray, state.info["nav"])
+        metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
+        object_end = first.object_pos_w.copy()
+        tracks = [[first.robot_pos_w[:record, :2]]]
+
+        episode_of = np.arange(size)  # episode played by each place in the batch
+        finished = episode_of >= count
+        planner = policy if isinstance(policy, Planner) else None
+        act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
+        if not isinstance(policy, jax.tree_util.Partial):
+            act = None if isinstance(policy, Planner) else jax.tree_util.Partial(policy)
+        step = 0
+        while not finished.all():
+            ended_here = jnp.asarray(finished[episode_of])
+            if act is None:
+                played = _play_planned(self._step, planner, state, first_episode + episode_of, ended_here, step)
+            else:
+                played = self._chunk(act, state, policy_keys[episode_of], ended_here, step)
+            state, ended, final, moved, track = played
+            step += CHUNK_STEPS
+            new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
+            for name, values in final.items():
+                metrics[name][episode_of[new]] = np.asarray(values)[new]
+            object_end[episode_of[new]] = np.asarray(moved)[new]
+            finished[episode_of[new]] = True
+            places = np.full((CHUNK_STEPS, record, 2), np.nan, np.float32)
+            seen = episode_of < record
+            places[:, episode_of[seen]] = np.asarray(track)[:, seen]
+            tracks.append(list(places))
+            on_progress(int(finished[:count].sum()), step)
+            running = np.flatnonzero(~finished[episode_of])
+            if env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
+                state = jax.tree.map(operator.itemgetter(running), state)
+                episode_of = episode_of[running]
+        robot_xy = np.stack([place for part in tracks for place in part], 1)
+        longest = np.isfinite(robot_xy[..., 0]).any(0).sum() if record else 0
+        paths = Paths(
+            scene_index=first.scene_index[:record],
+            start_xy_w=first.start_xy_w[:record],
+            goal_xy_w=first.goal_xy_w[:record],
+            robot_xy_w=robot_xy[:, :longest],
+            object_start_w=first.object_pos_w[:record],
+            object_end_w=object_end[:record],
+        )
+        return Episodes(first.scene_index[:count], {name: x[:count] for name, x in metrics.items()}, paths)
+
+
+def _joined(parts: list[Episodes]) -> Episodes:
+    """Batches one after the other; recorded paths as long as the longest."""
+    if len(parts) == 1:
+        return parts[0]
+    longest = max(part.paths.robot_xy_w.shape[1] for part in parts)
+
+    def along(name: str) -> np.ndarray:
+        arrays = [getattr(part.paths, name) for part in parts]
+        if name == "robot_xy_w":
+            pads = [((0, 0), (0, longest - a.shape[1]), (0, 0)) for a in arrays]
+            arrays = [np.pad(a, pad, constant_values=np.nan) for a, pad in zip(arrays, pads, strict=True)]
+        return np.concatenate(arrays)
+
+    return Episodes(
+        np.concatenate([part.scene_index for part in parts]),
+        {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
+        Paths(**{field.name: along(field.name) for field in dataclasses.fields(Paths)}),
     )
-    return Episodes(first.scene_index, metrics, paths)
-
-
-@functools.lru_cache(maxsize=1)
-def _planned_step(env: Any) -> Any:
-    """Compiled once for all planners of an environment: nothing of them is in it."""
-    return jax.jit(functools.partial(_play_step, env))
 
 
 def _play_step(env: Any, carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:

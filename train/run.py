@@ -21,7 +21,7 @@ from tensorboardX import SummaryWriter
 
 import interactive_nav
 from interactive_nav.wrappers import AutoResetEnv
-from train import checkpoint
+from train import checkpoint, tracking
 from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
@@ -29,7 +29,7 @@ from train.errors import CheckpointError, ConfigError, TrainError
 from train.files import write_text
 from train.learner import Snapshot, TrainResult, Update
 from train.progress import TrainingDisplay, describe
-from train.run_folder import FAILURES, RunFolder, claim, read_metrics
+from train.run_folder import FAILURES, RunFolder, claim, read_metrics, versions
 
 
 def make_env(config: EnvConfig) -> Any:
@@ -72,6 +72,7 @@ class FolderCallbacks:
         self._wall_before_s = 0.0
         self._began = time.perf_counter()
         self._events: SummaryWriter | None = None
+        self._tracker: tracking.Tracker | None = None
 
     def _wall_s(self) -> float:
         return self._wall_before_s + time.perf_counter() - self._began
@@ -108,6 +109,8 @@ class FolderCallbacks:
         note = getattr(snapshot.env_state, "note", "")
         if note:
             self._display.console.print(note, highlight=False, soft_wrap=True)
+        if self._config.run.wandb:
+            self._tracker = tracking.Tracker(self._folder.path, self._config, versions())
         self._display.begin(snapshot.env_steps, total_steps)
 
     def on_update(self, env_steps: int) -> None:
@@ -121,6 +124,8 @@ class FolderCallbacks:
             for name, value in metrics.items():
                 self._events.add_scalar(name if "/" in name else f"run/{name}", value, env_steps)
             self._events.flush()
+        if self._tracker:
+            self._tracker.log(env_steps, metrics)
         self._display.log(env_steps, metrics)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
@@ -154,6 +159,8 @@ class FolderCallbacks:
         """Finishes the event file."""
         if self._events:
             self._events.close()
+        if self._tracker:
+            self._tracker.close()
 
 
 def mean_score(lines: list[dict[str, Any]], name: str) -> float | None:
@@ -199,6 +206,8 @@ def train_run(
     Raises:
         TrainError: see `train.errors`.
     """
+    if config.run.wandb:
+        tracking.import_wandb()
     folder = RunFolder(Path(config.run.out_dir) / config.run.name)
     claim(folder.path)
     try:

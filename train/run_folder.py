@@ -33,6 +33,7 @@ PACKAGES = (
 )
 MAY_CHANGE = (
     *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),
+    *("run.wandb", "run.wandb_project"),
     *("run.env_state_limit_mb", "env.threads"),
 )
 """Settings that a run may be continued with at other values: they do not change what an update does."""
@@ -84,6 +85,23 @@ class RunFolder:
         write_text(self.config, to_yaml(config))
         write_text(self.path / "versions.json", json.dumps(versions(), indent=1) + "\n")
         return exists
+
+    def origin(self) -> dict[str, Any]:
+        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known."""
+        kept = {}
+        for name in ("summary.json", "versions.json"):
+            try:
+                kept[name] = json.loads((self.path / name).read_text())
+            except (OSError, ValueError):
+                kept[name] = {}
+        summary, versions = kept.values()
+        return {
+            "completed": summary.get("completed", False),
+            "env_steps": summary.get("env_steps"),
+            "wall_s": summary.get("wall_s"),
+            "device": versions.get("device", {}).get("kind"),
+            "commit": versions.get("commit"),
+        }
 
     def append_metrics(self, line: dict[str, Any]) -> None:
         """Adds one line to metrics.jsonl.

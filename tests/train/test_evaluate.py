@@ -13,7 +13,7 @@ from rich.console import Console
 
 from interactive_nav.env import EPISODE_METRICS
 from tests.train.toy_run import build_toy, toy_config
-from train import checkpoint, evaluate, figures
+from train import checkpoint, evaluate, figures, rollout
 from train.rows import score_table
 from train.run import train_run
 
@@ -84,6 +84,61 @@ def test_evaluation_is_repeatable_and_choosable(run, evaluated, tmp_path):
     np.testing.assert_allclose(again["robot_path_m"][5:], first["robot_path_m"][:5], rtol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def second(run, tmp_path_factory):
+    """Another run of the same kind: other numbers, another k_int and seed."""
+    config = toy_config(tmp_path_factory.mktemp("runs"), updates=2, seed=5)
+    run_config = dataclasses.replace(config.run, name="other")
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, k_int=1.0), run=run_config)
+    _, folder, _ = train_run(config, Console(file=io.StringIO()), build_env=build_toy)
+    return folder
+
+
+def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, evaluated, tmp_path):
+    """One environment, compiled once; a file a run, with the rows that each has alone; pandas reads the folder."""
+    pandas = pytest.importorskip("pandas")
+    built = []
+
+    def build(config):
+        built.append(build_toy(config))
+        return built[-1]
+
+    traced = []
+    usual = rollout._play_chunk
+
+    def counted(*arguments):
+        traced.append(arguments)
+        return usual(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "_play_chunk", counted)
+        words = ["--policies", "learned", "--episodes", "12", "--seed", "4", "--dataset", str(tmp_path)]
+        assert evaluate.main([str(run.path), str(second.path), *words], build_env=build) == 0
+        once = len(traced)
+        assert evaluate.main([str(run.path), *words], build_env=build) == 0
+    assert len(built) == 2  # one for both runs, one for the second command
+    assert once == len(traced) - once  # two runs traced the program as often as one
+    frame = pandas.read_parquet(tmp_path)
+    assert sorted(frame.groupby("run").size().to_dict().items()) == [("other", 12), ("toy", 12)]
+    assert frame.groupby("run")[["k_int", "seed"]].first().to_dict("index") == {
+        "other": {"k_int": 1.0, "seed": 5},
+        "toy": {"k_int": 0.1, "seed": 0},
+    }
+    assert set(frame["train_env_steps"]) == {512} and set(frame["train_device"]) == {"cpu"}
+    assert frame["versions"].str.contains("mujoco=").all() and (frame["evaluation_wall_s"] > 0).all()
+    assert (frame["train_wall_s"] > 0).all()
+    alone = pq.read_table(evaluated).to_pandas().query("policy == 'learned'")
+    both = frame.query("run == 'toy'").sort_values("episode")
+    np.testing.assert_allclose(both["robot_path_m"], alone["robot_path_m"], rtol=1e-5)
+    # The same question replaces its file, another one adds to the folder.
+    files = {path.name for path in tmp_path.glob("*.parquet")}
+    assert len(files) == 2
+    words[words.index("4")] = "9"
+    assert evaluate.main([str(run.path), *words], build_env=build) == 0
+    assert len({path.name for path in tmp_path.glob("*.parquet")} - files) == 1
+    assert pandas.read_parquet(tmp_path).groupby("run").size().to_dict() == {"other": 12, "toy": 24}
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -96,6 +151,8 @@ def test_evaluation_is_repeatable_and_choosable(run, evaluated, tmp_path):
         (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: cannot read"),
         (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
         (["--episodes", "0"], "--episodes is 0, expected at least 1"),
+        (["--batch", "0"], "--batch is 0, expected at least 1"),
+        (["another", "--out", "rows.parquet"], "--out is for one run; several write into a folder: --dataset DIR"),
         (["ppo.learning_rate=1"], "expected env.<setting>=value"),
         (["env.k_in=1"], "unknown key 'env.k_in', did you mean 'env.k_int'?"),
     ],

@@ -1,0 +1,73 @@
+"""What is kept of a sweep: rows as they are, thinner curves, and the checkpoint of each cell's best run alone."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.train.sweep.test_sweep import write_sweep
+from tests.train.synthetic import run_rows
+from train import checkpoint
+from train.rows import read_rows, write_parquet
+from train.run_folder import read_metrics
+from train.sweep import spec
+from train.sweep.__main__ import main
+from train.sweep.export import thinned
+from train.sweep.folder import SweepFolder
+
+
+def test_curves_are_means_over_episodes():
+    lines = [
+        {"env_steps": 10, "wall_s": 1.0, "episodes": 1.0, "episode/success": 1.0, "loss/v": 9.0},
+        {"env_steps": 20, "wall_s": 2.0, "episodes": 3.0, "episode/success": 0.0},
+        {"env_steps": 30, "wall_s": 3.0, "episodes": 0.0},
+        {"env_steps": 40, "wall_s": 4.123456, "episodes": 2.0, "episode/success": 0.123456},
+    ]
+    assert thinned(lines, 2) == [
+        {"env_steps": 20, "wall_s": 2.0, "episodes": 4.0, "episode/success": 0.25},
+        {"env_steps": 40, "wall_s": 4.1235, "episodes": 2.0, "episode/success": 0.12346},
+    ]
+    assert [line["env_steps"] for line in thinned(lines, 100)] == [10, 20, 30, 40]
+    assert [line["env_steps"] for line in thinned(lines, 3)] == [20, 40] and thinned([], 5) == []
+
+
+@pytest.fixture
+def swept(tmp_path):
+    """Two cells of two runs; seed 1 is the better one at k_int = 0, seed 0 at k_int = 1 (which has no checkpoint)."""
+    folder = SweepFolder(spec.load(str(write_sweep(tmp_path))))
+    folder.prepare()
+    for run in folder.sweep.runs:
+        home = folder.runs / run.name
+        k_int, seed = run.values["env.k_int"], run.values["run.seed"]
+        home.mkdir()
+        (home / "summary.json").write_text("{}")
+        (home / "metrics.jsonl").write_text(json.dumps({"env_steps": 5, "episodes": 1.0}) + "\n")
+        rows = run_rows("turtlebot", "ppo", k_int, seed, 0.5 + 0.1 * (seed if k_int == 0.0 else -seed), (0.5, 0.5))
+        rows = rows.set_column(0, "run", [[run.name] * len(rows)])
+        write_parquet(rows, folder.rows / folder.asked(run).file_name(run.name), {"trained_steps": "5"})
+        if k_int == 0.0:
+            meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, "ppo", "turtlebot", ("goal",), 3, 2)
+            state = {"x": np.zeros(4)}
+            snapshot = type("S", (), {"learner": {"w": np.full(3, seed, np.float32)}, "env_state": state})()
+            checkpoint.save(home / "checkpoints", snapshot, meta, 1, 1.0)
+    return folder
+
+
+def test_what_is_kept(swept, tmp_path, capsys):
+    out = tmp_path / "results"
+    old = out / "rows" / "k_int0-seed0-01234567.parquet"
+    for _ in range(2):  # again replaces
+        old.parent.mkdir(parents=True, exist_ok=True)
+        old.write_bytes(b"of an evaluation that the sweep no longer has")
+        assert main([str(tmp_path / "small.yaml"), "--export", str(out)]) == 0
+        printed = capsys.readouterr().out
+        assert "checkpoint of k_int0-seed1" in printed and "k_int0-seed0" not in printed and "MiB" in printed
+        assert len(read_rows(list((out / "rows").glob("*.parquet")))) == 4 * 40
+        assert sorted(path.name for path in (out / "runs").iterdir()) == [run.name for run in swept.sweep.runs]
+        assert read_metrics(out / "runs" / "k_int1-seed0" / "metrics.jsonl") == [{"env_steps": 5, "episodes": 1.0}]
+        (kept,) = out.rglob("learner.msgpack")
+        assert kept.parts[-4] == "k_int0-seed1" and not list(out.rglob(checkpoint.ENV_STATE))
+        path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
+        np.testing.assert_array_equal(checkpoint.load_learner(path, {"w": np.zeros(3, np.float32)})["w"], [1.0] * 3)

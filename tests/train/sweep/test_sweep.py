@@ -1,0 +1,296 @@
+"""Sweeps with quick programs in place of training: what runs, what is skipped, tried again, given up, stopped."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from rich.console import Console
+
+from train.sweep import spec
+from train.sweep.__main__ import main
+from train.sweep.devices import Gpu, Machine, find_gpus, parse_gpus, share_env
+from train.sweep.folder import RunState, SweepFolder, is_locked, last_line, take_lock
+from train.sweep.local import LocalLauncher
+from train.sweep.scheduler import Outcome, Programs, Scheduler
+from train.sweep.spec import LaunchConfig
+from train.sweep.table import SweepDisplay, totals
+
+FAKE = Programs(train=("-m", "tests.train.sweep.fake", "train"), evaluate=("-m", "tests.train.sweep.fake", "evaluate"))
+ROOT = Path(__file__).parents[3]
+
+
+def write_sweep(folder: Path, steps: int = 50, seeds: int = 2, **parts: object) -> Path:
+    plain = {
+        "out_dir": str(folder),
+        "preset": "turtlebot_ppo",
+        "grid": {"env.k_int": [0.0, 1.0], "run.seed": list(range(seeds))},
+        "settings": {"run": {"num_timesteps": steps}},
+        "evaluate": {"scenes": ["scenes_mjcf/alder", "scenes_mjcf/rowan"]},
+        "launch": {"slots": 2, "retries": 1, "grace_s": 20.0},
+    } | parts
+    path = folder / "small.yaml"
+    path.write_text(yaml.safe_dump(plain))
+    return path
+
+
+def sweep(path: Path, machine: Machine | None = None, limit_s: float | None = None, **keywords: object):
+    """(outcome, what was printed, folder) of one command."""
+    console = Console(file=io.StringIO(), width=400)
+    folder = SweepFolder(spec.load(str(path)))
+    folder.prepare()
+    launcher = LocalLauncher(machine or Machine([], 2))
+    with SweepDisplay(console) as display:
+        scheduler = Scheduler(folder, launcher, display, programs=FAKE, **keywords)  # type: ignore[arg-type]
+        outcome = scheduler.run([], limit_s, poll_s=0.05)
+    return outcome, console.file.getvalue(), folder  # type: ignore[attr-defined]
+
+
+def set_fates(folder: Path, fates: dict[str, list[str]]) -> None:
+    """What the programs of `fake` do in each try."""
+    (folder / "fates.json").write_text(json.dumps(fates))
+
+
+def tries(folder: SweepFolder) -> dict[str, int]:
+    return {
+        run.name: len(path.read_text().splitlines()) if (path := folder.runs / run.name / "tries").is_file() else 0
+        for run in folder.sweep.runs
+    }
+
+
+@pytest.fixture(autouse=True)
+def fake_on_path(monkeypatch):
+    monkeypatch.chdir(ROOT)
+
+
+def test_a_sweep_trains_evaluates_and_is_not_done_twice(tmp_path):
+    path = write_sweep(tmp_path)
+    outcome, printed, folder = sweep(path)
+    assert outcome.exit_code("done") == 0 and {s.state for s in outcome.states} == {"done"}
+    assert [s.env_steps for s in outcome.states] == [50] * 4
+    assert set(tries(folder).values()) == {1}
+    assert len(list(folder.rows.glob("*.parquet"))) == 4
+    assert "train k_int0-seed0: started (cpu)" in printed and "4 runs: 4 done" in totals(outcome.states)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file() and "configs" not in p.parts}
+    again, printed, _ = sweep(path)
+    assert again.exit_code("done") == 0 and "started" not in printed
+    after = {p: p.stat().st_mtime_ns for p in before}
+    assert before == after
+    # More steps are wanted: the same runs go on, and are evaluated anew, their old rows gone.
+    outcome, _, folder = sweep(write_sweep(tmp_path, steps=80))
+    assert [s.env_steps for s in outcome.states] == [80] * 4 and {s.state for s in outcome.states} == {"done"}
+    assert len(list(folder.rows.glob("*.parquet"))) == 4
+    assert set(tries(folder).values()) == {2}
+    # Another question to them: evaluated anew, not trained.
+    more = {"scenes": ["scenes_mjcf/alder", "scenes_mjcf/rowan"], "episodes": 7}
+    outcome, _, folder = sweep(write_sweep(tmp_path, steps=80, evaluate=more))
+    assert {s.state for s in outcome.states} == {"done"} and set(tries(folder).values()) == {2}
+    assert len(list(folder.rows.glob("*.parquet"))) == 4
+
+
+def test_stages_can_be_run_and_repeated_alone(tmp_path):
+    path = write_sweep(tmp_path)
+    outcome, _, folder = sweep(path, stages=("train",))
+    assert {s.state for s in outcome.states} == {"trained"} and not list(folder.rows.glob("*"))
+    assert outcome.exit_code("trained") == 0
+    outcome, printed, folder = sweep(path, stages=("evaluate",))
+    assert {s.state for s in outcome.states} == {"done"} and printed.count("started") == 1  # k_int is in no score
+    written = {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()}
+    assert len(written) == 4
+    sweep(path, stages=("evaluate",))
+    assert {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()} == written
+    sweep(path, stages=("evaluate",), redo=True)
+    assert all(p.stat().st_mtime_ns > written[p] for p in folder.rows.iterdir())
+
+
+def test_failures_stay_with_their_run_and_are_tried_again_so_many_times(tmp_path, monkeypatch):
+    fates = {
+        "k_int0-seed0": ["crash"],
+        "k_int0-seed1": ["crash", "crash", "crash"],
+        "k_int1-seed0": ["refuse", "refuse"],
+        "k_int1-seed1": ["", "", "no-evaluation"],
+    }
+    set_fates(tmp_path, fates)
+    outcome, printed, folder = sweep(write_sweep(tmp_path))
+    assert outcome.exit_code("done") == 1
+    states = {s.name: s for s in outcome.states}
+    assert states["k_int0-seed0"].state == "done"
+    assert states["k_int0-seed1"].state == states["k_int1-seed0"].state == "failed"
+    assert states["k_int1-seed1"].state == "trained"  # its evaluation failed, alone
+    assert tries(folder) == {"k_int0-seed0": 2, "k_int0-seed1": 2, "k_int1-seed0": 1, "k_int1-seed1": 1}
+    assert states["k_int0-seed1"].reason == "train: ended with exit code 1: IndexError: the toy broke"
+    assert "env.scenes is empty" in states["k_int1-seed0"].reason and "no checkpoint" in states["k_int1-seed1"].reason
+    assert "tried again (1 of 1)" in printed and "given up after 2 tries" in printed
+    assert "    IndexError: the toy broke" in printed and "another try cannot mend it" in printed
+    # The next command begins with a clean slate, and what was mended goes through.
+    set_fates(tmp_path, {})
+    outcome, _, folder = sweep(write_sweep(tmp_path))
+    assert outcome.exit_code("done") == 0 and not any(s.reason for s in outcome.states)
+    assert not list((folder.root / "failed").iterdir())
+
+
+def test_a_run_out_of_memory_gets_twice_the_share(tmp_path, monkeypatch):
+    set_fates(tmp_path, {"k_int0-seed0": ["oom", "oom"]})
+    launch = {"runs_per_gpu": 4, "retries": 2, "jax_memory_share": 0.5}
+    machine = Machine([Gpu("0", 100.0), Gpu("1", 100.0)], 1)
+    outcome, printed, folder = sweep(write_sweep(tmp_path, seeds=3, launch=launch), machine)
+    assert outcome.exit_code("done") == 0 and "tried again with twice the memory (1 of 2)" in printed
+    fractions = [line.split()[1] for line in (folder.runs / "k_int0-seed0" / "tries").read_text().splitlines()]
+    # 0.95 usable * share * 0.5 for JAX, at a quarter, a half and the whole of a GPU.
+    assert fractions == ["0.119", "0.237", "0.475"]
+    # Six runs of a quarter each were spread over both GPUs.
+    seen = {(folder.runs / run.name / "tries").read_text().split()[0] for run in folder.sweep.runs}
+    assert seen == {"0", "1"}
+
+
+def test_time_limit_stops_with_what_was_done_and_the_same_command_goes_on(tmp_path, monkeypatch):
+    slow = {f"k_int{k}-seed{s}": ["slow"] for k in (0, 1) for s in (0, 1)}
+    set_fates(tmp_path, slow)
+    path = write_sweep(tmp_path, steps=10_000)
+    logs = [tmp_path / "small" / "runs" / f"k_int0-seed{s}" / "metrics.jsonl" for s in (0, 1)]
+    # Time flies once the first two are at work.
+    outcome, printed, folder = sweep(path, limit_s=40.0, clock=lambda: 41.0 if all(map(last_line, logs)) else 0.0)
+    assert outcome.timed_out and outcome.exit_code("done") == 3
+    assert "time limit of 40 s: 2 run(s) are writing their checkpoints" in printed
+    assert sorted(s.state for s in outcome.states) == ["stopped", "stopped", "waiting", "waiting"]
+    stopped = {s.name: s.env_steps for s in outcome.states if s.state == "stopped"}
+    assert all(0 < steps < 10_000 for steps in stopped.values())
+    for name in stopped:  # it ended by itself, after SIGTERM
+        assert json.loads((folder.runs / name / "summary.json").read_text())["completed"] is False
+    set_fates(tmp_path, {})
+    outcome, printed, _ = sweep(path)
+    assert outcome.exit_code("done") == 0
+    first_two = [line.split()[2].rstrip(":") for line in printed.splitlines() if "started (cpu)" in line][:2]
+    assert set(first_two) == set(stopped)  # what was begun goes first
+
+
+def running(pid: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_children_end_with_the_sweep_however_it_ends(tmp_path, number):
+    path = write_sweep(tmp_path, steps=100_000)
+    program = (
+        "import sys; from train.sweep.__main__ import main; from tests.train.sweep.test_sweep import FAKE\n"
+        f"sys.exit(main([{str(path)!r}], FAKE))"
+    )
+    slow = {f"k_int{k}-seed{s}": ["slow"] * 9 for k in (0, 1) for s in (0, 1)}
+    set_fates(tmp_path, slow)
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], env=env, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    logs = [tmp_path / "small" / "runs" / f"k_int0-seed{s}" / "metrics.jsonl" for s in (0, 1)]
+    deadline = time.monotonic() + 60
+    while not all(last_line(log) for log in logs) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    pids = [last_line(log)["pid"] for log in logs]
+    assert all(running(pid) for pid in pids)
+    if number == signal.SIGINT:  # as a terminal does it: to the whole group
+        os.killpg(process.pid, number)
+    else:
+        process.send_signal(number)
+    printed, _ = process.communicate(timeout=60)
+    assert process.returncode == (-9 if number == signal.SIGKILL else 128 + number)
+    deadline = time.monotonic() + 20
+    while any(running(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(running(pid) for pid in pids)
+    for log in logs:  # each saved before it ended
+        assert json.loads((log.parent / "summary.json").read_text())["env_steps"] == last_line(log)["env_steps"]
+    if number != signal.SIGKILL:
+        assert f"{number.name}: 2 run(s) are writing" in printed and "the same command continues" in printed
+
+
+def test_a_run_that_somebody_else_works_on_is_left_alone(tmp_path):
+    path = write_sweep(tmp_path)
+    folder = SweepFolder(spec.load(str(path)))
+    folder.prepare()
+    held = take_lock(folder.lock("k_int0-seed1"))
+    assert held is not None and is_locked(folder.lock("k_int0-seed1")) and not is_locked(folder.lock("k_int0-seed0"))
+    outcome, printed, _ = sweep(path)
+    os.close(held)
+    assert outcome.elsewhere == 1 and tries(folder)["k_int0-seed1"] == 0
+    assert "train k_int0-seed1: somebody else works on it" in printed
+    assert sorted(s.state for s in outcome.states) == ["done", "done", "done", "running"]
+    outcome, _, _ = sweep(path)
+    assert outcome.exit_code("done") == 0 and outcome.elsewhere == 0
+
+
+def test_shares_of_a_machine():
+    listing = "0, GPU-aa, 143771\n1, GPU-bb, 143771\nnonsense\n"
+    gpus = parse_gpus(listing, None)
+    assert [g.name for g in gpus] == ["0", "1"] and gpus[0].memory_gb == pytest.approx(150.75, abs=0.01)
+    assert [g.name for g in parse_gpus(listing, "1")] == ["1"]
+    assert [g.name for g in parse_gpus(listing, "GPU-bb,GPU-aa")] == ["GPU-bb", "GPU-aa"]
+    assert parse_gpus(listing, "") == []
+    launch = LaunchConfig(runs_per_gpu=4, gpu_memory_gb=60.0, jax_memory_share=0.5)
+    machine = Machine(gpus, 1)
+    shares = [machine.take(launch) for _ in range(5)]
+    # 0.95 * 150.75 GB hold two runs of 60 GB, not four; the emptier GPU comes first.
+    assert [s.gpu.name if s and s.gpu else None for s in shares] == ["0", "1", "0", "1", None]
+    assert shares[0] is not None
+    assert share_env(shares[0], launch) == {
+        "CUDA_DEVICE_ORDER": "PCI_BUS_ID",
+        "CUDA_VISIBLE_DEVICES": "0",
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.237",
+    }
+    machine.give_back(shares[0])
+    assert machine.take(launch) is not None and machine.take(launch) is None
+    cpu = Machine([], 2)
+    first = cpu.take(launch)
+    assert first is not None and first.label == "cpu" and cpu.take(launch) is not None and cpu.take(launch) is None
+
+
+def test_exit_codes():
+    done, trained = RunState("a", "done", 9, 9, {}), RunState("b", "trained", 9, 9, {})
+    failed, waiting = RunState("c", "failed", 3, 9, {}, "train: x"), RunState("d", "waiting", 0, 9, {})
+    assert Outcome((done, done), None, True, 0).exit_code("done") == 0
+    assert Outcome((done, trained), None, False, 0).exit_code("trained") == 0
+    assert Outcome((done, waiting), None, True, 0).exit_code("done") == 3
+    assert Outcome((done, waiting, failed), None, True, 0).exit_code("done") == 1
+    assert Outcome((done, waiting, failed), 15, False, 0).exit_code("done") == 143
+    running = RunState("e", "running", 400, 1000, {"env_steps_per_s": 5.0})
+    assert totals([done, running]) == "2 runs: 1 running, 1 done; 600 env steps left at 5 a second: about 2 min"
+
+
+def test_status_prints_every_run_and_does_nothing(tmp_path, capsys):
+    path = write_sweep(tmp_path)
+    assert main([str(path), "--status"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("waiting") == 5 and "k_int1-seed1" in printed and not (tmp_path / "small").exists()
+    assert main([str(path), "--resume"]) == 2
+    assert "holds no sweep; leave --resume out" in capsys.readouterr().err
+    assert find_gpus() is not None
+
+
+def test_unfinished_runs_can_be_evaluated_as_far_as_they_are(tmp_path):
+    slow = {f"k_int{k}-seed{s}": ["slow"] for k in (0, 1) for s in (0, 1)}
+    set_fates(tmp_path, slow)
+    path = write_sweep(tmp_path, steps=10_000)
+    logs = [tmp_path / "small" / "runs" / f"k_int0-seed{s}" / "metrics.jsonl" for s in (0, 1)]
+    sweep(path, limit_s=40.0, clock=lambda: 41.0 if all(map(last_line, logs)) else 0.0)
+    outcome, _, folder = sweep(path, stages=("evaluate",))
+    assert not list(folder.rows.glob("*.parquet"))
+    outcome, _, folder = sweep(path, stages=("evaluate",), unfinished=True)
+    assert {p.name.rsplit("-", 1)[0] for p in folder.rows.glob("*.parquet")} == {"k_int0-seed0", "k_int0-seed1"}
+    assert sorted(s.state for s in outcome.states) == ["stopped", "stopped", "waiting", "waiting"]
+    before = {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()}
+    sweep(path, stages=("evaluate",), unfinished=True)
+    assert {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()} == before
+    # Trained further, they are evaluated anew.
+    set_fates(tmp_path, {})
+    outcome, _, folder = sweep(path)
+    assert {s.state for s in outcome.states} == {"done"} and all(p.stat().st_mtime_ns > t for p, t in before.items())

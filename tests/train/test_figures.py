@@ -1,0 +1,181 @@
+"""Figures from rows alone: what they show is what the rows say, and every one is drawn for a whole sweep."""
+
+from __future__ import annotations
+
+import json
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tests.train.synthetic import paper_like, run_rows, write_results, yardstick_rows
+from train import figures
+from train.asked import paths_beside
+from train.figures import curves, paths, scores, style, tables
+from train.figures.cli import chosen_split
+from train.rows import write_parquet
+
+
+def xy(line) -> np.ndarray:
+    """[n, 2] of a drawn line."""
+    return np.asarray(line.get_xydata())
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    folder = write_results(tmp_path_factory.mktemp("results"))
+    # Two seeds of one cell with learning curves, and paths of two k_int in the same episodes.
+    for seed in (0, 1):
+        run = folder / "runs" / f"turtlebot-ppo-k_int0-seed{seed}"
+        run.mkdir(parents=True)
+        lines = [{"env_steps": t, "episode/success": t / 1000 + 0.1 * seed, "episode/ins_0.5": 0.5} for t in (100, 500)]
+        (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        facts = {"robot": "turtlebot", "algorithm": "ppo", "k_int": 0.0, "seed": seed}
+        (run / "summary.json").write_text(json.dumps(facts))
+    for k_int in (0.0, 1.0):
+        rows = run_rows("turtlebot", "ppo", k_int, 7, 0.5, (0.9, 0.9))
+        path = folder / "rows" / f"k{k_int:g}-0123abcd.parquet"
+        write_parquet(rows, path, {"asked": "x"})
+        (folder / "rows" / "_paths").mkdir(exist_ok=True)
+        np.savez(paths_beside(path), **record(shift_m=k_int))  # type: ignore[arg-type]
+    return folder
+
+
+def record(shift_m: float, episodes: int = 3) -> dict[str, np.ndarray]:
+    """Paths as `train.evaluate` writes them: in episode i the robot drives i + 1 m and pushes a box `shift_m` x i."""
+    track = np.stack([np.linspace(0, 1, 5), np.zeros(5)], -1) * (np.arange(episodes) + 1)[:, None, None]
+    begin = np.tile([0.5, 0.5, 0.0], (episodes, 1, 1))
+    end = begin + np.array([1.0, 0.0, 0.0]) * shift_m * np.arange(episodes)[:, None, None]
+    return {
+        "policies": np.array(["learned"]),
+        "learned/scene_index": np.zeros(episodes, int),
+        "learned/start_xy_w": track[:, 0],
+        "learned/goal_xy_w": track[:, -1],
+        "learned/robot_xy_w": track,
+        "learned/object_start_w": begin,
+        "learned/object_end_w": end,
+        "learned/success": np.ones(episodes),
+        "scene/0/name": np.array("den"),
+        "scene/0/traversable": np.ones((40, 60), bool),
+        "scene/0/furniture": np.zeros((40, 60), bool),
+        "scene/0/resolution_m": np.array(0.1),
+        "scene/0/origin_w": np.array([-1.0, -2.0]),
+        "scene/0/object_names": np.array(["chair_0"]),
+    }
+
+
+def test_every_figure_of_a_sweep_is_drawn(results, tmp_path, capsys):
+    assert figures.main([str(results), "-o", str(tmp_path)]) == 0
+    assert sorted(path.stem for path in tmp_path.iterdir()) == [
+        "effort_terms",
+        "ins_over_alpha_fetch",
+        "ins_over_alpha_turtlebot",
+        "learning_curves",
+        "path_effort_fetch",
+        "path_effort_turtlebot",
+        "robots",
+        "seen_unseen",
+        "trajectories_turtlebot_ppo",
+    ]
+    assert all(path.stat().st_size > 20_000 for path in tmp_path.iterdir())
+    capsys.readouterr()
+
+
+def test_ins_over_alpha_shows_means_and_intervals_of_seeds():
+    """SAC on TurtleBot at k_int = 0.1: P_eff 0.83, E_eff 0.699, seeds 0.01 apart: half width 4.3027 x 0.01 / sqrt 3."""
+    figure = scores.ins_over_alpha(paper_like(), "turtlebot", "test")
+    by_title = {axis.get_title(): axis for axis in figure.axes if axis.get_visible()}
+    assert list(by_title) == ["PPO", "SAC", "DDPG", "k$_{int}$ = 0", "k$_{int}$ = 0.1", "k$_{int}$ = 1"]
+    ends = sorted((xy(line)[0, 1], xy(line)[-1, 1]) for line in by_title["SAC"].lines)
+    np.testing.assert_allclose(ends, [(0.599, 0.83), (0.699, 0.83), (0.799, 0.63)], atol=1e-6)
+    band = np.asarray(by_title["SAC"].collections[1].get_paths()[0].vertices)
+    at_one = band[np.isclose(band[:, 0], 1.0), 1]
+    assert np.ptp(at_one) / 2 == pytest.approx(4.3027 * 0.01 / np.sqrt(3), rel=1e-3)
+    # The three algorithms keep apart without colour, too.
+    looks = {(str(line.get_marker()), str(line.get_color())) for line in by_title["k$_{int}$ = 0"].lines}
+    assert len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == 3
+
+
+def test_the_plane_has_cells_in_front_of_what_never_learned():
+    rows = pa.concat_tables([paper_like(), yardstick_rows()], promote_options="permissive")
+    figure = scores.efficiency_plane(rows, "turtlebot", "test")
+    (axis,) = figure.axes
+    drawn = np.concatenate([xy(line) for line in axis.lines])
+    places = {(round(float(p), 3), round(float(e), 3)) for p, e in drawn}
+    assert {(0.83, 0.699), (0.63, 0.799), (0.75, 0.575), (0.5, 0.76)} <= places
+    assert {(0.9, 0.6), (0.8, 0.8), (0.6, 0.9), (0.85, 0.55)} <= places
+    texts = {text.get_text() for text in axis.texts}
+    assert texts == {"w=0", "w=0.5", "w=1", "follower"}
+
+
+def test_learning_curves_meet_at_the_steps_all_seeds_have():
+    runs = [
+        [{"env_steps": t, "s": v} for t, v in ((0, 0.0), (100, 1.0), (200, 1.0))],
+        [{"env_steps": t, "s": v} for t, v in ((50, 0.0), (150, 1.0))] + [{"env_steps": 160}],
+    ]
+    steps, values = curves.common_curve(runs, "s")
+    np.testing.assert_array_equal(steps, [50, 100, 150])
+    np.testing.assert_allclose(values, [[0.5, 1.0, 1.0], [0.0, 0.5, 1.0]])
+    assert curves.common_curve([[{"env_steps": 1}]], "s")[0].size == 0
+    np.testing.assert_allclose(curves.running_mean(np.array([[1.0, 2.0, 6.0, 3.0]]), 3), [[1.5, 3.0, 11 / 3, 4.5]])
+
+
+def test_paths_side_by_side_are_of_the_same_episodes():
+    one, other = record(0.0), record(1.0)
+    other["learned/goal_xy_w"] = other["learned/goal_xy_w"] + np.array([[0, 0], [1, 1], [0, 0]])
+    merged = paths.side_by_side({"k_int = 0": one, "k_int = 1": other})
+    assert [str(name) for name in merged["policies"]] == ["k_int = 0", "k_int = 1"]
+    np.testing.assert_array_equal(merged["k_int = 1/goal_xy_w"], one["learned/goal_xy_w"][[0, 2]])
+    # Most was moved in the last one.
+    assert list(paths.spread_episodes(merged, 1)) == [1] and list(paths.spread_episodes(merged, 5)) == [0, 1]
+    figure = figures.trajectories(merged, episodes=[1])
+    lines = [line for line in figure.axes[0].lines if len(xy(line)) == 5]
+    assert [xy(line)[-1, 0] for line in lines] == [3.0, 3.0]
+    assert lines[0].get_linestyle() != lines[1].get_linestyle()
+
+
+def test_tables_say_what_the_rows_say(results, capsys):
+    assert figures.main([str(results), "--tables"]) == 0
+    printed = capsys.readouterr().out
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed.splitlines() if line[:1] == "|"]
+    found = {tuple(line[:4]): line[4:] for line in lines}
+    assert found["TurtleBot", "SAC", "0.1", "unseen"] == [
+        *("3", "60", "0.950 ± 0.000", "0.830 ± 0.025", "0.699 ± 0.025", "0.764 ± 0.025"),
+    ]
+    assert found["TurtleBot", "namo:0.5", "unseen", "20"][1].startswith("0.800 [")
+    assert [line for line in lines if line[0] == "turtlebot-sac-k_int1-seed2"] == [
+        ["turtlebot-sac-k_int1-seed2", "2,000", "1,000", "1.5", "toy", "0123456789", "toy"]
+    ]
+    assert "SAC is best overall" in printed and "Welch" in printed
+
+
+def test_tables_need_learned_rows(tmp_path, capsys):
+    write_parquet(yardstick_rows(), tmp_path / "y.parquet")
+    assert figures.main([str(tmp_path), "--tables"]) == 2
+    assert "no rows of learned runs; evaluate them first" in capsys.readouterr().err
+
+
+def test_unseen_scenes_are_shown_where_there_are_any():
+    rows = paper_like(("turtlebot",))
+    assert chosen_split(rows, "auto") == "test" and chosen_split(rows, None) is None
+    seen = rows.filter(pa.array([split == "train" for split in rows["split"].to_pylist()]))
+    assert chosen_split(seen, "auto") == "train"
+
+
+def test_looks_keep_apart():
+    among = ["ppo", "td3", "a2c"]
+    assert len({style.look(style.ALGORITHMS, name, among) for name in among}) == 3
+    assert [style.fill_of(k, [0.0, 0.1, 1.0]) for k in (0.0, 0.1, 1.0)] == ["none", "left", "full"]
+    assert len({str(style.line_of(k, [0.0, 0.1, 1.0])) for k in (0.0, 0.1, 1.0)}) == 3
+    assert style.in_order({"zeta", "ddpg", "ppo", "sac"}) == ["ppo", "sac", "ddpg", "zeta"]
+
+
+def test_markdown_tables_by_hand():
+    assert tables.markdown(("a", "b"), [(1, "x")]) == "| a | b |\n| --- | --- |\n| 1 | x |\n"

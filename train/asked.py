@@ -1,0 +1,50 @@
+"""What an evaluation was asked to play, and the file of rows that answers it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationAsked:
+    """What an evaluation was asked to play: with the run, it names a file of rows."""
+
+    scenes: tuple[str, ...]
+    policies: tuple[str, ...]
+    episodes: int
+    seed: int
+    balanced: bool
+    """Scenes take turns."""
+    checkpoint: str
+    deterministic: bool
+    settings: tuple[str, ...] = ()
+    """env.key=value words."""
+    episode_file: str = ""
+    """Digest of a file of episodes."""
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    def file_name(self, run: str) -> str:
+        """`<run>-<8 hex>.parquet`: the same question about a run replaces its file, another one adds one."""
+        digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()
+        return f"{run}-{digest[:8]}.parquet"
+
+
+def files_of_run(dataset: Path, run: str) -> list[Path]:
+    """Files of rows in a dataset folder that are of one run."""
+    name = re.compile(re.escape(run) + r"-[0-9a-f]{8}\.parquet")
+    return sorted(path for path in dataset.glob("*.parquet") if name.fullmatch(path.name))
+
+
+def paths_beside(rows: Path) -> Path:
+    """Where the recorded paths of a file of rows lie: in a dataset's `_paths`, which readers of a folder pass over."""
+    in_dataset = re.search(r"-[0-9a-f]{8}\.parquet$", rows.name)
+    folder = rows.parent / "_paths" if in_dataset else rows.parent
+    return folder / f"{rows.stem}.npz"

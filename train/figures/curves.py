@@ -1,0 +1,152 @@
+"""Lines of metrics.jsonl in; learning curves out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter
+
+from train.figures import style
+from train.statistics import estimate
+
+CURVES = (
+    ("episode/success", "success"),
+    ("episode/ins_0.5", "INS$_{0.5}$"),
+    ("episode/sum_reward", "episode reward"),
+)
+SMOOTHED = 40
+"""Curves of more points than this are drawn as running means over a twentieth of them."""
+
+
+def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
+    """Success, INS_0.5 and reward of training episodes over environment steps, a line a run.
+
+    Args:
+        runs: name -> lines of its metrics.jsonl.
+    """
+    figure, axes = plt.subplots(1, len(CURVES), figsize=(4 * len(CURVES), 3.2), layout="constrained")
+    for axis, (key, label) in zip(axes, CURVES, strict=True):
+        for name, lines in runs.items():
+            seen = [(line["env_steps"], line[key]) for line in lines if key in line]
+            axis.plot(*np.array(seen).reshape(-1, 2).T, label=name, marker="." if len(seen) < 30 else None)
+        if key != "episode/sum_reward":
+            axis.set_ylim(-0.02, 1.02)
+        axis.set_xlabel("environment steps")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    figure.suptitle("training episodes (exploring policy), means over log intervals", fontsize=10)
+    return figure
+
+
+def common_curve(runs: Sequence[Sequence[Mapping[str, Any]]], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Curves of several runs at the same steps.
+
+    Args:
+        runs: lines of metrics of each.
+        key: the metric; lines without it are left out.
+
+    Returns:
+        steps [T] that all runs have reached, values [runs, T], linear between logged points.
+    """
+    curves = []
+    for lines in runs:
+        points = np.array([(line["env_steps"], line[key]) for line in lines if key in line], float).reshape(-1, 2)
+        if len(points):
+            curves.append(points)
+    if not curves:
+        return np.zeros(0), np.zeros((0, 0))
+    low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
+    steps = np.unique(np.concatenate([c[:, 0] for c in curves]))
+    steps = steps[(steps >= low) & (steps <= high)]
+    return steps, np.stack([np.interp(steps, *c.T) for c in curves])
+
+
+def running_mean(values: np.ndarray, width: int) -> np.ndarray:
+    """Centred means over up to `width` points along the last axis, fewer at the ends."""
+    if width <= 1:
+        return values
+    sums = np.cumsum(np.concatenate([np.zeros((*values.shape[:-1], 1)), values], -1), -1)
+    at = np.arange(values.shape[-1])
+    low, high = np.maximum(at - width // 2, 0), np.minimum(at + width // 2 + 1, values.shape[-1])
+    return (sums[..., high] - sums[..., low]) / (high - low)
+
+
+def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
+    """Success, INS_0.5 and reward of training episodes over env steps: a line a cell, with its seeds' interval.
+
+    Args:
+        cells: (robot, algorithm, k_int) -> lines of metrics of each of its runs.
+    """
+    robots = sorted({cell[0] for cell in cells}, reverse=True)
+    algorithms = style.in_order({cell[1] for cell in cells})
+    k_ints = sorted({cell[2] for cell in cells})
+    with style.applied():
+        size = (3.3 * len(CURVES), 2.5 * len(robots) + 0.7)
+        figure, grid = plt.subplots(len(robots), len(CURVES), figsize=size, squeeze=False, layout="constrained")
+        seeds = set()
+        for (robot, algorithm, k_int), runs in sorted(cells.items()):
+            colour, marker = style.look(style.ALGORITHMS, algorithm, algorithms)
+            for axis, (key, _) in zip(grid[robots.index(robot)], CURVES, strict=True):
+                steps, values = common_curve(runs, key)
+                if not len(steps):
+                    continue
+                values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
+                seeds.add(len(values))
+                points = [estimate(column) for column in values.T]
+                axis.plot(
+                    steps,
+                    [point.mean for point in points],
+                    color=colour,
+                    linestyle=style.line_of(k_int, k_ints),
+                    marker=marker,
+                    markevery=max(1, len(steps) // 6),
+                    markersize=4,
+                    fillstyle=style.fill_of(k_int, k_ints),
+                    linewidth=1.2,
+                )
+                bounds = (-np.inf, np.inf) if key == "episode/sum_reward" else (0.0, 1.0)
+                low, high = (np.clip([getattr(p, end) for p in points], *bounds) for end in ("low", "high"))
+                axis.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
+        for row, robot in zip(grid, robots, strict=True):
+            for axis, (key, label) in zip(row, CURVES, strict=True):
+                if key != "episode/sum_reward":
+                    axis.set_ylim(-0.02, 1.02)
+                axis.set_xlabel("environment steps")
+                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+                axis.set_ylabel(label)
+                axis.set_title(style.robot_name(robot))
+        handles = [
+            Line2D(
+                [],
+                [],
+                color=style.look(style.ALGORITHMS, a, algorithms)[0],
+                label=style.name_of(a),
+                marker=style.look(style.ALGORITHMS, a, algorithms)[1],
+                markersize=4,
+            )
+            for a in algorithms
+        ]
+        handles += [
+            Line2D(
+                [],
+                [],
+                color="0.3",
+                linestyle=style.line_of(k, k_ints),
+                marker="o",
+                markersize=4,
+                fillstyle=style.fill_of(k, k_ints),
+                label=f"k$_{{int}}$ = {k:g}",
+            )
+            for k in k_ints
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        told = "-".join(str(n) for n in sorted({min(seeds), max(seeds)})) if seeds else "0"
+        figure.suptitle(f"training episodes (exploring policy); mean of {told} seeds, 95 % t interval", fontsize=9)
+    return figure

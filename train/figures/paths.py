@@ -1,0 +1,144 @@
+"""Recorded paths in; top views of where robots went and what they moved out (paper, figures 7 and 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from train.figures.style import policy_colour
+
+FURNITURE_COLOUR = "#ecd9b8"
+MOVED_M = 0.02
+"""Objects moved less than this are drawn once."""
+LINES = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
+"""Of the first, second, ... policy: without colour, too, they can be told apart."""
+
+
+def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Sequence[int] | None = None) -> Figure:
+    """Top views: where each policy's robot went in the same episodes, and what it moved.
+
+    Args:
+        paths: arrays that `train.evaluate` recorded.
+        most: episodes to draw.
+        episodes: which; the first ones where None.
+    """
+    policies = [str(name) for name in paths["policies"]]
+    chosen = list(episodes) if episodes is not None else range(min(most, len(paths[f"{policies[0]}/goal_xy_w"])))
+    count = len(chosen)
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    aspect = _aspect(paths)
+    size = (4.4 * columns, (4.0 * aspect + 0.9) * rows + 0.6)  # panels, their titles and labels, the legend
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis in grid.flat[count:]:
+        axis.set_axis_off()
+    for axis, i in zip(grid.flat, chosen, strict=False):
+        _draw_episode(axis, paths, policies, i)
+    handles = [
+        Line2D([], [], color=policy_colour(p, k), linestyle=LINES[k % len(LINES)], label=p)
+        for k, p in enumerate(policies)
+    ]
+    grey: dict[str, Any] = {"color": "0.35", "linestyle": ""}
+    handles += [
+        Line2D([], [], marker="o", markerfacecolor="w", label="start", markersize=8, **grey),
+        Line2D([], [], marker="*", label="goal", markersize=11, **grey),
+        Patch(color=FURNITURE_COLOUR, label="furniture at start, as far as it bars the robot"),
+        Line2D([], [], marker="s", markerfacecolor="none", label="object at start", markersize=6, **grey),
+        Line2D([], [], marker="s", label="object at end (coloured by who moved it)", markersize=6, **grey),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[str], i: int) -> None:
+    scene = int(paths[f"{policies[0]}/scene_index"][i])
+    free = paths[f"scene/{scene}/traversable"]
+    resolution_m, origin = float(paths[f"scene/{scene}/resolution_m"]), paths[f"scene/{scene}/origin_w"]
+    rows, columns = free.shape
+    extent = (origin[0], origin[0] + columns * resolution_m, origin[1], origin[1] + rows * resolution_m)
+    kind = np.where(free, np.where(paths[f"scene/{scene}/furniture"], 1, 2), 0)
+    colours = ListedColormap(["0.72", FURNITURE_COLOUR, "1.0"])
+    axis.imshow(kind, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=2, interpolation="nearest")
+    begin = paths[f"{policies[0]}/object_start_w"][i, :, :2]
+    # Empty slots and objects that found no place wait far outside the map.
+    inside = ((begin > [extent[0], extent[2]]) & (begin < [extent[1], extent[3]])).all(-1)
+    axis.scatter(*begin[inside].T, s=26, marker="s", facecolors="none", edgecolors="0.35", linewidths=0.9)
+    for k, policy in enumerate(policies):
+        colour = policy_colour(policy, k)
+        end = paths[f"{policy}/object_end_w"][i, :, :2]
+        moved = inside & (np.linalg.norm(end - begin, axis=-1) > MOVED_M)
+        for a, b in zip(begin[moved], end[moved], strict=True):
+            axis.plot(*np.stack([a, b]).T, color=colour, linewidth=0.8, linestyle=":")
+        axis.scatter(*end[moved].T, s=26, marker="s", color=colour, linewidths=0, zorder=6)
+        track = paths[f"{policy}/robot_xy_w"][i]
+        track = track[np.isfinite(track[:, 0])]
+        axis.plot(*track.T, color=colour, linewidth=1.6, linestyle=LINES[k % len(LINES)], alpha=0.9)
+        if not paths[f"{policy}/success"][i]:
+            axis.plot(*track[-1], marker="x", color=colour, markersize=7, markeredgewidth=2)
+    start, goal = paths[f"{policies[0]}/start_xy_w"][i], paths[f"{policies[0]}/goal_xy_w"][i]
+    axis.plot(*start, marker="o", markerfacecolor="w", markeredgecolor="k", markersize=8, zorder=5)
+    axis.plot(*goal, marker="*", color="#e69f00", markeredgecolor="k", markersize=14, zorder=5)
+    reached = [policy for policy in policies if paths[f"{policy}/success"][i]]
+    axis.set_title(
+        f"{paths[f'scene/{scene}/name']}, episode {i}\nreached by: {', '.join(reached) or 'none'}", fontsize=9
+    )
+    axis.set_aspect("equal")
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
+    axis.tick_params(labelsize=7)
+    axis.set_xlabel("x [m]", fontsize=8)
+    axis.set_ylabel("y [m]", fontsize=8)
+
+
+def _aspect(paths: Mapping[str, np.ndarray]) -> float:
+    shapes = [paths[name].shape for name in paths if name.endswith("/traversable")]
+    return float(np.clip(max(rows / columns for rows, columns in shapes), 0.5, 1.6))
+
+
+def side_by_side(records: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Paths of several runs in the same episodes as paths of one record.
+
+    Args:
+        records: label -> arrays that `train.evaluate` recorded of a run; the first one's scenes are kept.
+
+    Returns:
+        What `trajectories` takes, a policy a label; only episodes that begin alike in all of them.
+    """
+    first = next(iter(records.values()))
+    count = min(len(record["learned/goal_xy_w"]) for record in records.values())
+    same = np.ones(count, bool)
+    for record in records.values():
+        for name in ("scene_index", "start_xy_w", "goal_xy_w"):
+            mine, its = first[f"learned/{name}"][:count], record[f"learned/{name}"][:count]
+            same &= np.isclose(mine, its).reshape(count, -1).all(1)
+    merged = {name: value for name, value in first.items() if name.startswith("scene/")}
+    merged["policies"] = np.array(list(records))
+    for label, record in records.items():
+        for name, value in record.items():
+            if name.startswith("learned/"):
+                merged[f"{label}/{name.removeprefix('learned/')}"] = value[:count][same]
+    return merged
+
+
+def spread_episodes(paths: Mapping[str, np.ndarray], most: int) -> Sequence[int]:
+    """Episodes to draw: those in which most was moved come first, from as many scenes as there are."""
+    policies = [str(name) for name in paths["policies"]]
+    scene = paths[f"{policies[0]}/scene_index"]
+    moved = np.zeros(len(scene))
+    for policy in policies:
+        begin, end = paths[f"{policy}/object_start_w"], paths[f"{policy}/object_end_w"]
+        moved = np.maximum(moved, np.linalg.norm(end - begin, axis=-1).clip(max=5.0).sum(-1))
+    order = np.argsort(-moved, kind="stable")
+    seen: dict[int, int] = {}
+    rank = {}
+    for i in order:
+        rank[i] = seen[int(scene[i])] = seen.get(int(scene[i]), -1) + 1
+    return sorted(sorted(order, key=lambda i: rank[i])[:most])

@@ -1,0 +1,315 @@
+"""Rows of a sweep in; the paper's figures 5, 6 and 9 to 13 out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from train.figures import style
+from train.figures.frontier import equal_ins
+from train.statistics import RunMean, cells, correlation, estimate, p_text, run_means, seen_unseen
+
+ALPHAS = np.linspace(0.0, 1.0, 11)
+DOTS = 3000
+"""Episodes drawn at most as dots."""
+SPLITS = {"train": "seen (training) scenes", "test": "unseen (test) scenes", None: "all scenes"}
+
+
+class Legend:
+    """Values that a set of runs has on the sweep's axes."""
+
+    def __init__(self, means: Sequence[RunMean]):
+        self.robots = sorted({run.robot for run in means}, reverse=True)
+        self.algorithms = style.in_order({run.algorithm for run in means})
+        self.k_ints = sorted({run.k_int for run in means})
+        seeds = sorted({len(runs) for runs in cells(means).values()})
+        self.seeds = "-".join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1]))) if seeds else "0"
+
+    def algorithm_handles(self) -> list[Line2D]:
+        """For a legend."""
+        found = []
+        for algorithm in self.algorithms:
+            colour, marker = style.look(style.ALGORITHMS, algorithm, self.algorithms)
+            found.append(Line2D([], [], color=colour, marker=marker, markersize=5, label=style.name_of(algorithm)))
+        return found
+
+    def k_int_handles(self) -> list[Line2D]:
+        """For a legend."""
+        return [
+            Line2D(
+                [],
+                [],
+                color="0.3",
+                marker="o",
+                markersize=5,
+                fillstyle=style.fill_of(k, self.k_ints),
+                linestyle=style.line_of(k, self.k_ints),
+                label=f"k$_{{int}}$ = {k:g}",
+            )
+            for k in self.k_ints
+        ]
+
+
+def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
+    """INS_alpha over alpha (paper, figures 5 and 12): above a panel an algorithm, below a panel a k_int."""
+    means = [run for run in run_means(rows, split) if run.robot == robot]
+    has, by_cell = Legend(means), cells(means)
+    with style.applied():
+        wide = max(len(has.algorithms), len(has.k_ints))
+        size = (2.9 * wide, 6.0)
+        figure, grid = plt.subplots(
+            2, wide, figsize=size, squeeze=False, sharex=True, sharey=True, layout="constrained"
+        )
+        for axis in grid.flat:
+            axis.set_visible(False)
+        for (_, algorithm, k_int), runs in by_cell.items():
+            points = [estimate(run.ins(alpha) for run in runs) for alpha in ALPHAS]
+            colour, marker = style.look(style.ALGORITHMS, algorithm, has.algorithms)
+            places = (grid[0, has.algorithms.index(algorithm)], grid[1, has.k_ints.index(k_int)])
+            for axis, title in zip(places, (style.name_of(algorithm), f"k$_{{int}}$ = {k_int:g}"), strict=True):
+                axis.set_visible(True)
+                axis.set_title(title)
+                axis.plot(
+                    ALPHAS,
+                    [p.mean for p in points],
+                    color=colour,
+                    marker=marker,
+                    markevery=5,
+                    markersize=5,
+                    fillstyle=style.fill_of(k_int, has.k_ints),
+                    linestyle=style.line_of(k_int, has.k_ints),
+                )
+                axis.fill_between(
+                    ALPHAS, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.13, linewidth=0
+                )
+        low, high = grid[0, 0].get_ylim()
+        grid[0, 0].set_ylim(max(low, -0.02), min(high, 1.02))  # no score lies outside, though an interval may
+        for axis in grid[:, 0]:
+            axis.set_ylabel("INS$_α$")
+        for axis in grid[1]:
+            axis.set_xlabel("α: 0 effort only, 1 path only")
+        for axis in grid[0]:
+            axis.tick_params(labelbottom=True)
+        handles = [*has.algorithm_handles(), *has.k_int_handles()]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        figure.suptitle(
+            f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds} seeds, 95 % t interval", fontsize=9
+        )
+    return figure
+
+
+def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
+    """Path against effort efficiency of each cell (paper, figures 6 and 11), before those who never learned."""
+    means = [run for run in run_means(rows, split) if run.robot == robot]
+    has = Legend(means)
+    with style.applied():
+        figure, axis = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
+        _yardsticks(axis, rows, robot, split)
+        for algorithm in has.algorithms:
+            colour, marker = style.look(style.ALGORITHMS, algorithm, has.algorithms)
+            _chain(axis, [run for run in means if run.algorithm == algorithm], has.k_ints, colour, marker)
+        _finish_plane(axis)
+        handles = [*has.algorithm_handles(), *_without_line(has.k_int_handles())]
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6))
+        axis.set_title(
+            f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds} seeds, 95 % t intervals\n"
+            "grey lines: equal INS$_{0.5}$, steps of 0.1"
+        )
+    return figure
+
+
+def robots_plane(rows: pa.Table, split: str | None) -> Figure:
+    """Path against effort efficiency of each robot (paper, figure 9)."""
+    means = run_means(rows, split)
+    has = Legend(means)
+    with style.applied():
+        wide = len(has.algorithms)
+        figure, grid = plt.subplots(
+            1, wide, figsize=(3.4 * wide + 0.6, 3.9), squeeze=False, sharex=True, sharey=True, layout="constrained"
+        )
+        for axis, algorithm in zip(grid[0], has.algorithms, strict=True):
+            for robot in has.robots:
+                colour, marker = style.look(style.ROBOTS, robot, has.robots)
+                runs = [run for run in means if (run.algorithm, run.robot) == (algorithm, robot)]
+                _chain(axis, runs, has.k_ints, colour, marker)
+            axis.set_title(style.name_of(algorithm))
+        _finish_plane(*grid[0])
+        for axis in grid[0, 1:]:
+            axis.set_ylabel("")
+        looks = {robot: style.look(style.ROBOTS, robot, has.robots) for robot in has.robots}
+        handles = [
+            Line2D([], [], color=c, marker=m, markersize=5, linestyle="-", label=style.robot_name(robot))
+            for robot, (c, m) in looks.items()
+        ]
+        figure.legend(handles=[*handles, *_without_line(has.k_int_handles())], loc="outside lower center", ncols=5)
+        figure.suptitle(f"{SPLITS[split]}; mean of {has.seeds} seeds, 95 % t intervals", fontsize=9)
+    return figure
+
+
+def effort_terms(rows: pa.Table, split: str | None) -> Figure:
+    """Kinematic against dynamic term of E_eff (paper, figure 10): runs large, some of their episodes as dots."""
+    means = run_means(rows, split)
+    has = Legend(means)
+    episodes = _learned(rows, split)
+    with style.applied():
+        wide = len(has.robots)
+        figure, grid = plt.subplots(1, wide, figsize=(3.9 * wide, 4.3), squeeze=False, layout="constrained")
+        for axis, robot in zip(grid[0], has.robots, strict=True):
+            chosen = np.asarray(episodes["robot"].to_pylist()) == robot
+            x, y = (episodes[name].to_numpy()[chosen] for name in ("kinematic_effort", "dynamic_effort"))
+            shown = np.random.default_rng(0).permutation(len(x))[:DOTS]
+            axis.scatter(x[shown], y[shown], s=3, color="0.75", linewidths=0, rasterized=True, zorder=1)
+            runs = [run for run in means if run.robot == robot]
+            for run in runs:
+                colour, marker = style.look(style.ALGORITHMS, run.algorithm, has.algorithms)
+                axis.plot(
+                    run.scores["kinematic_effort"],
+                    run.scores["dynamic_effort"],
+                    color=colour,
+                    marker=marker,
+                    fillstyle=style.fill_of(run.k_int, has.k_ints),
+                    markersize=6,
+                    linestyle="",
+                    zorder=3,
+                )
+            over_runs = correlation(
+                (run.scores["kinematic_effort"] for run in runs), (run.scores["dynamic_effort"] for run in runs)
+            )
+            axis.set_title(
+                f"{style.robot_name(robot)}\nr over runs: {over_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
+            )
+            axis.set_xlabel("kinematic term of E$_{eff}$")
+            axis.set_ylabel("dynamic term of E$_{eff}$")
+            low = max(0.0, 0.1 * np.floor(10 * min(x.min(), y.min())))
+            axis.set_xlim(low - 0.02, 1.02)
+            axis.set_ylim(low - 0.02, 1.02)
+            axis.set_aspect("equal")
+        dot: Any = Line2D([], [], color="0.75", marker=".", linestyle="", label="episode")
+        handles = _without_line([*has.algorithm_handles(), *has.k_int_handles()])
+        figure.legend(handles=[*handles, dot], loc="outside lower center", ncols=4 if wide == 1 else 7)
+        figure.suptitle(SPLITS[split] or "", fontsize=9)
+    return figure
+
+
+def seen_and_unseen(rows: pa.Table) -> Figure:
+    """INS_0.5 of each cell on training and on test scenes, with the test of the paper (figure 13)."""
+    pairs, test = seen_unseen(rows)
+    assert test is not None, "there are rows of both"
+    has = Legend([train for train, _ in pairs])
+    by_cell = cells([train for train, _ in pairs])
+    unseen = cells([test for _, test in pairs])
+    order = sorted(by_cell, key=lambda c: (has.robots.index(c[0]), has.algorithms.index(c[1]), c[2]))
+    with style.applied():
+        size = (max(5.6, 0.62 * len(order) + 1.4), 3.9)
+        figure, axis = plt.subplots(figsize=size, layout="constrained")
+        for i, cell in enumerate(order):
+            colour, marker = style.look(style.ALGORITHMS, cell[1], has.algorithms)
+            for runs, shift, fill in ((by_cell[cell], -0.14, "full"), (unseen[cell], 0.14, "none")):
+                e = estimate(run.ins(0.5) for run in runs)
+                bar = None if math.isnan(e.half) else e.half
+                axis.errorbar(
+                    i + shift, e.mean, bar, color=colour, marker=marker, fillstyle=fill, capsize=2, markersize=6
+                )
+                x = np.full(len(runs), i + shift + 0.09 * np.sign(shift))
+                axis.scatter(x, [run.ins(0.5) for run in runs], s=5, color="0.5", linewidths=0, zorder=1)
+        axis.set_xticks(range(len(order)))
+        robot_too = len(has.robots) > 1
+        labels = [f"{style.name_of(a)}\n{k:g}" + (f"\n{style.robot_name(r)}" if robot_too else "") for r, a, k in order]
+        axis.set_xticklabels(labels, fontsize=7)
+        axis.set_xlabel("algorithm, k$_{int}$" + (", robot" if robot_too else ""))
+        axis.set_ylabel("INS$_{0.5}$")
+        axis.grid(axis="x", visible=False)
+        p = "" if math.isnan(test.p_value) else f", one-sample t test p {p_text(test.p_value)}"
+        axis.set_title(
+            f"unseen minus seen: {test.difference:+.3f} over {len(pairs)} runs{p}\n"
+            "markers: mean over seeds, 95 % t interval; dots: runs"
+        )
+        handles = [
+            Line2D([], [], color="0.3", marker="o", linestyle="", fillstyle="full", label="training scenes"),
+            Line2D([], [], color="0.3", marker="o", linestyle="", fillstyle="none", label="unseen scenes"),
+        ]
+        handles = [*_without_line(has.algorithm_handles()), *handles]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return figure
+
+
+def _chain(axis: Axes, runs: Sequence[RunMean], k_ints: list[float], colour: str, marker: str) -> None:
+    """A marker with intervals for each k_int, joined in its order."""
+    places = []
+    for k_int in sorted({run.k_int for run in runs}):
+        chosen = [run for run in runs if run.k_int == k_int]
+        p = estimate(run.scores["path_efficiency"] for run in chosen)
+        e = estimate(run.scores["effort_efficiency"] for run in chosen)
+        axis.errorbar(
+            p.mean,
+            e.mean,
+            None if math.isnan(e.half) else e.half,
+            None if math.isnan(p.half) else p.half,
+            color=colour,
+            marker=marker,
+            markersize=7,
+            fillstyle=style.fill_of(k_int, k_ints),
+            capsize=2,
+            elinewidth=0.8,
+            linestyle="",
+            zorder=4,
+        )
+        places.append((p.mean, e.mean))
+    axis.plot(*np.array(places).T, color=colour, linewidth=0.9, alpha=0.7, zorder=3)
+
+
+def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> None:
+    """Policies that never learned, in grey: the planner's weights as a line, the others as named points."""
+    policy = np.asarray(rows["policy"].to_pylist())
+    chosen = (policy != "learned") & (np.asarray(rows["robot"].to_pylist()) == robot)
+    if split is not None:
+        chosen &= np.asarray(rows["split"].to_pylist()) == split
+    p, e = (rows[name].to_numpy() for name in ("path_efficiency", "effort_efficiency"))
+    line = []
+    for name in dict.fromkeys(policy[chosen]):
+        at = chosen & (policy == name)
+        place = float(p[at].mean()), float(e[at].mean())
+        kind, _, weight = name.partition(":")
+        if kind == "namo":
+            line.append((float(weight), *place))
+            label = f"w={float(weight):g}"
+        else:
+            label = name
+        axis.plot(*place, marker="." if kind == "namo" else "x", color="0.45", zorder=2)
+        axis.annotate(label, place, xytext=(4, -9), textcoords="offset points", fontsize=7, color="0.35")
+    if line:
+        points = np.array(sorted(line))[:, 1:]
+        axis.plot(*points.T, color="0.45", linewidth=1.0, zorder=2)
+
+
+def _finish_plane(*axes: Axes) -> None:
+    """Labels, limits and lines of equal INS_0.5, once everything is drawn; the limits follow the data."""
+    x, y = axes[0].get_xlim(), axes[0].get_ylim()
+    for axis in axes:
+        equal_ins(axis)
+        axis.set_xlim(max(-0.02, x[0] - 0.03), min(1.03, x[1] + 0.03))
+        axis.set_ylim(max(-0.02, y[0] - 0.03), min(1.01, y[1] + 0.03))
+        axis.grid(visible=False)
+        axis.set_xlabel(style.P_LABEL)
+        axis.set_ylabel(style.E_LABEL)
+
+
+def _without_line(handles: list[Line2D]) -> list[Line2D]:
+    for handle in handles:
+        handle.set_linestyle("")
+    return handles
+
+
+def _learned(rows: pa.Table, split: str | None) -> pa.Table:
+    chosen = np.asarray(rows["policy"].to_pylist()) == "learned"
+    if split is not None:
+        chosen &= np.asarray(rows["split"].to_pylist()) == split
+    return rows.filter(pa.array(chosen))

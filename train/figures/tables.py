@@ -1,0 +1,107 @@
+"""Rows of a sweep in; Markdown tables of scores, claims and provenance out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pyarrow as pa
+
+from train.figures import style
+from train.rows import interval
+from train.statistics import cells, claims, estimate, run_means
+
+SPLITS = {"train": "seen", "test": "unseen"}
+COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
+NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
+
+
+def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """A table."""
+    rows = [list(header), ["---"] * len(header), *([str(cell) for cell in line] for line in lines)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def score_cells(rows: pa.Table) -> str:
+    """Scores of every cell on seen and unseen scenes: mean over seeds and half of the 95 % t interval."""
+    lines = []
+    for split, name in SPLITS.items():
+        for (robot, algorithm, k_int), runs in cells(run_means(rows, split)).items():
+            scores = [estimate(run.scores[score] for run in runs) for score in NAMES]
+            episodes = sum(run.episodes for run in runs)
+            where = (style.robot_name(robot), style.name_of(algorithm), f"{k_int:g}", name)
+            lines.append((*where, len(runs), f"{episodes:,}", *scores))
+    lines.sort(key=lambda line: (line[0], line[1], line[2]))
+    return markdown(("robot", "algorithm", "k_int", "scenes", "runs", "episodes", *COLUMNS), lines)
+
+
+def yardsticks(rows: pa.Table) -> str:
+    """Scores of policies that never learned: mean over episodes and their 95 % interval; empty where there are none."""
+    policy = np.asarray(rows["policy"].to_pylist())
+    keys = sorted({key for key in zip(rows["robot"].to_pylist(), policy, rows["split"].to_pylist(), strict=True)})
+    robots, splits = np.asarray(rows["robot"].to_pylist()), np.asarray(rows["split"].to_pylist())
+    lines = []
+    for robot, name, split in keys:
+        if name == "learned":
+            continue
+        at = (robots == robot) & (policy == name) & (splits == split)
+        scores = []
+        for score in NAMES:
+            values = rows[score].to_numpy()[at]
+            low, high = interval(score, values)
+            scores.append(f"{values.mean():.3f} [{low:.3f}, {high:.3f}]")
+        lines.append((style.robot_name(robot), name, SPLITS.get(split, split), f"{int(at.sum()):,}", *scores))
+    return markdown(("robot", "policy", "scenes", "episodes", *COLUMNS), lines) if lines else ""
+
+
+def claim_lines(rows: pa.Table, split: str | None) -> str:
+    """The paper's claims and what the runs say to them."""
+    lines = [(f.claim, f.compared, f.result, f.verdict) for f in claims(rows, split)]
+    return markdown(("claim", "compared", "difference [95 % interval], p", "here"), lines)
+
+
+def provenance(rows: pa.Table) -> str:
+    """Env steps, wall-clock, device and commit of every run."""
+    names = ("run", "train_env_steps", "checkpoint_steps", "train_wall_s", "train_device", "train_commit", "device")
+    if not set(names) <= set(rows.column_names):
+        return ""
+    learned = rows.filter(pa.array([policy == "learned" for policy in rows["policy"].to_pylist()]))
+    found = learned.group_by(list(names)).aggregate([("episode", "count")]).to_pylist()
+    lines = [
+        (
+            row["run"],
+            _number(row["train_env_steps"]),
+            _number(row["checkpoint_steps"]),
+            "-" if row["train_wall_s"] is None else f"{row['train_wall_s'] / 60:.1f}",
+            row["train_device"] or "-",
+            (row["train_commit"] or "-")[:10],
+            row["device"],
+        )
+        for row in sorted(found, key=lambda row: row["run"])
+    ]
+    header = ("run", "env steps", "evaluated at", "wall-clock [min]", "trained on", "commit", "evaluated on")
+    return markdown(header, lines)
+
+
+def _number(value: int | None) -> str:
+    return "-" if value is None else f"{value:,}"
+
+
+def document(rows: pa.Table, split: str | None) -> str:
+    """All tables, with what the numbers mean."""
+    shown = {"train": "training", "test": "unseen", None: "all"}[split]
+    parts = [
+        "## Scores",
+        "Mean over runs ± half of the 95 % t interval over seeds; a run's score is the mean over its fixed episodes.",
+        score_cells(rows),
+        "## The paper's claims",
+        f"On {shown} scenes unless the line says otherwise. Two-sided Welch t tests over seeds, each seed's score the "
+        "mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
+        "`undecided` and `no significant difference` say that these runs cannot tell, not that there is none.",
+        claim_lines(rows, split),
+    ]
+    if known := yardsticks(rows):
+        parts += ["## Policies that never learned", "Mean over episodes [95 % interval].", known]
+    if runs := provenance(rows):
+        parts += ["## Runs", runs]
+    return "\n\n".join(part.rstrip() for part in parts) + "\n"

@@ -1,0 +1,119 @@
+"""`python -m train.sweep`: one YAML file in; trained runs and rows of their evaluation out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from train.errors import ConfigError, TrainError
+from train.run_folder import claim
+from train.sweep import spec
+from train.sweep.devices import Machine, find_gpus
+from train.sweep.folder import SweepFolder
+from train.sweep.local import Launcher, LocalLauncher
+from train.sweep.scheduler import STAGES, Programs, Scheduler, collected_signals
+from train.sweep.spec import Sweep
+from train.sweep.table import SweepDisplay, status_table, totals
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m train.sweep",
+        description="Trains and evaluates every run of a sweep. The same command continues what was stopped or killed, "
+        "and leaves out what is done.",
+        epilog=f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done, 1 runs were given up, "
+        "2 the file is wrong, 3 stopped by the time limit, 128 + signal",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    known = ", ".join(spec.known_sweeps())
+    made.add_argument("sweep", nargs="?", metavar="NAME|PATH", help=f"a sweep ({known}) or a YAML file")
+    made.add_argument("--config", metavar="NAME|PATH", help="the same, as `python -m train` takes it")
+    made.add_argument("--status", action="store_true", help="print how far every run is, and do nothing")
+    made.add_argument("--export", metavar="DIR", help="copy rows, curves and the best run's checkpoint of each cell")
+    made.add_argument("--resume", action="store_true", help="only continue: refuse a sweep that was never begun")
+    made.add_argument("--only", choices=STAGES, help="train without evaluating, or evaluate what is trained")
+    made.add_argument("--redo", action="store_true", help="evaluate again what is evaluated")
+    made.add_argument("--unfinished", action="store_true", help="evaluate unfinished runs too, as far as they are")
+    made.add_argument("--time-limit", type=float, metavar="SECONDS", help="then stop all runs, with their checkpoints")
+    made.add_argument(
+        "--where", action="append", default=[], metavar="KEY=VALUE[,VALUE]", help="only these runs (may be repeated)"
+    )
+    made.add_argument("--shard", metavar="I/N", help="only every N-th run, from the I-th: one machine's part")
+    made.add_argument("--launcher", choices=("local", "ray"), default="local", help="this machine, or a Ray cluster")
+    made.add_argument("--ray-address", default="auto", metavar="ADDRESS", help="of the cluster (default: auto)")
+    return made
+
+
+def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
+    """Where jobs are to run.
+
+    Raises:
+        ConfigError: Ray is wanted and missing, or its cluster cannot be reached.
+    """
+    if name == "ray":
+        from train.sweep.on_ray import RayLauncher
+
+        return RayLauncher(address)
+    return LocalLauncher(Machine(find_gpus(), sweep.config.launch.slots))
+
+
+def main(argv: Sequence[str] | None = None, programs: Programs | None = None) -> int:
+    """Runs a sweep; see `Outcome.exit_code`."""
+    arguments = parser().parse_args(argv)
+    console = Console()
+    try:
+        chosen = [name for name in (arguments.sweep, arguments.config) if name]
+        if len(chosen) != 1:
+            raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
+        if arguments.time_limit is not None and arguments.time_limit <= 0:
+            raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
+        if arguments.unfinished and arguments.only != "evaluate":
+            raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
+        sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
+        folder = SweepFolder(sweep)
+        if arguments.status:
+            states = [folder.state(run) for run in sweep.runs]
+            console.print(status_table(states))
+            console.print(totals(states), highlight=False, soft_wrap=True)
+            return 0
+        if arguments.export:
+            from train.sweep.export import export
+
+            size, best = export(folder, Path(arguments.export))
+            for name in best.values():
+                console.print(f"checkpoint of {name}", highlight=False)
+            console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)
+            return 0
+        if arguments.resume and not (folder.root / "configs").is_dir():
+            raise ConfigError(f"--resume: {folder.root} holds no sweep; leave --resume out to begin it")
+        claim(folder.root)
+        folder.prepare()
+        launcher = make_launcher(arguments.launcher, arguments.ray_address, sweep)
+        stages = (arguments.only,) if arguments.only else STAGES
+        try:
+            with collected_signals() as stops, SweepDisplay(console) as display:
+                display.event(f"{folder.root}: {len(sweep.runs)} runs")
+                outcome = Scheduler(
+                    folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs
+                ).run(stops, arguments.time_limit)
+        finally:
+            launcher.close()
+    except TrainError as error:
+        print(f"train.sweep: {error}", file=sys.stderr)
+        return 2
+    console.print(status_table(outcome.states))
+    console.print(totals(outcome.states), highlight=False, soft_wrap=True)
+    if outcome.elsewhere:
+        console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them", highlight=False)
+    if outcome.stopped_by or outcome.timed_out:
+        console.print("the same command continues", highlight=False)
+    return outcome.exit_code("trained" if arguments.only == "train" else "done")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

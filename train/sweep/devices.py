@@ -1,0 +1,111 @@
+"""What a machine has, and which part of it a run gets."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+
+from train.sweep.spec import LaunchConfig
+
+USABLE = 0.95
+"""Part of a GPU's memory that runs may fill: the driver takes some."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gpu:
+    """One GPU."""
+
+    name: str
+    """As CUDA_VISIBLE_DEVICES takes it: an index or a UUID."""
+    memory_gb: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """Part of a machine for one run."""
+
+    gpu: Gpu | None
+    fraction: float
+    """Of the GPU's memory, or of the machine's cores."""
+
+    @property
+    def label(self) -> str:
+        """For the table."""
+        return "cpu" if self.gpu is None else f"gpu {self.gpu.name}"
+
+
+def find_gpus() -> list[Gpu]:
+    """The NVIDIA GPUs that this process may use; none where there are none."""
+    query = ["nvidia-smi", "--query-gpu=index,uuid,memory.total", "--format=csv,noheader,nounits"]
+    try:
+        done = subprocess.run(query, capture_output=True, text=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return parse_gpus(done.stdout if done.returncode == 0 else "", os.environ.get("CUDA_VISIBLE_DEVICES"))
+
+
+def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
+    """The GPUs of nvidia-smi's `index, uuid, MiB` lines that CUDA_VISIBLE_DEVICES (None: unset) leaves."""
+    found: dict[str, Gpu] = {}
+    for line in listing.splitlines():
+        fields = [field.strip() for field in line.split(",")]
+        if len(fields) == 3 and fields[2].isdecimal():
+            memory_gb = int(fields[2]) * 2**20 / 1e9
+            found[fields[0]] = Gpu(fields[0], memory_gb)
+            found[fields[1]] = Gpu(fields[1], memory_gb)
+    names = [n for n in found if n.isdecimal()] if visible is None else [n.strip() for n in visible.split(",")]
+    return [found[name] for name in names if name in found]
+
+
+class Machine:
+    """Gives out shares of one machine, and takes them back."""
+
+    def __init__(self, gpus: list[Gpu], slots: int):
+        self._gpus, self._slots = gpus, slots
+        self._given: list[Share] = []
+
+    def take(self, launch: LaunchConfig, factor: float = 1.0) -> Share | None:
+        """A share for a run; None where there is no room.
+
+        Args:
+            launch: of the run.
+            factor: this many times the usual share, at most a whole GPU.
+        """
+        if not self._gpus:
+            if len(self._given) >= self._slots:
+                return None
+            share = Share(None, 1.0 / self._slots)
+        else:
+            free = {gpu: 1.0 - sum(s.fraction for s in self._given if s.gpu == gpu) for gpu in self._gpus}
+            gpu = max(free, key=lambda g: free[g])
+            share = Share(gpu, min(1.0, factor * fraction_of(gpu, launch)))
+            if share.fraction > free[gpu] + 1e-9:
+                return None
+        self._given.append(share)
+        return share
+
+    def give_back(self, share: Share) -> None:
+        """A run is over."""
+        self._given.remove(share)
+
+
+def fraction_of(gpu: Gpu, launch: LaunchConfig) -> float:
+    """Part of a GPU's memory that one run gets."""
+    runs = launch.runs_per_gpu
+    if launch.gpu_memory_gb:
+        runs = max(1, min(runs, int(USABLE * gpu.memory_gb / launch.gpu_memory_gb)))
+    return 1.0 / runs
+
+
+def share_env(share: Share, launch: LaunchConfig) -> dict[str, str]:
+    """Environment variables that keep a run within its share."""
+    if share.gpu is None:
+        cores = max(1, int((os.cpu_count() or 1) * share.fraction))
+        return {"OMP_NUM_THREADS": str(cores)} if share.fraction < 1.0 else {}
+    memory = USABLE * share.fraction * launch.jax_memory_share
+    return {
+        "CUDA_DEVICE_ORDER": "PCI_BUS_ID",  # nvidia-smi's order
+        "CUDA_VISIBLE_DEVICES": share.gpu.name,
+        "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{memory:.3f}",
+    }

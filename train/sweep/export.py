@@ -1,0 +1,109 @@
+"""A sweep's folder in; what is worth keeping of it out: rows, thinned curves, origins, the best checkpoints."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from train import checkpoint
+from train.asked import files_of_run, paths_beside
+from train.errors import CheckpointError, RunFolderError
+from train.files import write_text
+from train.rows import read_rows
+from train.run_folder import RunFolder, read_metrics
+from train.statistics import run_means
+from train.sweep.folder import SweepFolder
+from train.sweep.spec import RunSpec
+
+CURVE_LINES = 100
+"""Lines of metrics that an exported run keeps."""
+KEPT = ("env_steps", "wall_s", "env_steps_per_s", "episodes")
+FILES = ("config.yaml", "versions.json", "summary.json")
+
+
+def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], str]]:
+    """Copies a sweep's results; what is there already of the same runs is replaced.
+
+    Args:
+        folder: of the sweep.
+        out: `<out>/rows` and `<out>/runs` are written.
+
+    Returns:
+        Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
+        over its rows, on test scenes where there are any.
+
+    Raises:
+        RunFolderError: it cannot be written.
+    """
+    runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
+    try:
+        if folder.rows.is_dir():
+            names = shutil.ignore_patterns(".*")
+            shutil.copytree(folder.rows, out / "rows", dirs_exist_ok=True, ignore=names)
+            for path in (path for run in runs for path in files_of_run(out / "rows", run.name)):
+                if not (folder.rows / path.name).is_file():  # of an evaluation that was replaced since
+                    path.unlink()
+                    paths_beside(path).unlink(missing_ok=True)
+        for run in runs:
+            source, target = RunFolder(folder.runs / run.name), out / "runs" / run.name
+            target.mkdir(parents=True, exist_ok=True)
+            for name in FILES:
+                if (source.path / name).is_file():
+                    shutil.copy2(source.path / name, target / name)
+            lines = thinned(read_metrics(source.metrics), CURVE_LINES)
+            write_text(target / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+            shutil.rmtree(target / "checkpoints", ignore_errors=True)
+        best = best_runs(folder, runs)
+        for name in best.values():
+            _keep_checkpoint(folder, name, out / "runs" / name / "checkpoints")
+    except OSError as error:
+        raise RunFolderError(f"{out}: cannot be written ({error.strerror or error}); make room") from None
+    return sum(path.stat().st_size for path in out.rglob("*") if path.is_file()), best
+
+
+def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, ...], str]:
+    """Cell -> its run of the highest mean INS_0.5; cells without rows are left out."""
+    paths = sorted(folder.rows.glob("*.parquet")) if folder.rows.is_dir() else []
+    rows = read_rows(paths) if paths else pa.table({})
+    if "policy" not in rows.column_names:
+        return {}
+    means = {run.run: run.scores["ins_0.5"] for run in run_means(rows, "test") or run_means(rows)}
+    best: dict[tuple[Any, ...], str] = {}
+    for run in runs:
+        if run.name in means and means[run.name] > means.get(best.get(run.cell, ""), float("-inf")):
+            best[run.cell] = run.name
+    return best
+
+
+def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
+    """At most so many lines of metrics: consecutive ones as one, scores as means over their episodes.
+
+    Losses are left out, and numbers rounded to five digits.
+    """
+    size = -(-len(lines) // most)
+    out = []
+    for i in range(0, len(lines), max(size, 1)):
+        group = lines[i : i + size]
+        made = {name: group[-1][name] for name in KEPT[:3] if name in group[-1]}
+        made["episodes"] = sum(line.get("episodes", 0.0) for line in group)
+        for name in dict.fromkeys(name for line in group for name in line if name.startswith("episode/")):
+            scored = [(line[name], line["episodes"]) for line in group if name in line]
+            count = sum(episodes for _, episodes in scored)
+            made[name] = sum(value * episodes for value, episodes in scored) / count
+        out.append({name: value if isinstance(value, int) else float(f"{value:.5g}") for name, value in made.items()})
+    return out
+
+
+def _keep_checkpoint(folder: SweepFolder, run: str, target: Path) -> None:
+    """Copies the checkpoint that was evaluated, without its environments."""
+    try:
+        path, _ = checkpoint.find(folder.runs / run / "checkpoints", folder.sweep.config.evaluate.checkpoint)
+    except CheckpointError:
+        return
+    target.mkdir(parents=True)
+    shutil.copytree(path, target / path.name, ignore=shutil.ignore_patterns(checkpoint.ENV_STATE))

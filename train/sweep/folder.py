@@ -1,0 +1,227 @@
+"""A sweep's folder: where its files lie, and how far each run is, read from them alone.
+
+<out_dir>/<name>/configs/<run>.yaml     complete config of a run, as `python -m train --config` takes it
+                 runs/<run>/            its run folder
+                 rows/<run>-*.parquet   what it scored; in rows/_paths/ where its robot went in some episodes
+                 logs/<run>.log         what its programs printed
+                 failed/<run>.json      why it was given up
+                 locks/<run>            held by whoever works on it
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from train.asked import EvaluationAsked, files_of_run, paths_beside
+from train.config_io import to_yaml
+from train.errors import RunFolderError
+from train.files import write_text
+from train.rows import read_notes
+from train.run_folder import RunFolder
+from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
+
+TAIL_BYTES = 1 << 16
+
+
+@dataclasses.dataclass(frozen=True)
+class RunState:
+    """How far a run is."""
+
+    name: str
+    state: str
+    """waiting, running, stopped, trained, done or failed."""
+    env_steps: int
+    total_steps: int
+    metrics: dict[str, Any]
+    """Its last line of metrics."""
+    reason: str = ""
+    """Why it failed, one line."""
+
+    @property
+    def over(self) -> bool:
+        """Nothing is left to train."""
+        return self.state in ("trained", "done")
+
+
+class SweepFolder:
+    """Paths of a sweep, and the small files in it."""
+
+    def __init__(self, sweep: Sweep):
+        self.sweep, self.root = sweep, sweep.root
+        self.rows, self.runs = self.root / "rows", self.root / "runs"
+
+    def prepare(self) -> None:
+        """Makes the folder and writes the config of each run.
+
+        Raises:
+            RunFolderError: it cannot be written.
+        """
+        for run in self.sweep.runs:
+            write_text(self.config(run.name), to_yaml(run.config))
+        for name in ("runs", "rows", "logs", "locks", "failed"):
+            (self.root / name).mkdir(exist_ok=True)
+
+    def config(self, run: str) -> Path:
+        """The config that `python -m train` is given."""
+        return self.root / "configs" / f"{run}.yaml"
+
+    def log(self, run: str) -> Path:
+        """What its programs printed."""
+        return self.root / "logs" / f"{run}.log"
+
+    def lock(self, run: str) -> Path:
+        """Held by whoever works on the run."""
+        return self.root / "locks" / run
+
+    def state(self, run: RunSpec) -> RunState:
+        """How far a run is; of finished ones `done` where its rows are up to date."""
+        folder = RunFolder(self.runs / run.name)
+        metrics = last_line(folder.metrics)
+        origin = folder.origin()
+        steps, total = int(metrics.get("env_steps", 0)), run.config.run.num_timesteps
+        failed = self.root / "failed" / f"{run.name}.json"
+        if is_locked(self.lock(run.name)):
+            state = "running"
+        elif origin["completed"] and (origin["env_steps"] or 0) >= total:
+            state = "done" if self.evaluated(run) else "trained"
+            steps = origin["env_steps"]
+        elif failed.is_file():
+            state = "failed"
+        else:
+            state = "stopped" if steps else "waiting"
+        reason = json.loads(failed.read_text())["reason"] if failed.is_file() and state != "done" else ""
+        return RunState(run.name, state, steps, max(total, steps), metrics, reason)
+
+    def asked(self, run: RunSpec) -> EvaluationAsked:
+        """The evaluation that the sweep wants of a run."""
+        wanted: EvaluateConfig = self.sweep.config.evaluate
+        return EvaluationAsked(
+            scenes=tuple(Path(scene).name for scene in wanted.scenes or run.config.env.scenes),
+            policies=("learned",),
+            episodes=wanted.episodes,
+            seed=wanted.seed,
+            balanced=wanted.balanced,
+            checkpoint=wanted.checkpoint,
+            deterministic=not wanted.stochastic,
+        )
+
+    def evaluated(self, run: RunSpec) -> bool:
+        """Rows are there, as wanted, of the run as far as it is trained."""
+        path = self.rows / self.asked(run).file_name(run.name)
+        if not path.is_file():
+            return False
+        steps = read_notes(path).get("trained_steps")
+        return steps == json.dumps(RunFolder(self.runs / run.name).origin()["env_steps"])
+
+    def drop_old_rows(self, run: RunSpec) -> None:
+        """Removes rows of an evaluation that is no longer wanted, once those that are wanted are there."""
+        wanted = self.rows / self.asked(run).file_name(run.name)
+        for path in files_of_run(self.rows, run.name) if wanted.is_file() else []:
+            if path != wanted:
+                path.unlink()
+                paths_beside(path).unlink(missing_ok=True)
+
+    def give_up(self, run: str, reason: str, attempts: int) -> None:
+        """Notes why a run was given up."""
+        write_text(self.root / "failed" / f"{run}.json", json.dumps({"reason": reason, "attempts": attempts}) + "\n")
+
+    def try_again(self, run: str) -> None:
+        """Forgets that a run was given up."""
+        (self.root / "failed" / f"{run}.json").unlink(missing_ok=True)
+
+
+def last_line(path: Path) -> dict[str, Any]:
+    """The last whole line of a file of JSON lines; empty where there is none."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return {}
+    for line in reversed(lines):
+        with contextlib.suppress(ValueError):
+            found = json.loads(line)
+            if isinstance(found, dict):
+                return found
+    return {}
+
+
+def log_tail(path: Path, count: int = 6) -> list[str]:
+    """The last lines of a log that say something."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return []
+    return [line.rstrip() for line in lines if line.strip()][-count:]
+
+
+def take_lock(path: Path) -> int | None:
+    """Holds a lock as long as the file descriptor that it returns is open, here or in a child; None: it is held.
+
+    Raises:
+        RunFolderError: the file cannot be made.
+    """
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+    except OSError as error:
+        raise RunFolderError(f"{path}: cannot be made ({error.strerror}); expected a writable folder") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    except OSError as error:
+        os.close(descriptor)
+        raise RunFolderError(
+            f"{path}: its file system has no locks ({error.strerror}); set out_dir to a folder on one that does"
+        ) from None
+    return descriptor
+
+
+def is_locked(path: Path) -> bool:
+    """Whether somebody holds a lock."""
+    if not path.is_file():
+        return False
+    descriptor = take_lock(path)
+    if descriptor is None:
+        return True
+    os.close(descriptor)
+    return False
+
+
+def programs_env() -> dict[str, str]:
+    """Environment of a child that runs our programs: the same code as here, from whatever folder."""
+    ours = str(Path(__file__).resolve().parents[2])
+    paths = [ours, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONUNBUFFERED": "1"}
+
+
+def words_of_training(folder: SweepFolder, run: str, program: tuple[str, ...]) -> list[str]:
+    """The command that trains a run, or continues it."""
+    return [sys.executable, *program, "--config", str(folder.config(run))]
+
+
+def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str, ...]) -> list[str]:
+    """The command that evaluates runs of one environment."""
+
+    def words() -> Iterator[str]:
+        wanted = folder.sweep.config.evaluate
+        yield from (str(folder.runs / run) for run in runs)
+        yield from ("--dataset", str(folder.rows), "--policies", "learned", "--checkpoint", wanted.checkpoint)
+        yield from ("--episodes", str(wanted.episodes), "--seed", str(wanted.seed), "--record", str(wanted.record))
+        yield "--stochastic" if wanted.stochastic else "--no-stochastic"
+        yield from ("--balanced",) if wanted.balanced else ()
+        yield from ("--batch", str(wanted.batch)) if wanted.batch else ()
+        yield from ("--scenes", *wanted.scenes) if wanted.scenes else ()
+
+    return [sys.executable, *program, *words()]

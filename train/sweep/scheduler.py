@@ -1,0 +1,321 @@
+"""Runs and a launcher in; every run trained and evaluated, given up with a reason, or stopped where it can go on."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from types import FrameType
+from typing import Any, Protocol
+
+from train.sweep.folder import (
+    RunState,
+    SweepFolder,
+    log_tail,
+    programs_env,
+    words_of_evaluation,
+    words_of_training,
+)
+from train.sweep.jobs import LOCKED, LOST, Job
+from train.sweep.local import Launcher
+from train.sweep.spec import RunSpec
+
+STAGES = ("train", "evaluate")
+POLL_S = 0.5
+EVALUATED_TOGETHER = 8
+"""Runs of one environment that a process evaluates one after the other: it compiles once."""
+LAST_START_S = 60.0
+"""So shortly before the time limit (or its last tenth, if that is less) nothing is begun."""
+ELSEWHERE_S = 10.0
+"""Between two looks whether a run that somebody else works on is free."""
+REFUSED = 2
+"""Exit code for what another try cannot mend."""
+OUT_OF_MEMORY = ("resource_exhausted", "out of memory", "cuda_error_out_of_memory", "memory allocation failed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Programs:
+    """What `python` is to run; tests give others."""
+
+    train: tuple[str, ...] = ("-m", "train")
+    evaluate: tuple[str, ...] = ("-m", "train.evaluate")
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a sweep's command ended."""
+
+    states: tuple[RunState, ...]
+    stopped_by: int | None
+    """The signal, if one did."""
+    timed_out: bool
+    elsewhere: int
+    """Runs left to somebody else who works on them."""
+
+    def exit_code(self, done: str) -> int:
+        """0: every run got to `done`; 1: some were given up; 3: stopped by the time limit; 128 + signal.
+
+        Args:
+            done: state to reach, trained or done.
+        """
+        if self.stopped_by:
+            return 128 + self.stopped_by
+        left = [s for s in self.states if s.state != "done" and not (done == "trained" and s.state == "trained")]
+        if any(s.reason for s in left):
+            return 1
+        return 3 if left and self.timed_out else 0
+
+
+class Display(Protocol):
+    """What a person sees."""
+
+    def event(self, text: str, style: str = "") -> None:
+        """Something happened."""
+        ...
+
+    def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:
+        """How far the runs are; must be cheap to call often."""
+        ...
+
+
+@contextlib.contextmanager
+def collected_signals() -> Iterator[list[int]]:
+    """Collects SIGINT and SIGTERM into the list that it yields."""
+    seen: list[int] = []
+    usual: dict[int, Any] = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+
+    def remember(number: int, _: FrameType | None) -> None:
+        seen.append(number)
+
+    for number in usual:
+        signal.signal(number, remember)
+    try:
+        yield seen
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+
+
+class Scheduler:
+    """Decides what runs next.
+
+    Args:
+        folder: of the sweep.
+        launcher: where jobs run.
+        display: for people.
+        stages: train, evaluate or both.
+        redo: evaluate again what is evaluated.
+        unfinished: evaluate what is not trained to its end as well, as far as it is.
+        programs: what to run.
+        clock: seconds.
+    """
+
+    def __init__(
+        self,
+        folder: SweepFolder,
+        launcher: Launcher,
+        display: Display,
+        stages: Sequence[str] = STAGES,
+        redo: bool = False,
+        unfinished: bool = False,
+        programs: Programs | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._folder, self._launcher, self._display = folder, launcher, display
+        self._stages, self._unfinished = stages, unfinished
+        self._programs, self._clock = programs or Programs(), clock
+        self._runs = {run.name: run for run in folder.sweep.runs}
+        self._attempts: dict[tuple[str, str], int] = {}
+        self._factor: dict[tuple[str, str], float] = {}
+        self._given_up: set[tuple[str, str]] = set()
+        self._alone: set[str] = set()
+        self._not_before: dict[str, float] = {}
+        self._busy: dict[str, str] = {}
+        self._redo = set(self._runs) if redo else set()
+        self._stopping = False
+
+    def run(self, stops: list[int], time_limit_s: float | None = None, poll_s: float = POLL_S) -> Outcome:
+        """Works until nothing is left, the time is over, or a signal asks to stop; a second one does not wait.
+
+        Args:
+            stops: signals, as they come.
+            time_limit_s: after it all runs are stopped, with their checkpoints; None: no limit.
+            poll_s: between two looks.
+        """
+        began, deadline, killed = self._clock(), None, False
+        timed_out = False
+        states = self._states()
+        while True:
+            for job, code in self._launcher.ended():
+                self._over(job, code)
+            elapsed = self._clock() - began
+            timed_out = timed_out or (time_limit_s is not None and elapsed >= time_limit_s)
+            if (stops or timed_out) and not self._stopping:
+                self._stopping = True
+                grace_s = self._folder.sweep.config.launch.grace_s
+                deadline = self._clock() + grace_s
+                if self._busy:
+                    why = f"time limit of {time_limit_s:.0f} s" if timed_out else signal.Signals(stops[0]).name
+                    self._display.event(
+                        f"{why}: {len(self._busy)} run(s) are writing their checkpoints (a second Ctrl-C does not wait)"
+                    )
+                self._launcher.stop()
+            if deadline is not None and not killed and (len(stops) > 1 or self._clock() > deadline) and self._busy:
+                killed = True
+                self._display.event("not waiting any longer: what they did since the last checkpoint is lost", "red")
+                self._launcher.kill()
+            states = self._states()
+            late = time_limit_s is not None and time_limit_s - elapsed < min(LAST_START_S, 0.1 * time_limit_s)
+            if not self._stopping and not late:
+                states = self._start(states)
+            self._display.update(states, self._busy)
+            waiting = [] if self._stopping else self._waiting(states)
+            if not self._busy and all(name in self._not_before for name in waiting):
+                break
+            time.sleep(poll_s)
+        elsewhere = sum(name in self._not_before for name in ([] if self._stopping else self._waiting(states)))
+        return Outcome(tuple(states), stops[0] if stops else None, timed_out, elsewhere)
+
+    def _states(self) -> list[RunState]:
+        return [self._folder.state(run) for run in self._runs.values()]
+
+    def _to_train(self, states: Sequence[RunState]) -> list[str]:
+        """Runs to train, begun ones first."""
+        if "train" not in self._stages:
+            return []
+        left = [
+            state
+            for state in states
+            if not state.over and state.name not in self._busy and ("train", state.name) not in self._given_up
+        ]
+        return [state.name for state in sorted(left, key=lambda state: state.env_steps == 0)]
+
+    def _to_evaluate(self, states: Sequence[RunState]) -> list[str]:
+        if "evaluate" not in self._stages:
+            return []
+        names = []
+        for state in states:
+            far = state.over or (self._unfinished and state.env_steps > 0)
+            fresh = state.name not in self._redo and self._folder.evaluated(self._runs[state.name])
+            if far and not fresh and state.name not in self._busy and ("evaluate", state.name) not in self._given_up:
+                names.append(state.name)
+        return names
+
+    def _waiting(self, states: Sequence[RunState]) -> list[str]:
+        return [*self._to_train(states), *self._to_evaluate(states)]
+
+    def _free(self, names: list[str]) -> list[str]:
+        now = self._clock()
+        return [name for name in names if self._not_before.get(name, 0.0) <= now]
+
+    def _start(self, states: list[RunState]) -> list[RunState]:
+        """Starts what there is room for: training first, then evaluation."""
+        for name in self._free(self._to_train(states)):
+            command = words_of_training(self._folder, name, self._programs.train)
+            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.threads:
+                command = [*command, f"env.threads={_threads(self._runs[name])}"]
+            if not self._begin("train", [name], command):
+                return states
+        for group in self._groups(self._free(self._to_evaluate(states))):
+            command = words_of_evaluation(self._folder, group, self._programs.evaluate)
+            if not self._begin("evaluate", group, command):
+                return states
+        return states
+
+    def _groups(self, names: list[str]) -> list[list[str]]:
+        """Runs to evaluate by one process each: those of one environment (k_int is in no score)."""
+        kinds: dict[Any, list[str]] = {}
+        for name in names:
+            env = dataclasses.replace(self._runs[name].config.env, k_int=0.0)
+            kinds.setdefault(name if name in self._alone else env, []).append(name)
+        size = EVALUATED_TOGETHER
+        return [group[i : i + size] for group in kinds.values() for i in range(0, len(group), size)]
+
+    def _begin(self, kind: str, names: list[str], command: list[str]) -> bool:
+        log = self._folder.log(names[0])
+        job = Job(
+            kind=kind,
+            runs=tuple(names),
+            command=tuple(command),
+            log=log,
+            locks=tuple(self._folder.lock(name) for name in names),
+            env=programs_env(),
+            launch=self._runs[names[0]].launch,
+            factor=max(self._factor.get((kind, name), 1.0) for name in names),
+        )
+        where = self._launcher.start(job)
+        if where is None:
+            return False
+        for name in names:
+            self._busy[name] = f"{kind}, {where}"
+            self._not_before.pop(name, None)
+            self._folder.try_again(name)
+        self._display.event(f"{job.name}: started ({where}), log {log}")
+        return True
+
+    def _over(self, job: Job, code: int) -> None:
+        for name in job.runs:
+            self._busy.pop(name, None)
+        if code == LOCKED:
+            for name in job.runs:
+                self._not_before[name] = self._clock() + ELSEWHERE_S
+            self._display.event(f"{job.name}: somebody else works on it, looking again later", "yellow")
+            return
+        if job.kind == "evaluate":
+            left = [name for name in job.runs if not self._folder.evaluated(self._runs[name])]
+            for name in set(job.runs) - set(left) if code == 0 or not self._redo else set():
+                self._redo.discard(name)
+                self._folder.drop_old_rows(self._runs[name])
+            left = left or ([name for name in job.runs if name in self._redo] if code else [])
+        else:
+            left = [name for name in job.runs if not self._folder.state(self._runs[name]).over]
+        if not left:
+            self._display.event(f"{job.name}: done", "green")
+        elif self._stopping and code not in (1, REFUSED):
+            self._display.event(f"{job.name}: stopped")
+        elif len(job.runs) > 1:
+            # Which of them is to blame shows when each has a process of its own.
+            self._alone.update(left)
+            self._display.event(f"{job.name}: {_how(code)}; {len(left)} left, now one by one", "yellow")
+        else:
+            self._failed(job, code)
+
+    def _failed(self, job: Job, code: int) -> None:
+        (name,) = job.runs
+        key = (job.kind, name)
+        tail = log_tail(job.log, 40)
+        told = tail[-6:] or ["(nothing was printed)"]
+        reason = f"{job.kind}: {_how(code)}: {told[-1][:300]}"
+        attempts = self._attempts[key] = self._attempts.get(key, 0) + 1
+        hungry = any(word in line.lower() for line in tail for word in OUT_OF_MEMORY)
+        if code == REFUSED or attempts > job.launch.retries:
+            self._given_up.add(key)
+            self._folder.give_up(name, reason, attempts)
+            more = "another try cannot mend it" if code == REFUSED else f"given up after {attempts} tries"
+            self._display.event(f"{job.name}: {_how(code)}, {more}; the end of {job.log}:", "red")
+        else:
+            self._factor[key] = job.factor * 2.0 if hungry else job.factor
+            more = " with twice the memory" if hungry else ""
+            self._display.event(
+                f"{job.name}: {_how(code)}, tried again{more} ({attempts} of {job.launch.retries}); "
+                f"the end of {job.log}:",
+                "yellow",
+            )
+        for line in told:
+            self._display.event(f"    {line}")
+
+
+def _threads(run: RunSpec) -> int:
+    return max(1, (os.cpu_count() or 1) // run.launch.slots)
+
+
+def _how(code: int) -> str:
+    if code == LOST:
+        return "the node or its worker was lost"
+    if code < 0:
+        with contextlib.suppress(ValueError):
+            return f"ended by {signal.Signals(-code).name}"
+    return f"ended with exit code {code}"

@@ -1,0 +1,358 @@
+"""One YAML file in, a list of runs with their complete configs out; every mistake named in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from train import config_io
+from train.config import TrainConfig, validate
+from train.errors import ConfigError
+
+SWEEP_DIR = config_io.PRESET_DIR / "sweeps"
+BARE = ("algorithm", "env.robot")
+"""Axes whose values name themselves in a run's name."""
+PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """The fixed episodes that every trained run plays; see `python -m train.evaluate --help`."""
+
+    scenes: tuple[str, ...] = ()
+    """Scene folders; empty: those that the run was trained on."""
+    episodes: int = 1000
+    """Episodes of each run."""
+    seed: int = 1_000_000
+    """Which episodes."""
+    balanced: bool = True
+    """Scenes take turns; otherwise each episode draws one."""
+    checkpoint: str = "best"
+    """best, last or a number of env steps."""
+    stochastic: bool = True
+    """Sample actions instead of taking their mode."""
+    record: int = 8
+    """First episodes whose paths are kept for pictures."""
+    batch: int | None = None
+    """Episodes played at a time; auto: by backend."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("episodes", 1), ("seed", 0), ("record", 0), ("batch", 1)):
+            value = getattr(self, name)
+            if value is not None and value < low:
+                raise ValueError(f"{name} is {value!r}, expected at least {low}")
+        if self.checkpoint not in ("best", "last") and not self.checkpoint.isdecimal():
+            raise ValueError(f"checkpoint is {self.checkpoint!r}, expected best, last or a number of env steps")
+
+
+@dataclasses.dataclass(frozen=True)
+class LaunchConfig:
+    """How runs share a machine."""
+
+    runs_per_gpu: int = 1
+    """Runs that share a GPU; one that runs out of memory is tried again with twice the share."""
+    gpu_memory_gb: float | None = None
+    """Memory that one run needs: on GPUs too small for runs_per_gpu of them fewer are packed; auto: not looked at."""
+    jax_memory_share: float = 0.6
+    """Part of a run's share of the GPU that JAX reserves; the rest is for Warp, the renderer and CUDA."""
+    slots: int = 1
+    """Runs at a time on a machine without a GPU; each gets its part of the cores."""
+    cpus_per_run: int = 1
+    """CPU cores that a run reserves on a Ray cluster."""
+    retries: int = 2
+    """Times that a crashed run is started again by one command; a refused config or diverged numbers are not."""
+    grace_s: float = 300.0
+    """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("runs_per_gpu", 1), ("slots", 1), ("cpus_per_run", 1), ("retries", 0), ("grace_s", 0)):
+            if getattr(self, name) < low:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected at least {low}")
+        if not 0.0 < self.jax_memory_share <= 1.0:
+            raise ValueError(f"jax_memory_share is {self.jax_memory_share!r}, expected above 0 and at most 1")
+        if self.gpu_memory_gb is not None and self.gpu_memory_gb <= 0:
+            raise ValueError(f"gpu_memory_gb is {self.gpu_memory_gb!r}, expected a positive number")
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepConfig:
+    """A sweep as its file says it."""
+
+    name: str = ""
+    """Folder of the sweep inside out_dir; empty: the file's name."""
+    out_dir: str = "sweeps"
+    """Folder of all sweeps."""
+    preset: str = ""
+    """What every run starts from: a preset or a YAML file of `python -m train`; {algorithm}, {env.robot} and the like
+    stand for the run's own value."""
+    grid: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
+    """Dotted setting -> its values; every combination is a run, the last one varies fastest."""
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Settings of every run, laid over the preset."""
+    overrides: Sequence[Any] = ()
+    """Settings of some runs: {where: {setting: value or values}, settings: {...}, launch: {...}}."""
+    skip: Sequence[Any] = ()
+    """Combinations to leave out: {setting: value or values}."""
+    evaluate: EvaluateConfig = dataclasses.field(default_factory=EvaluateConfig)
+    """The fixed episodes that every trained run plays."""
+    launch: LaunchConfig = dataclasses.field(default_factory=LaunchConfig)
+    """How runs share a machine."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """One run of a sweep."""
+
+    name: str
+    values: Mapping[str, Any]
+    """Its value on each axis of the grid."""
+    config: TrainConfig
+    """Complete; sizes may still be `auto`."""
+    launch: LaunchConfig
+
+    @property
+    def cell(self) -> tuple[Any, ...]:
+        """Its values without the seed."""
+        return tuple(str(value) for axis, value in self.values.items() if axis != "run.seed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """A sweep, expanded."""
+
+    config: SweepConfig
+    root: Path
+    runs: tuple[RunSpec, ...]
+
+
+def known_sweeps() -> list[str]:
+    """Names of the sweeps that come with the package."""
+    return sorted(path.stem for path in SWEEP_DIR.glob("*.yaml"))
+
+
+def load(name_or_path: str) -> Sweep:
+    """Reads a sweep by name or path.
+
+    Raises:
+        ConfigError: no such file, or something in it cannot be run.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = SWEEP_DIR / f"{name_or_path}.yaml"
+        if not path.is_file():
+            near = config_io.nearest(name_or_path, known_sweeps())
+            raise ConfigError(
+                f"no sweep {name_or_path!r}{near}; expected one of {', '.join(known_sweeps())}, "
+                "or the path of a .yaml file"
+            )
+    try:
+        plain = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path.name}: not readable as YAML: {' '.join(str(error).split())}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise ConfigError(f"cannot read {path} ({reason}); expected a YAML file of a sweep") from None
+    return expand(read(plain, path.name, path.stem), path.name)
+
+
+def read(plain: Any, where: str, default_name: str) -> SweepConfig:
+    """The typed sweep of nested plain values.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type or a value out of range.
+    """
+    _mapping(plain, where, "the file")
+    fields = {field.name: field for field in dataclasses.fields(SweepConfig)}
+    made: dict[str, Any] = {}
+    for key, value in plain.items():
+        if key not in fields:
+            raise ConfigError(f"{where}: unknown key {key!r}{config_io.nearest(str(key), list(fields))}")
+        if key in ("evaluate", "launch"):
+            base = EvaluateConfig() if key == "evaluate" else LaunchConfig()
+            made[key] = config_io.overlay(base, {} if value is None else value, where, f"{key}.")
+        elif key in ("grid", "settings"):
+            made[key] = _mapping({} if value is None else value, where, key)
+        elif key in ("overrides", "skip"):
+            if not isinstance([] if value is None else value, list):
+                raise ConfigError(f"{where}: {key}: got {value!r}, expected a list")
+            made[key] = value or []
+        elif not isinstance(value, str):
+            raise ConfigError(f"{where}: {key}: got {value!r} ({type(value).__name__}), expected text")
+        else:
+            made[key] = value
+    made["name"] = made.get("name") or default_name
+    if made["name"] != Path(made["name"]).name:
+        raise ConfigError(f"{where}: name is {made['name']!r}, expected one folder name (out_dir says where it lies)")
+    if not made.get("preset"):
+        raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
+    return SweepConfig(**made)
+
+
+def expand(config: SweepConfig, where: str) -> Sweep:
+    """Every run of a sweep with its complete config.
+
+    Raises:
+        ConfigError: a setting that does not exist, a value it cannot have, or two runs of one name.
+    """
+    settings_known = list(config_io.flatten(TrainConfig()))
+    for axis, values in config.grid.items():
+        if axis not in settings_known:
+            raise ConfigError(f"{where}: grid: unknown key {axis!r}{config_io.nearest(str(axis), settings_known)}")
+        if axis in ("run.name", "run.out_dir"):
+            raise ConfigError(f"{where}: grid: {axis} is the sweep's own to choose")
+        if not isinstance(values, list) or not values:
+            raise ConfigError(f"{where}: grid: {axis}: got {values!r}, expected a list of values")
+    axes = list(config.grid)
+    overrides = [_override(entry, config, f"{where}: overrides[{i}]") for i, entry in enumerate(config.overrides)]
+    skips = [_where(entry, config, f"{where}: skip[{i}]") for i, entry in enumerate(config.skip)]
+    root = Path(config.out_dir) / config.name
+    runs: dict[str, RunSpec] = {}
+    for combination in itertools.product(*config.grid.values()):
+        values = dict(zip(axes, combination, strict=True))
+        if any(_matches(skip, values) for skip in skips):
+            continue
+        name = _run_name(config, values) or "run"
+        told = f"{where}: {name}"
+        train = config_io.load(_filled(config.preset, values, where))
+        launch = config.launch
+        layers = [config.settings] + [entry["settings"] for entry in overrides if _matches(entry["where"], values)]
+        for layer in [*layers, values]:
+            train = config_io.from_dict(_nested(layer, told), train, told)
+        for entry in overrides:
+            if _matches(entry["where"], values):
+                launch = config_io.overlay(launch, entry["launch"], told, "launch.")
+        run = dataclasses.replace(train.run, name=name, out_dir=str(root / "runs"))
+        train = dataclasses.replace(train, run=run)
+        validate(train)
+        if name in runs:
+            raise ConfigError(f"{where}: two runs are named {name!r}; give the grid values that can be told apart")
+        runs[name] = RunSpec(name, values, train, launch)
+    if not runs:
+        raise ConfigError(f"{where}: no run is left of the grid; expected at least one that skip does not name")
+    return Sweep(config, root, tuple(runs.values()))
+
+
+def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
+    """The part of a sweep that one machine takes.
+
+    Args:
+        sweep: expanded.
+        where: `setting=value[,value]` words; a run must match them all.
+        shard: `I/N`, every N-th run beginning with the I-th (from 0); None: all.
+
+    Raises:
+        ConfigError: another axis or value than the grid's, or a shard that is none.
+    """
+    runs = list(sweep.runs)
+    for word in where:
+        axis, equals, text = word.partition("=")
+        if not equals:
+            raise ConfigError(f"--where {word!r}: expected setting=value[,value], for example env.robot=fetch")
+        chosen = [yaml.safe_load(item) for item in text.split(",")]
+        wanted = _where({axis: chosen}, sweep.config, f"--where {word}")
+        runs = [run for run in runs if _matches(wanted, run.values)]
+    if shard is not None:
+        match = re.fullmatch(r"(\d+)/(\d+)", shard)
+        index, count = (int(match[1]), int(match[2])) if match else (0, 0)
+        if index >= count:
+            raise ConfigError(f"--shard {shard!r}: expected I/N with I from 0 to N - 1, for example 0/2 and 1/2")
+        runs = runs[index::count]
+    if not runs:
+        raise ConfigError("no run of the sweep is left; expected --where and --shard to leave some")
+    return dataclasses.replace(sweep, runs=tuple(runs))
+
+
+def help_text() -> str:
+    """One line for each key of a sweep's file."""
+    lines: list[tuple[str, str]] = []
+    for prefix, part in (("", SweepConfig()), ("evaluate.", EvaluateConfig()), ("launch.", LaunchConfig())):
+        docs = config_io.field_docs(type(part))
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            if not dataclasses.is_dataclass(value):
+                shown = config_io.AUTO if value is None else value if isinstance(value, (str, int, float)) else ""
+                lines.append((f"{prefix}{field.name}: {shown}", docs[field.name]))
+    width = max(len(left) for left, _ in lines) + 2
+    return "\n".join(f"  {left:<{width}}{doc}" for left, doc in lines)
+
+
+def _mapping(value: Any, where: str, what: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{where}: {what}: got {value!r} ({type(value).__name__}), expected a mapping of settings")
+    return value
+
+
+def _nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Dotted keys taken apart; nested ones stay."""
+    nested: dict[str, Any] = {}
+    for key, value in settings.items():
+        *sections, last = str(key).split(".")
+        place = nested
+        for section in sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"{where}: {key}: {section} has a value already")
+        if isinstance(value, Mapping):
+            inner = place.setdefault(last, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"{where}: {key}: has a value already")
+            inner.update(_nested(value, where))
+        else:
+            place[last] = value
+    return nested
+
+
+def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
+    known = ("where", "settings", "launch")
+    _mapping(entry, where, "the entry")
+    for key in entry:
+        if key not in known:
+            raise ConfigError(f"{where}: unknown key {key!r}{config_io.nearest(str(key), known)}")
+    made = {key: _mapping(entry.get(key) or {}, where, key) for key in known}
+    return {**made, "where": _where(made["where"], config, where)}
+
+
+def _where(entry: Any, config: SweepConfig, where: str) -> dict[str, list[Any]]:
+    """Axis -> the values that match."""
+    wanted = {}
+    for axis, value in _mapping(entry, where, "where").items():
+        if axis not in config.grid:
+            near = config_io.nearest(str(axis), list(config.grid))
+            raise ConfigError(f"{where}: {axis!r} is no axis of the grid{near}; axes: {', '.join(config.grid)}")
+        values = value if isinstance(value, list) and value not in config.grid[axis] else [value]
+        for item in values:
+            if item not in config.grid[axis]:
+                raise ConfigError(f"{where}: {axis} is {item!r}, expected one of {config.grid[axis]}")
+        wanted[axis] = values
+    return wanted
+
+
+def _matches(wanted: Mapping[str, list[Any]], values: Mapping[str, Any]) -> bool:
+    return all(values[axis] in chosen for axis, chosen in wanted.items())
+
+
+def _filled(preset: str, values: Mapping[str, Any], where: str) -> str:
+    def value_of(match: re.Match[str]) -> str:
+        if match[1] not in values:
+            near = config_io.nearest(match[1], list(values))
+            raise ConfigError(f"{where}: preset: {{{match[1]}}} is no axis of the grid{near}")
+        return str(values[match[1]])
+
+    return PLACEHOLDER.sub(value_of, preset)
+
+
+def _run_name(config: SweepConfig, values: Mapping[str, Any]) -> str:
+    parts = []
+    for axis, value in sorted(values.items(), key=lambda item: item[0] == "run.seed"):  # the seed comes last
+        tail = "" if axis in BARE else axis.rpartition(".")[2]
+        if isinstance(value, (list, dict)):
+            value = config.grid[axis].index(value)
+        shown = f"{value:g}" if isinstance(value, float) else str(value).lower()
+        parts.append(re.sub(r"[^\w.+-]", "_", tail + shown))
+    return "-".join(parts)

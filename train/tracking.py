@@ -1,0 +1,80 @@
+"""Metrics of a run to Weights & Biases, for those who want it there too (`run.wandb=true`).
+
+The package is an optional extra. Where it writes is its own to say: WANDB_MODE=offline keeps everything in the run
+folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
+"""
+
+from __future__ import annotations
+
+import importlib
+import uuid
+from pathlib import Path
+from typing import Any
+
+from train.config import TrainConfig
+from train.config_io import flatten
+from train.errors import ConfigError
+from train.files import write_text
+
+ID_FILE = "wandb_id"
+
+
+def import_wandb() -> Any:
+    """The package.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        return importlib.import_module("wandb")
+    except ImportError:
+        raise ConfigError(
+            "run.wandb is true, but Weights & Biases is not installed; pip install 'interactive-nav[wandb]', or set "
+            "run.wandb=false"
+        ) from None
+
+
+class Tracker:
+    """One run there; a continued run goes on with the same one.
+
+    Args:
+        folder: of the run; remembers the run's id, and holds its files.
+        config: of the run.
+        versions: packages, device and commit.
+
+    Raises:
+        ConfigError: not installed, not logged in, or not reachable.
+    """
+
+    def __init__(self, folder: Path, config: TrainConfig, versions: dict[str, Any]):
+        wandb = import_wandb()
+        kept = folder / ID_FILE
+        if not kept.is_file():
+            write_text(kept, uuid.uuid4().hex[:12] + "\n")
+        try:
+            self._run = wandb.init(
+                project=config.run.wandb_project,
+                name=config.run.name,
+                id=kept.read_text().strip(),
+                resume="allow",
+                dir=str(folder),
+                group=f"{config.env.robot}-{config.algorithm}-k_int{config.env.k_int:g}",
+                config={**flatten(config), "versions": versions},
+                settings=wandb.Settings(console="off", silent=True),
+            )
+        except wandb.Error as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"run.wandb: {reason}; run `wandb login`, set WANDB_MODE=offline, or set run.wandb=false"
+            ) from None
+        # Steps after the last checkpoint are taken again by a killed run: an axis of its own, not W&B's counter.
+        self._run.define_metric("env_steps")
+        self._run.define_metric("*", step_metric="env_steps")
+
+    def log(self, env_steps: int, metrics: dict[str, float]) -> None:
+        """The means of a log interval."""
+        self._run.log({"env_steps": env_steps, **metrics})
+
+    def close(self) -> None:
+        """Sends or writes what is left."""
+        self._run.finish()
