@@ -28,13 +28,16 @@ class CheckpointMeta:
     wall_s: float
     """Training time up to here, over all sittings."""
     score: float | None
-    """Mean of run.best_metric over the checkpoint interval; None if no episode ended in it."""
+    """Mean of run.best_metric over the checkpoint interval; None if no episode ended in it, or before every
+    environment has had the time for a whole episode."""
     algorithm: str
     robot: str
     observations: tuple[str, ...]
     observation_size: int | dict[str, list[int]]
     """Length of the vector, or with images the shape under each key."""
     action_size: int
+    began_together: int = 0
+    """Env steps at which all environments last began new episodes."""
 
 
 def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:

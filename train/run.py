@@ -70,6 +70,7 @@ class FolderCallbacks:
         self._folder, self._config, self._env = folder, config, env
         self._display, self._stops = display, stops
         self._wall_before_s = 0.0
+        self._began_together = 0
         self._began = time.perf_counter()
         self._events: SummaryWriter | None = None
         self._tracker: tracking.Tracker | None = None
@@ -86,7 +87,9 @@ class FolderCallbacks:
         check_fits(meta, path, self._config.env, self._env)
         self._wall_before_s = meta.wall_s
         learner = checkpoint.load_learner(path, template.learner)
-        return Snapshot(meta.env_steps, learner, checkpoint.load_env_state(path, template.env_state))
+        env_state = checkpoint.load_env_state(path, template.env_state)
+        self._began_together = meta.env_steps if env_state is None else meta.began_together
+        return Snapshot(meta.env_steps, learner, env_state)
 
     def should_stop(self) -> bool:
         """True once a signal asked for it."""
@@ -129,14 +132,20 @@ class FolderCallbacks:
         self._display.log(env_steps, metrics)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
-        """Writes a checkpoint; its score is the mean over the episodes of the last checkpoint interval."""
+        """Writes a checkpoint; its score is the mean over the episodes of the last checkpoint interval.
+
+        Where all environments began together, the first episodes to end are the short ones, which succeed; until
+        each had the time for a whole episode, scores would flatter.
+        """
         run = self._config.run
-        since = snapshot.env_steps - run.checkpoint_every_steps
+        fair = self._began_together + num_envs(self._config) * self._config.env.episode_steps
+        since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
         lines = [line for line in read_metrics(self._folder.metrics) if line["env_steps"] > since]
         meta = CheckpointMeta(
             env_steps=snapshot.env_steps,
             wall_s=self._wall_s(),
             score=mean_score(lines, run.best_metric),
+            began_together=self._began_together,
             algorithm=self._config.algorithm,
             robot=self._config.env.robot,
             observations=self._config.env.observations,

@@ -21,6 +21,7 @@ from rich.console import Console
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import checkpoint, run_folder
+from train.config import resolve
 from train.config_io import from_yaml
 from train.errors import CheckpointError, ConfigError, DivergedError, RunFolderError
 from train.run import check_fits, failures, mean_score, train_run
@@ -53,7 +54,7 @@ def test_folder_of_a_finished_run(finished):
     assert {"loss/total_loss", "env_steps_per_s", "episodes", "wall_s"} <= read_metrics(folder.metrics)[0].keys()
     assert list(folder.tensorboard.glob("events.out.tfevents.*"))
     written = from_yaml(folder.config.read_text())
-    assert written == config and None not in dataclasses.astuple(written.ppo)
+    assert written == resolve(config, "native") and None not in dataclasses.astuple(written.ppo)
     versions = json.loads((folder.path / "versions.json").read_text())
     assert versions["packages"]["brax"] == "0.14.2" and versions["device"]["platform"] == "cpu"
     summary = json.loads((folder.path / "summary.json").read_text())
@@ -182,6 +183,24 @@ def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path, monkeypatch):
         checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=200), 2, 1.0)
     assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [100]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["000000000100"]
+
+
+def test_checkpoints_have_no_score_before_every_environment_had_time_for_an_episode(tmp_path):
+    """16 environments and a limit of 60 steps: what ends in the first 960 env steps are the short episodes."""
+    config = toy_config(tmp_path, updates=6, keep_checkpoints=9)
+    _, folder, _ = train_run(config, quiet(), build_env=build_toy)
+    lines = read_metrics(folder.metrics)
+    saved = {c.env_steps: c.score for c in checkpoint.list_checkpoints(folder.checkpoints)}
+    assert list(saved) == [512, 1024, 1536] and saved[512] is None
+    assert sum(line["episodes"] for line in lines if line["env_steps"] <= 512) > 0
+    assert saved[1024] == pytest.approx(mean_score([line for line in lines if line["env_steps"] == 1024], "ins_0.5"))
+    assert saved[1536] == pytest.approx(mean_score([line for line in lines if line["env_steps"] > 1024], "ins_0.5"))
+    # Without room for the environments all begin anew, and the wait with them.
+    config = toy_config(tmp_path, updates=10, keep_checkpoints=9, env_state_limit_mb=0.0)
+    (folder.checkpoints / "000000001536" / checkpoint.ENV_STATE).unlink()
+    train_run(config, quiet(), build_env=build_toy)
+    saved = {c.env_steps: (c.score, c.began_together) for c in checkpoint.list_checkpoints(folder.checkpoints)}
+    assert saved[2048] == (None, 1536) and saved[2560][1] == 1536 and saved[2560][0] is not None
 
 
 def test_unknown_best_metric_is_refused(tmp_path):
