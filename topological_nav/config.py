@@ -1,4 +1,4 @@
-"""Every setting of datasets, training and maps: frozen dataclasses, checked on construction; docstrings are the help."""
+"""Every setting of datasets, training and maps: frozen dataclasses checked on construction; docstrings are the help."""
 
 from __future__ import annotations
 

@@ -17,6 +17,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from topological_nav.build import Built
+from topological_nav.data import load_plan, load_rooms, read_header
+from topological_nav.graph import Route
 from topological_nav.space import FreeSpace
 from train.files import whole_file
 
@@ -89,4 +92,93 @@ def rooms_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 for r in mine
             ]
             axis.set_title(f"{scene}, {method}\n" + "; ".join(said), fontsize=7.5)
+    return figure
+
+
+def dataset_figure(folder: Path) -> Figure:
+    """Where a dataset's images were taken, a panel a scene, and level images of some positions below."""
+    header, config = read_header(folder)
+    scenes = [(s["name"], load_plan(folder, s["name"])) for s in header["scenes"]]
+    rooms = load_rooms(folder)
+    shown = np.linspace(0, len(rooms.xy_w) - 1, min(6, len(rooms.xy_w))).astype(int)
+    columns = min(4, len(scenes))
+    lines = -(-len(scenes) // columns)
+    figure = plt.figure(figsize=(12, 3.4 * lines + 1.25 * len(shown)), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[3.4 * lines, 1.25 * len(shown)])
+    for axis in np.ravel(above.subplots(lines, columns, squeeze=False))[len(scenes) :]:
+        axis.set_axis_off()
+    for axis, (name, plan) in zip(above.axes, scenes, strict=False):
+        axis.scatter(*plan.rooms.points_w.T, s=1, c="0.85", linewidths=0)
+        for held, marker in ((False, "o"), (True, "^")):
+            mine = plan.test == held
+            room_points(axis, plan.xy_w[mine], plan.room[mine], s=22, marker=marker, edgecolors="k", linewidths=0.4)
+        step = 0.35 * np.stack([np.cos(plan.passages.heading_rad), np.sin(plan.passages.heading_rad)], -1)
+        ways = list(np.stack([plan.passages.xy_w, plan.passages.xy_w + step], 1))
+        colours = np.where(plan.passages.free, "tab:green", "tab:red")
+        axis.add_collection(LineCollection(ways, colors=list(colours), linewidths=0.7))
+        axis.set_aspect("equal")
+        axis.tick_params(labelsize=6)
+        axis.set_title(
+            f"{name}: {len(plan.xy_w)} positions (▲ for testing), {len(plan.passages)} passages\n"
+            "(green free, red blocked)",
+            fontsize=7,
+        )
+    grid = below.subplots(len(shown), 1, squeeze=False)[:, 0]
+    for axis, position in zip(grid, shown, strict=True):
+        strip = rooms.images[position, 1, :: max(config.headings // 9, 1)]
+        axis.imshow(np.concatenate(list(strip), 1))
+        axis.set_axis_off()
+        axis.set_title(f"room {rooms.names[rooms.label[position]]}, level, turning left", fontsize=7, loc="left")
+    return figure
+
+
+def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
+    """Loss and accuracy over epochs, a column a phase.
+
+    Args:
+        lines: of a run's metrics.jsonl.
+    """
+    names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
+    phases = list(dict.fromkeys(line["phase"] for line in lines))
+    figure, grid = plt.subplots(1, len(phases), figsize=(4.6 * len(phases), 3.2), squeeze=False, layout="constrained")
+    for axis, phase in zip(grid[0], phases, strict=True):
+        mine = [line for line in lines if line["phase"] == phase]
+        epochs = [line["epoch"] for line in mine]
+        axis.plot(epochs, [line["loss"] for line in mine], marker=".", label="loss")
+        if "accuracy" in mine[0]:
+            axis.plot(epochs, [line["accuracy"] for line in mine], marker=".", label="accuracy on training images")
+        axis.set_title(names[phase], fontsize=9)
+        axis.set_xlabel("epoch")
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    return figure
+
+
+def map_figure(built: Built, route: Route | None = None) -> Figure:
+    """A map over the floor plan: edges red to green by probability, each direction on its own half.
+
+    Args:
+        built: of `build.build_map`.
+        route: drawn on top.
+    """
+    made = built.map
+    extent = np.ptp(built.space.centres(0.0), axis=0)
+    figure, axis = plt.subplots(figsize=(8.4, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")
+    floor_plan(axis, built.space)
+    start, end = made.xy_w[made.edges[:, 0]], made.xy_w[made.edges[:, 1]]
+    order = np.argsort(made.p)
+    halves = LineCollection(
+        list(np.stack([start, (start + end) / 2], 1)[order]), cmap="RdYlGn", linewidths=1.1, zorder=2
+    )
+    halves.set_array(made.p[order])
+    halves.set_clim(0.0, 1.0)
+    axis.add_collection(halves)
+    room_points(axis, made.xy_w, made.room, s=34, edgecolors="k", linewidths=0.6, zorder=4)
+    for node, (x, y) in enumerate(made.xy_w):
+        axis.annotate(str(node), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=5, zorder=5)
+    if route is not None:
+        axis.plot(*made.xy_w[list(route.nodes)].T, color="tab:blue", linewidth=2.6, zorder=3)
+    figure.colorbar(halves, ax=axis, label="probability that the way is free", shrink=0.6, pad=0.01)
+    axis.set_title(f"{made.scene}: {len(made.xy_w)} nodes, {len(made.edges)} directed edges", fontsize=9)
     return figure
