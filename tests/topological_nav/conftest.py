@@ -1,0 +1,68 @@
+"""One small dataset, two runs and a map of a toy scene of two rooms, made by the commands themselves and shared."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from tests.toys import write_room
+from topological_nav.__main__ import main
+
+WORDS = (
+    *("width=32", "height=32", "supersample=1", "positions=24", "num_rooms=2", "room_method=kmeans", "quality=100"),
+    *("passage_sources=12", "passage_length_m=1.2", "shard=4"),
+)
+TRAINED = ("width=4", "hidden=32", "learning_rate=3e-3")
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """Where the commands wrote."""
+
+    scene: Path
+    data: Path
+    rooms: Path
+    passages: Path
+    map: Path
+
+
+def paint(folder: Path) -> None:
+    """Colours a toy room's walls: red on the left, green on the right, so that its rooms look different."""
+    spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+    for geom in spec.geoms:
+        if geom.parent.name == "structure":
+            left = geom.pos[0] < -0.1
+            middle = abs(geom.pos[0]) <= 0.1
+            geom.rgba = [0.6, 0.6, 0.6, 1] if middle else [0.9, 0.1, 0.1, 1] if left else [0.1, 0.8, 0.1, 1]
+    (folder / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def painted(tmp_path_factory) -> Path:
+    """Two rooms of 3 x 4 m joined by a gap of 1 m, a cube in each."""
+    folder = write_room(
+        tmp_path_factory.mktemp("topological") / "painted",
+        (6.0, 4.0),
+        (("chair", 1.4, -0.5, 5.0, 0.5), ("table", -1.5, 0.5, 10.0, 0.4)),
+        partition=True,
+    )
+    paint(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def made(painted, tmp_path_factory) -> Made:
+    """Everything the commands make of the painted scene."""
+    base = tmp_path_factory.mktemp("made")
+    here = Made(painted, base / "data", base / "rooms", base / "passages", base / "map.npz")
+    assert main(["data", str(painted), "-o", str(here.data), *WORDS]) == 0
+    learn = ["--data", str(here.data)]
+    assert main(["train", "rooms", *learn, "-o", str(here.rooms), "epochs=6", "batch=32", *TRAINED]) == 0
+    words = ["network=alexnet", "epochs=30", "batch=16", *TRAINED]
+    assert main(["train", "passages", *learn, "-o", str(here.passages), *words]) == 0
+    runs = ["--localiser", str(here.rooms), "--detector", str(here.passages)]
+    assert main(["map", str(painted), *runs, "-o", str(here.map), "--route", "0", "1"]) == 0
+    return here
