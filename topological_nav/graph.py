@@ -17,7 +17,7 @@ from typing import Any
 
 import networkx as nx
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from topological_nav.config import MapConfig
@@ -218,17 +218,12 @@ def _cells(space: FreeSpace, xy: np.ndarray) -> np.ndarray:
     return np.floor((xy - space.origin_w) / space.resolution_m).astype(int)
 
 
-def _lattice(index: dict[tuple[int, int], int], step: float) -> coo_array:
-    """Neighbouring cells, also across corners, with the distances of their centres."""
-    rows, columns, lengths = [], [], []
-    for (x, y), i in index.items():
-        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            j = index.get((x + dx, y + dy))
-            if j is not None:
-                rows += [i, j]
-                columns += [j, i]
-                lengths += [step * math.hypot(dx, dy)] * 2
-    return coo_array((lengths, (rows, columns)), shape=(len(index), len(index))).tocsr()
+def _lattice(index: dict[tuple[int, int], int], step: float) -> csr_array:
+    """Cells that share a side, so that the straight way between their centres is as free as they are."""
+    pairs = [(i, index.get(side, -1)) for (x, y), i in index.items() for side in ((x + 1, y), (x, y + 1))]
+    first, second = np.array([pair for pair in pairs if pair[1] >= 0], int).reshape(-1, 2).T
+    entries = (np.full(2 * len(first), step), (np.r_[first, second], np.r_[second, first]))
+    return csr_array(entries, shape=(len(index), len(index)))
 
 
 def assemble(

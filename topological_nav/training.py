@@ -12,6 +12,7 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -79,7 +80,13 @@ class Trained:
             raise RunError(
                 f"images are {images.shape[1:]}, expected {expected}, the size that the network learned from"
             )
-        return in_batches(jax.jit(lambda x: self.network.apply(self.variables, x, method=method)), images)
+        return in_batches(functools.partial(_applied(self.network, method), self.variables), images)
+
+
+@functools.cache
+def _applied(network: Network, method: str) -> Callable[..., jax.Array]:
+    """A network's method, compiled once."""
+    return jax.jit(lambda variables, images: network.apply(variables, images, method=method))  # type: ignore[return-value]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from tests.toys import write_room
 from topological_nav.__main__ import main
 
 WORDS = (
-    *("width=32", "height=32", "supersample=1", "positions=24", "num_rooms=2", "room_method=kmeans", "quality=100"),
+    *("width=32", "height=32", "supersample=1", "positions=40", "num_rooms=2", "room_method=kmeans", "quality=100"),
     *("passage_sources=12", "passage_length_m=1.2", "shard=4"),
 )
 TRAINED = ("width=4", "hidden=32", "learning_rate=3e-3")

@@ -52,7 +52,7 @@ def test_max_pooling_before_normalising_by_hand():
 
 
 def test_vicreg_by_hand():
-    # Two samples, one dimension: +-1 has variance 2 (n - 1), so no spread is lacking; no off-diagonal; views differ by 1.
+    # Two samples, one dimension: +-1 has variance 2 (over n - 1), so no spread is lacking; views differ by 1.
     a, b = jnp.array([[1.0], [-1.0]]), jnp.array([[2.0], [0.0]])
     assert float(vicreg_loss(a, b)) == pytest.approx(25.0)
     # Collapsed: no variance, each view lacks 1 - sqrt(1e-4) = 0.99; 25 x (0.99 / 2 + 0.99 / 2).
