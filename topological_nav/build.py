@@ -64,10 +64,9 @@ def build_map(
     space = free_space(scene, robot.height_m)
     known = recorded_rooms(scene.path)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
-    rng = np.random.default_rng([config.seed, 3, int(scene.digest[:8], 16)])
     judged = overlaid(DataConfig(), detector.about["data"], str(detector_run))
     margin_m, points = judged.passage_margin_m, judged.passage_points
-    xy, lacking = place_nodes(space, rooms, config, margin_m, points, rng)
+    xy, lacking = place_nodes(space, rooms, config, margin_m, points)
     if not len(xy):
         raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)

@@ -142,14 +142,12 @@ def passage_config() -> TrainConfig:
 class MapConfig:
     """Where nodes stand, and which edges join them."""
 
-    seed: int = 0
-    """Of the nodes' places."""
     clearance_m: float = 0.3
     """Least distance of nodes from obstacles."""
     min_per_room: int = 3
     """Nodes a room, at least."""
-    spacing_m: float = 1.5
-    """Nodes are added until no free place is farther than this from one."""
+    spacing_m: float = 1.2
+    """No free place of a room is farther than this from one of its nodes."""
     edge_m: float = 2.5
     """Nodes nearer than this are joined, both ways."""
     edge_image: Literal["exact", "nearest"] = "exact"
@@ -160,7 +158,6 @@ class MapConfig:
     """Edges with at least this probability count as open where connectedness is told."""
 
     def __post_init__(self) -> None:
-        require(self, "seed", 0, 2**32 - 1)
         require(self, "clearance_m", 0.0, 10.0)
         require(self, "min_per_room", 1, 1000)
         require(self, "spacing_m edge_m", 0.1, 100.0)

@@ -19,12 +19,13 @@ import networkx as nx
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.distance import cdist
 
 from topological_nav.config import MapConfig
 from topological_nav.errors import MapError
 from topological_nav.localise import nearest_node
 from topological_nav.rooms import Rooms
-from topological_nav.space import FreeSpace, spread
+from topological_nav.space import FreeSpace
 from train.files import whole_file
 
 FORMAT = 1
@@ -121,13 +122,14 @@ def angles(xy_w: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def place_nodes(
-    space: FreeSpace, rooms: Rooms, config: MapConfig, margin_m: float, points: int, rng: np.random.Generator
+    space: FreeSpace, rooms: Rooms, config: MapConfig, margin_m: float, points: int
 ) -> tuple[np.ndarray, list[str]]:
     """Where a map's nodes stand.
 
-    Every room gets `min_per_room` nodes far from each other, then more until each of its free places is within
-    `spacing_m` of one; then, where `connect` is set, nodes are added along the shortest free way between parts of the
-    map that no free edge joins.
+    In every room one place after the other becomes a node, each time the one that has most places within `spacing_m`
+    that no node has yet: nodes stand in the open rather than along walls. A room that needs fewer than `min_per_room`
+    is covered again with less spacing. Then, where `connect` is set, nodes are added along the shortest free way
+    between parts of the map that no free edge joins.
 
     Args:
         space: of the scene.
@@ -135,7 +137,6 @@ def place_nodes(
         config: of the map.
         margin_m: clearance that a free way has; nodes added to join parts need only this much.
         points: looked up on a way.
-        rng: draws the first node of each room.
 
     Returns:
         [N, 2] m, and what could not be had, in words.
@@ -145,15 +146,15 @@ def place_nodes(
     nodes, lacking = [], []
     for room in range(rooms.count):
         mine = places[label == room]
-        chosen = mine[spread(mine, config.min_per_room, rng)]
-        if len(chosen) < config.min_per_room:
-            lacking.append(f"room {room} has place for {len(chosen)} nodes only, expected {config.min_per_room}")
-        if not len(chosen):
+        if len(mine) < config.min_per_room:
+            lacking.append(f"room {room} has place for {len(mine)} nodes only, expected {config.min_per_room}")
+            nodes.append(mine)
             continue
-        away = np.linalg.norm(mine[:, None] - chosen[None], axis=-1).min(1)
-        while away.max() > config.spacing_m:
-            chosen = np.concatenate([chosen, mine[[away.argmax()]]])
-            away = np.minimum(away, np.linalg.norm(mine - chosen[-1], axis=1))
+        radius = config.spacing_m
+        chosen = _covering(mine, radius, space.resolution_m)
+        while len(chosen) < config.min_per_room:
+            radius *= 0.8
+            chosen = _covering(mine, radius, space.resolution_m)
         nodes.append(chosen)
     xy = np.concatenate(nodes) if nodes else np.zeros((0, 2))
     if not config.connect:
@@ -168,6 +169,24 @@ def free_edges(space: FreeSpace, xy_w: np.ndarray, edge_m: float, margin_m: floa
     """[E, 2] i32: the pairs of `near_pairs` whose way is free."""
     edges = near_pairs(xy_w, edge_m)
     return edges[space.segment_free(xy_w[edges[:, 0]], xy_w[edges[:, 1]], points, margin_m)]
+
+
+def _covering(places: np.ndarray, radius_m: float, step_m: float) -> np.ndarray:
+    """Some of the places [n, 2], at least one within the radius of each: greedily those with most of the rest near."""
+    # One place in each square of two cells is enough to choose from.
+    _, first = np.unique(np.floor(places / (2 * step_m)), axis=0, return_index=True)
+    some = places[np.sort(first)]
+    near = cdist(some, some) <= radius_m
+    chosen, bare = [], np.ones(len(some), bool)
+    while bare.any():
+        chosen.append(int((near & bare).sum(1).argmax()))
+        bare &= ~near[chosen[-1]]
+    nodes = some[chosen]
+    away = cdist(places, nodes).min(1)
+    while away.max() > radius_m:  # the other places of the squares
+        nodes = np.concatenate([nodes, places[[away.argmax()]]])
+        away = np.minimum(away, np.linalg.norm(places - nodes[-1], axis=1))
+    return nodes
 
 
 def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, points: int) -> tuple[np.ndarray, int]:

@@ -98,23 +98,18 @@ def free_space(scene: Scene, height_m: float) -> FreeSpace:
     return FreeSpace(clearance(free, maps.resolution_m), maps.resolution_m, maps.origin_w)
 
 
-def spread(points: np.ndarray, count: int, rng: np.random.Generator, chosen: np.ndarray | None = None) -> np.ndarray:
-    """Indices of `count` points far from each other: each next one is the farthest from those before.
+def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of `count` points (all, where there are fewer), far from each other: each next one is the farthest.
 
     Args:
         points: [n, 2].
-        count: at most n.
-        rng: draws the first, where none is chosen already.
-        chosen: [k, 2] points that count as taken.
+        count: at least 0.
+        rng: draws the first.
     """
     if count <= 0 or not len(points):
         return np.zeros(0, int)
-    if chosen is None or not len(chosen):
-        picked = [int(rng.integers(len(points)))]
-        away = np.linalg.norm(points - points[picked[0]], axis=1)
-    else:
-        picked = []
-        away = np.linalg.norm(points[:, None] - chosen[None], axis=-1).min(1)
+    picked = [int(rng.integers(len(points)))]
+    away = np.linalg.norm(points - points[picked[0]], axis=1)
     while len(picked) < min(count, len(points)):
         nearest = int(np.argmax(away))
         picked.append(nearest)

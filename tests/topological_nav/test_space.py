@@ -73,7 +73,9 @@ def test_too_little_space_is_said(space):
 
 def test_spread_takes_the_farthest_each_time():
     points = np.array([[0.0, 0.0], [1.0, 0.0], [10.0, 0.0], [4.0, 0.0]])
-    taken = spread(points, 3, np.random.default_rng(0), chosen=np.array([[0.0, 0.0]]))
-    # Farthest from 0 is 10; then 4 is 4 m from {0, 10}; then 1.
-    assert taken.tolist() == [2, 3, 1]
+    # From whichever the first is, the next is the farthest from it, the third the farthest from both.
+    for seed in range(8):
+        first, second, third = spread(points, 3, np.random.default_rng(seed))
+        assert second == {0: 2, 1: 2, 2: 0, 3: 2}[first]
+        assert third == {0: 3, 1: 3, 2: 3, 3: 0}[first]
     assert len(spread(points, 9, np.random.default_rng(0))) == 4
