@@ -6,6 +6,7 @@ run that goes on from a checkpoint ends where an uninterrupted one does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -48,11 +49,34 @@ def make_learner(
         tx: its state is made too.
         seed: of the weights.
     """
-    made = jax.jit(lambda key, x: module.init(key, x, train=False))(
-        jax.random.PRNGKey(seed), jnp.zeros((1, *image_shape, 3), jnp.uint8)
-    )
-    params = made["params"]
-    return Learner(params, made.get("batch_stats", {}), tx.init(params))
+    made = initial(variable_shapes(module, image_shape), seed)
+    return Learner(made["params"], made["batch_stats"], tx.init(made["params"]))
+
+
+def variable_shapes(module: nn.Module, image_shape: tuple[int, int]) -> dict[str, Any]:
+    """`params` and `batch_stats` of a module as shapes; nothing is computed."""
+    key, image = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, *image_shape, 3), jnp.uint8)
+    return {"batch_stats": {}, **jax.eval_shape(lambda k, x: module.init(k, x, train=False), key, image)}
+
+
+def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
+    """First values of variables: the same on every device, and without a program to compile.
+
+    Convolutions as in He et al. 2015 by outputs (sd root of 2 over fan out), dense layers by inputs (1 over root of
+    fan in), scales and variances 1, everything else 0.
+    """
+    rng = np.random.default_rng(seed)
+
+    def value(path: Any, leaf: Any) -> jax.Array:
+        name, shape = path[-1].key, leaf.shape
+        if name == "kernel":
+            conv = len(shape) == 4
+            sd = math.sqrt(2.0 / (math.prod(shape[:2]) * shape[3])) if conv else 1.0 / math.sqrt(shape[0])
+            return jnp.asarray(rng.normal(0.0, sd, shape), leaf.dtype)
+        assert name in ("bias", "scale", "mean", "var"), name
+        return jnp.full(shape, 1.0 if name in ("scale", "var") else 0.0, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(value, shapes)
 
 
 def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:

@@ -172,11 +172,8 @@ def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:
 
 def _conv(channels: int, kernel: int, stride: int) -> Any:
     pad = [(kernel // 2, kernel // 2)] * 2
-    return nn.Conv(channels, (kernel, kernel), (stride, stride), pad, use_bias=False, kernel_init=_HE)
+    return nn.Conv(channels, (kernel, kernel), (stride, stride), pad, use_bias=False)
 
 
 def _norm(train: bool) -> Any:
     return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)
-
-
-_HE = nn.initializers.variance_scaling(2.0, "fan_out", "normal")

@@ -39,6 +39,7 @@ from topological_nav.learning import (
     labelled_epoch,
     make_learner,
     paired_epoch,
+    variable_shapes,
     with_backbone,
 )
 from topological_nav.localise import localisation_scores
@@ -207,12 +208,7 @@ def load_trained(run: Path) -> Trained:
         raise RunError(f"{run}: holds no trained network; finish it: python -m topological_nav train TASK -o {run}")
     about = json.loads((run / DESCRIPTION).read_text())
     network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
-    key, image = (
-        jax.random.PRNGKey(0),
-        jax.ShapeDtypeStruct((1, about["data"]["height"], about["data"]["width"], 3), jnp.uint8),
-    )
-    template = jax.eval_shape(lambda k, x: network.init(k, x, train=False), key, image)
-    template = {"batch_stats": {}, **template}
+    template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
     try:
         zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
         variables = flax.serialization.from_bytes(zeros, (run / WEIGHTS).read_bytes())

@@ -12,8 +12,17 @@ from tests.toys import write_room
 from topological_nav.__main__ import main
 
 WORDS = (
-    *("width=32", "height=32", "supersample=1", "positions=40", "num_rooms=2", "room_method=kmeans", "quality=100"),
-    *("passage_sources=12", "passage_length_m=1.2", "shard=4"),
+    *(
+        "width=32",
+        "height=32",
+        "supersample=1",
+        "positions=60",
+        "max_per_room=16",
+        "num_rooms=2",
+        "room_method=kmeans",
+        "quality=100",
+    ),
+    *("passage_sources=24", "passage_length_m=1.2", "shard=4"),
 )
 TRAINED = ("width=4", "hidden=32", "learning_rate=3e-3")
 
@@ -30,13 +39,25 @@ class Made:
 
 
 def paint(folder: Path) -> None:
-    """Colours a toy room's walls: red on the left, green on the right, so that its rooms look different."""
+    """Puts panels before the walls of a 6 x 4 m toy, red on the left, green on the right: its rooms look different."""
     spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
-    for geom in spec.geoms:
-        if geom.parent.name == "structure":
-            left = geom.pos[0] < -0.1
-            middle = abs(geom.pos[0]) <= 0.1
-            geom.rgba = [0.6, 0.6, 0.6, 1] if middle else [0.9, 0.1, 0.1, 1] if left else [0.1, 0.8, 0.1, 1]
+    structure = next(body for body in spec.bodies if body.name == "structure")
+    for side, rgba in ((-1, [0.9, 0.1, 0.1, 1]), (1, [0.1, 0.8, 0.1, 1])):
+        for x, y, half_x, half_y in (
+            (2.99, 0, 0.01, 2),
+            (1.5, 1.99, 1.5, 0.01),
+            (1.5, -1.99, 1.5, 0.01),
+            (0.06, -0.5, 0.01, 1.5),
+        ):
+            structure.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=[side * x, y, 0.6],
+                size=[half_x, half_y, 0.6],
+                rgba=rgba,
+                contype=0,
+                conaffinity=0,
+                group=3,
+            )
     (folder / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")
 
 
@@ -61,7 +82,7 @@ def made(painted, tmp_path_factory) -> Made:
     assert main(["data", str(painted), "-o", str(here.data), *WORDS]) == 0
     learn = ["--data", str(here.data)]
     assert main(["train", "rooms", *learn, "-o", str(here.rooms), "epochs=6", "batch=32", *TRAINED]) == 0
-    words = ["network=alexnet", "epochs=30", "batch=16", *TRAINED]
+    words = ["network=alexnet", "epochs=80", "batch=16", "width=8", "learning_rate=1e-3"]
     assert main(["train", "passages", *learn, "-o", str(here.passages), *words]) == 0
     runs = ["--localiser", str(here.rooms), "--detector", str(here.passages)]
     assert main(["map", str(painted), *runs, "-o", str(here.map), "--route", "0", "1"]) == 0

@@ -5,15 +5,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from topological_nav.learning import initial, variable_shapes
 from topological_nav.networks import Network, augmented, joined, vicreg_loss
 
 
 def sizes(network: Network, height: int = 224, width: int = 224) -> dict:
     """Parameters by part, without computing anything."""
-    made = jax.eval_shape(
-        lambda: network.init(jax.random.PRNGKey(0), jnp.zeros((1, height, width, 3), jnp.uint8), train=False)
-    )
+    made = variable_shapes(network, (height, width))
     return {name: sum(x.size for x in jax.tree.leaves(tree)) for name, tree in made["params"].items()}
+
+
+def test_first_values_have_the_stated_spread_and_follow_from_the_seed():
+    shapes = variable_shapes(Network("rooms", "resnet18", 16, 512, 5), (32, 32))
+    one, same, other = (initial(shapes, seed) for seed in (3, 3, 4))
+    kernel = one["params"]["body"]["Conv_0"]["kernel"]  # 7 x 7 x 3 x 16: root of 2 / (49 x 16) = 0.0505
+    assert float(kernel.std()) == pytest.approx(0.0505, rel=0.05)
+    dense = one["params"]["layers_1"]["kernel"]  # 512 x 512: 1 / root of 512 = 0.0442
+    assert float(dense.std()) == pytest.approx(0.0442, rel=0.02)
+    assert float(abs(dense.mean())) < 1e-3
+    assert {float(x.mean()) for x in jax.tree.leaves(one["batch_stats"])} == {0.0, 1.0}
+    assert (kernel == same["params"]["body"]["Conv_0"]["kernel"]).all()
+    assert (kernel != other["params"]["body"]["Conv_0"]["kernel"]).any()
 
 
 def test_backbones_are_as_large_as_the_originals():
@@ -35,7 +47,7 @@ def test_the_room_head_has_two_layers_of_512():
 def test_embeddings_are_two_unit_vectors(backbone, length):
     network = Network("rooms", backbone, 4, 8, 3)
     images = jnp.asarray(np.random.default_rng(0).integers(0, 256, (5, 32, 48, 3)), jnp.uint8)
-    variables = jax.jit(network.init)(jax.random.PRNGKey(0), images)
+    variables = initial(variable_shapes(network, (32, 48)), 0)
     embedded = jax.jit(lambda v, x: network.apply(v, x, method="embed"))(variables, images)
     assert embedded.shape == (5, length)
     first = {"resnet18": 8, "alexnet": 24}[backbone]
