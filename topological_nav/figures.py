@@ -104,7 +104,8 @@ def dataset_figure(folder: Path) -> Figure:
     columns = min(4, len(scenes))
     lines = -(-len(scenes) // columns)
     figure = plt.figure(figsize=(12, 3.4 * lines + 1.25 * len(shown)), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[3.4 * lines, 1.25 * len(shown)])
+    parts: Any = figure.subfigures(2, 1, height_ratios=[3.4 * lines, 1.25 * len(shown)])
+    above, below = parts
     for axis in np.ravel(above.subplots(lines, columns, squeeze=False))[len(scenes) :]:
         axis.set_axis_off()
     for axis, (name, plan) in zip(above.axes, scenes, strict=False):

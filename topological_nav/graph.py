@@ -86,9 +86,10 @@ class TopologicalMap:
             if not 0 <= node < len(self.xy_w):
                 raise MapError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
         try:
-            cost, nodes = nx.single_source_dijkstra(self.graph, start, goal)
+            found: Any = nx.single_source_dijkstra(self.graph, start, goal)
         except nx.NetworkXNoPath:
             raise MapError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser") from None
+        cost, nodes = found
         angles = tuple(self.graph.edges[a, b]["angle_rad"] for a, b in zip(nodes, nodes[1:], strict=False))
         return Route(tuple(nodes), angles, float(cost))
 

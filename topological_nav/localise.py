@@ -15,7 +15,8 @@ def nearest_node(queries: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np
     Returns:
         [Q] i32 nodes, of equals the first, and [Q] f32 Euclidean distances to their nearest image.
     """
-    flat = nodes.reshape(-1, nodes.shape[-1])
+    # In double precision: images of neighbouring nodes differ by less than single precision loses here.
+    queries, flat = queries.astype(float), nodes.reshape(-1, nodes.shape[-1]).astype(float)
     squares = (queries**2).sum(-1)[:, None] + (flat**2).sum(-1) - 2.0 * queries @ flat.T
     best = squares.argmin(1)
     gap = np.linalg.norm(queries - flat[best], axis=-1)

@@ -77,7 +77,7 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
         return np.zeros(len(points), np.int32)
     with threadpool_limits(1):  # on problems this small, threads cost more than they give
         if method == "kmeans":
-            labels = KMeans(count, n_init=10, random_state=seed).fit_predict(points)
+            labels = KMeans(count, n_init=10, random_state=seed).fit_predict(points)  # type: ignore[arg-type]
         elif method == "gmm":
             labels = _mixture(points, count, seed).predict(points)
         else:

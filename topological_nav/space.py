@@ -59,7 +59,7 @@ class FreeSpace:
         start_w, end_w = np.asarray(start_w, float), np.asarray(end_w, float)
         along = start_w[..., None, :] + share * (end_w - start_w)[..., None, :]
         # A point on the border of two cells belongs to either: a hair of slack keeps the answer the same both ways.
-        return (self.at(along) >= max(margin_m, _FREE_M) - 1e-9).all(-1)
+        return np.asarray((self.at(along) >= max(margin_m, _FREE_M) - 1e-9).all(-1))
 
     def sample(self, rng: np.random.Generator, count: int, least_m: float) -> np.ndarray:
         """[count, 2] m: different cell centres with at least this clearance, uniform over them.

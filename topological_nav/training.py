@@ -81,7 +81,8 @@ class Trained:
             raise RunError(
                 f"images are {images.shape[1:]}, expected {expected}, the size that the network learned from"
             )
-        return in_batches(functools.partial(_applied(self.network, method), self.variables), images)
+        method_of = _applied(self.network, method)  # type: ignore[arg-type]  (flax modules are hashable)
+        return in_batches(functools.partial(method_of, self.variables), images)
 
 
 @functools.cache
@@ -361,7 +362,7 @@ def _read_checkpoint(out: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        return flax.serialization.msgpack_restore(path.read_bytes())
+        return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
     except Exception as error:  # noqa: BLE001  (msgpack raises many kinds for a damaged file)
         raise RunError(f"{path}: not readable ({error}); delete it to begin again") from None
 

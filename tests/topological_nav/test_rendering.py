@@ -17,6 +17,7 @@ from topological_nav.rendering import BATCH, SceneRenderer, camera_pose, shrink
 def test_the_camera_stands_where_the_robots_mount_has_it():
     robot = get_robot("ttbot")
     spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
     robot.add_to(spec)
     model = spec.compile()
     mount = make_mount(model, robot.base_body, robot.camera)

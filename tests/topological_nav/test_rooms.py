@@ -52,8 +52,8 @@ def test_recorded_rooms_hold_the_free_space_of_their_scene():
     assert known is not None and known.shape == (4, 4)  # scenes_mjcf/README.md: four rooms
     free = free_space(load_scene(SCENE), 1.1).centres(0.2)
     inside = ((free[:, None] > known[:, :2]) & (free[:, None] < known[:, 2:])).all(-1)
-    assert inside.any(1).mean() > 0.95  # the rest stands in doorways
-    assert inside.any(0).all()
+    assert inside.sum(1).mean() > 0.95  # the rest stands in doorways
+    assert inside.sum(0).min() > 0
 
 
 def test_scenes_without_a_recipe_have_none(room):

@@ -87,7 +87,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
 def test_a_finished_run_is_left_as_it_is(made, whole):
     before = (whole[0] / "weights.msgpack").read_bytes()
     told = []
-    assert training.train("rooms", made.data, *whole, told.append) is not None
+    assert training.train("rooms", made.data, whole[0], whole[1], told.append) is not None
     assert told == [] and (whole[0] / "weights.msgpack").read_bytes() == before
 
 
@@ -136,7 +136,7 @@ def test_one_program_an_epoch_does_what_one_an_update_does(monkeypatch):
     ends = []
     for backend in ("cpu", "gpu"):
         monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
-        ends.append(compiled_epoch(steps, update)(jax.numpy.float32(0.0), rows, two, None))
+        ends.append(compiled_epoch(steps, update)(jax.numpy.float32(0.0), rows, two, jax.random.PRNGKey(0)))
     # 2, 6, 12: the last is 12, the mean 20 / 3.
     for learner, told in ends:
         assert float(learner) == 12.0 and float(told["sum"]) == pytest.approx(20 / 3)
