@@ -128,7 +128,7 @@ def place_nodes(
     """Where a map's nodes stand.
 
     In every room one place after the other becomes a node, each time the one that has most places within `spacing_m`
-    that no node has yet: nodes stand in the open rather than along walls. A room that needs fewer than `min_per_room`
+    that no node has yet. A room that needs fewer than `min_per_room`
     is covered again with less spacing. Then, where `connect` is set, nodes are added along the shortest free way
     between parts of the map that no free edge joins.
 

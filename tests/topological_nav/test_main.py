@@ -5,10 +5,10 @@ import pytest
 from PIL import Image
 
 from interactive_nav.scene import load_scene
+from topological_nav import rooms
 from topological_nav.__main__ import main
 from topological_nav.graph import load_map
 from topological_nav.localise import nearest_node
-from topological_nav.rooms import main as rooms_main
 
 
 def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
@@ -69,9 +69,10 @@ def test_a_room_classifier_judges_no_passages(made, capsys, tmp_path):
     assert "the detector was trained for 'rooms', expected a run of 'train passages'" in capsys.readouterr().err
 
 
-def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys):
+def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(rooms, "CLUSTERED", 120)
     out = tmp_path / "rooms.png"
-    assert rooms_main([str(made.scene), "-o", str(out)]) == 0
+    assert rooms.main([str(made.scene), "-o", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines] == ["kmeans", "gmm", "spectral"]
     assert Image.open(out).size[0] > 800

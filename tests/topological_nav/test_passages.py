@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.scene import load_scene
@@ -62,6 +62,7 @@ def test_balance_by_hand():
     assert len(balanced(np.array([0, 1]), labels, np.random.default_rng(0))) == 0
 
 
+@settings(deadline=None)
 @given(st.integers(0, 40), st.floats(0.01, 0.99), st.integers(0, 1000))
 def test_of_two_or_more_some_are_held_out_and_some_are_not(count, share, seed):
     held = held_out(count, share, np.random.default_rng(seed))

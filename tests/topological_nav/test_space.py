@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.scene import load_scene
@@ -59,6 +59,7 @@ def test_a_thin_obstacle_between_two_points_is_missed_as_the_definition_has_it()
     assert bool(thin.segment_free(start, end, 50, 0.0)) is False
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.6))
 def test_sampled_places_have_the_clearance_and_differ(space, seed, least):
     places = space.sample(np.random.default_rng(seed), 20, least)

@@ -65,22 +65,20 @@ def test_the_phase_without_labels_comes_first_and_learns(whole):
     assert lines[1]["loss"] < lines[0]["loss"]
 
 
-@pytest.mark.parametrize("stop_after", [1, 3])
-def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_path, stop_after):
-    """Stopped in either phase, after as many epochs; the second call goes on."""
+def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_path):
+    """Stopped in either phase, after one epoch and after three; the third call ends it."""
     out, config = tmp_path / "run", whole[1]
     told = []
-    assert training.train("rooms", made.data, out, config, told.append, lambda: len(told) >= stop_after) is None
-    assert len(told) == stop_after
+    for stop_after in (1, 3):
+        assert training.train("rooms", made.data, out, config, told.append, lambda n=stop_after: len(told) >= n) is None
+        assert len(told) == stop_after
     with pytest.raises(RunError, match="holds no trained network; finish it"):
         training.load_trained(out)
     assert training.train("rooms", made.data, out, config, told.append) is not None
     assert len(told) == 4
     assert same(weights(out), weights(whole[0]))
-    strip = [
-        [{k: v for k, v in line.items() if k != "seconds"} for line in read_metrics(p / "metrics.jsonl")]
-        for p in (out, whole[0])
-    ]
+    lines = [read_metrics(run / "metrics.jsonl") for run in (out, whole[0])]
+    strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in run] for run in lines]
     assert strip[0] == strip[1]
 
 
