@@ -62,7 +62,7 @@ def build_map(
     data = _camera_of(localiser, detector)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)
-    known = recorded_rooms(scene.path)
+    known = recorded_rooms(scene.digest)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
     judged = overlaid(DataConfig(), detector.about["data"], str(detector_run))
     margin_m, points = judged.passage_margin_m, judged.passage_points

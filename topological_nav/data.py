@@ -104,7 +104,7 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
         SpaceError: too little free space.
     """
     rng = np.random.default_rng([config.seed, 2, int(scene.digest[:8], 16)])
-    known = recorded_rooms(scene.path)
+    known = recorded_rooms(scene.digest)
     rooms = find_rooms(space, config.room_method, config.num_rooms, known, config.seed, config.clearance_m)
     try:
         drawn = space.sample(rng, config.positions, config.clearance_m)
@@ -279,7 +279,7 @@ def _plan_arrays(plan: ScenePlan) -> dict[str, np.ndarray]:
 
 
 def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
-    known = recorded_rooms(scene.path)
+    known = recorded_rooms(scene.digest)
     return {
         "name": scene.name,
         "digest": scene.digest,

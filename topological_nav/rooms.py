@@ -1,14 +1,13 @@
 """`python -m topological_nav.rooms SCENE... -o rooms.png`: free positions in, rooms by three kinds of clustering out.
 
-Positions are clustered by their coordinates alone. Where a scene's plan is recorded (generated scenes: the recipe
-beside their folders), the rooms found are compared with it by the adjusted Rand index.
+Positions are clustered by their coordinates alone. Where a scene's plan is recorded (`plans.py`: the generated
+scenes), the rooms found are compared with it by the adjusted Rand index.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from topological_nav.config import DataConfig
 from topological_nav.errors import SpaceError, TopologicalError
+from topological_nav.plans import RECORDED
 from topological_nav.space import FreeSpace, free_space
 
 METHODS = ("kmeans", "gmm", "spectral")
@@ -133,25 +133,9 @@ def find_rooms(
     return Rooms(points, cluster(points, method, count, seed), method, by)
 
 
-def recorded_rooms(scene_folder: Path) -> np.ndarray | None:
-    """[k, 4] x0, y0, x1, y1 (m, world) of a generated scene's rooms; None where its plan is not recorded.
-
-    `recipes.yaml` beside the scene's folder names the seed that its building was drawn from; it is drawn again.
-    """
-    recipes = Path(scene_folder).resolve().parent / "recipes.yaml"
-    return _recorded(recipes, Path(scene_folder).resolve().name) if recipes.is_file() else None
-
-
-@functools.cache
-def _recorded(recipes: Path, name: str) -> np.ndarray | None:
-    from converters.generate import design_building
-    from converters.generate.recipes import load_recipes
-
-    for recipe in load_recipes(recipes).scenes:
-        if recipe.name == name:
-            rooms = design_building(recipe.seed, recipe.building).plan.rooms
-            return np.array([[r.x0, r.y0, r.x1, r.y1] for r in rooms])
-    return None
+def recorded_rooms(digest: str) -> np.ndarray | None:
+    """[k, 4] x0, y0, x1, y1 (m, world) of a scene's rooms, by its digest; None where its plan is not recorded."""
+    return np.array(RECORDED[digest]) if digest in RECORDED else None
 
 
 def room_of(known: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
@@ -176,7 +160,8 @@ def compare(scene_folders: Sequence[Path], seed: int = 0, clearance_m: float = 0
     height_m = get_robot(DataConfig().robot).height_m
     rows = []
     for folder in scene_folders:
-        space, known = free_space(load_scene(folder), height_m), recorded_rooms(folder)
+        scene = load_scene(folder)
+        space, known = free_space(scene, height_m), recorded_rooms(scene.digest)
         for method in METHODS:
             for given in [known, None] if known is not None else [None]:
                 rooms = find_rooms(space, method, None, given, seed, clearance_m)

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from sklearn.metrics import adjusted_rand_score
 
+from converters.generate import design_building
+from converters.generate.recipes import load_recipes
 from interactive_nav.scene import load_scene
 from topological_nav import rooms
+from topological_nav.plans import RECORDED
 from topological_nav.space import free_space
 
 SCENE = Path(__file__).parents[2] / "scenes_mjcf" / "apartment_0"
@@ -48,7 +51,7 @@ def test_wrong_requests_are_refused():
 
 
 def test_recorded_rooms_hold_the_free_space_of_their_scene():
-    known = rooms.recorded_rooms(SCENE)
+    known = rooms.recorded_rooms(load_scene(SCENE).digest)
     assert known is not None and known.shape == (4, 4)  # scenes_mjcf/README.md: four rooms
     free = free_space(load_scene(SCENE), 1.1).centres(0.2)
     inside = ((free[:, None] > known[:, :2]) & (free[:, None] < known[:, 2:])).all(-1)
@@ -56,8 +59,17 @@ def test_recorded_rooms_hold_the_free_space_of_their_scene():
     assert inside.sum(0).min() > 0
 
 
-def test_scenes_without_a_recipe_have_none(room):
-    assert rooms.recorded_rooms(room) is None
+def test_recorded_rooms_are_those_that_the_recipes_draw():
+    """A scene that is made anew has another digest: record its plan then."""
+    recipes = load_recipes(SCENE.parent / "recipes.yaml").scenes
+    assert len(recipes) == len(RECORDED)
+    for recipe in recipes:
+        drawn = [(r.x0, r.y0, r.x1, r.y1) for r in design_building(recipe.seed, recipe.building).plan.rooms]
+        assert RECORDED[load_scene(SCENE.parent / recipe.name).digest] == pytest.approx(np.array(drawn), abs=1e-6)
+
+
+def test_other_scenes_have_none(room):
+    assert rooms.recorded_rooms(load_scene(room).digest) is None
 
 
 def test_a_doorway_belongs_to_the_nearer_room():
@@ -67,7 +79,7 @@ def test_a_doorway_belongs_to_the_nearer_room():
 
 
 def test_known_rooms_decide_the_number_and_are_agreed_with():
-    known = rooms.recorded_rooms(SCENE)
+    known = rooms.recorded_rooms(load_scene(SCENE).digest)
     assert known is not None
     space = free_space(load_scene(SCENE), 1.1)
     found = rooms.find_rooms(space, "spectral", None, known, 0, 0.2)
