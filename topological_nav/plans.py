@@ -1,6 +1,6 @@
 """Plans of the generated scenes: the rooms that each building was drawn with, by the scene's digest.
 
-From `converters.generate.design_building` and `scenes_mjcf/recipes.yaml`; `tests/topological_nav/test_rooms.py` draws them again.
+Drawn by `converters.generate.design_building` from `scenes_mjcf/recipes.yaml`; a test draws them again and compares.
 """
 
 Rectangle = tuple[float, float, float, float]
