@@ -1,0 +1,89 @@
+"""One small dataset, two runs and a map of a toy scene of two rooms, made by the commands themselves and shared."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from tests.toys import write_room
+from topological_nav.__main__ import main
+
+WORDS = (
+    *(
+        "width=32",
+        "height=32",
+        "supersample=1",
+        "positions=60",
+        "max_per_room=16",
+        "num_rooms=2",
+        "room_method=kmeans",
+        "quality=100",
+    ),
+    *("passage_sources=24", "passage_length_m=1.2", "shard=4"),
+)
+TRAINED = ("width=4", "hidden=32", "learning_rate=3e-3")
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """Where the commands wrote."""
+
+    scene: Path
+    data: Path
+    rooms: Path
+    passages: Path
+    map: Path
+
+
+def paint(folder: Path) -> None:
+    """Puts panels before the walls of a 6 x 4 m toy, red on the left, green on the right: its rooms look different."""
+    spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+    structure = next(body for body in spec.bodies if body.name == "structure")
+    for side, rgba in ((-1, [0.9, 0.1, 0.1, 1]), (1, [0.1, 0.8, 0.1, 1])):
+        for x, y, half_x, half_y in (
+            (2.99, 0, 0.01, 2),
+            (1.5, 1.99, 1.5, 0.01),
+            (1.5, -1.99, 1.5, 0.01),
+            (0.06, -0.5, 0.01, 1.5),
+        ):
+            structure.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=[side * x, y, 0.6],
+                size=[half_x, half_y, 0.6],
+                rgba=rgba,
+                contype=0,
+                conaffinity=0,
+                group=3,
+            )
+    (folder / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def painted(tmp_path_factory) -> Path:
+    """Two rooms of 3 x 4 m joined by a gap of 1 m, a cube in each."""
+    folder = write_room(
+        tmp_path_factory.mktemp("topological") / "painted",
+        (6.0, 4.0),
+        (("chair", 1.4, -0.5, 5.0, 0.5), ("table", -1.5, 0.5, 10.0, 0.4)),
+        partition=True,
+    )
+    paint(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def made(painted, tmp_path_factory) -> Made:
+    """Everything the commands make of the painted scene."""
+    base = tmp_path_factory.mktemp("made")
+    here = Made(painted, base / "data", base / "rooms", base / "passages", base / "map.npz")
+    assert main(["data", str(painted), "-o", str(here.data), *WORDS]) == 0
+    learn = ["--data", str(here.data)]
+    assert main(["train", "rooms", *learn, "-o", str(here.rooms), "epochs=6", "batch=32", *TRAINED]) == 0
+    words = ["network=alexnet", "epochs=80", "batch=16", "width=8", "learning_rate=1e-3"]
+    assert main(["train", "passages", *learn, "-o", str(here.passages), *words]) == 0
+    runs = ["--localiser", str(here.rooms), "--detector", str(here.passages)]
+    assert main(["map", str(painted), *runs, "-o", str(here.map), "--route", "0", "1"]) == 0
+    return here

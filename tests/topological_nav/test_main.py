@@ -1,0 +1,78 @@
+"""The commands: what they write, draw and refuse."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from interactive_nav.scene import load_scene
+from topological_nav import rooms
+from topological_nav.__main__ import main
+from topological_nav.graph import load_map
+from topological_nav.localise import nearest_node
+
+
+def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
+    digest = load_scene(made.scene).digest
+    read = load_map(made.map, digest)
+    assert np.bincount(read.room).min() >= 3
+    assert read.embeddings.shape == (len(read.xy_w), 18, 24 // 3 * 1 + 32)
+    assert np.linalg.norm(read.embeddings, axis=-1) == pytest.approx(np.sqrt(2), abs=1e-4)
+    away = np.linalg.norm(read.xy_w[read.edges[:, 0]] - read.xy_w[read.edges[:, 1]], axis=1)
+    assert away.max() < 2.5 and ((read.p > 0) & (read.p < 1)).all()
+    # A node's own images lead back to it, or to one that saw the same.
+    found, gap = nearest_node(read.embeddings[:, 5], read.embeddings)
+    assert (found == np.arange(len(read.xy_w))).mean() > 0.8 and gap.max() < 1e-3
+    assert (read.localise(read.embeddings[:, 5]) == found).all()
+    assert set(read.about) >= {"localiser", "detector", "settings", "data"}
+
+
+def test_every_command_draws(made):
+    for path in (made.data / "preview.png", made.rooms / "curves.png", made.map.with_suffix(".png")):
+        picture = np.asarray(Image.open(path).convert("RGB"))
+        assert picture.shape[0] > 200 and picture.std() > 10
+    drawn = np.asarray(Image.open(made.map.with_suffix(".png")).convert("RGB")).astype(int)
+    blue = (abs(drawn - [31, 119, 180]).sum(-1) < 12).sum()  # tab:blue, the route
+    assert blue > 50
+
+
+def test_the_nearest_image_of_a_node_may_judge_its_edges(made, tmp_path, capsys):
+    out = tmp_path / "nearest.npz"
+    runs = ["--localiser", str(made.rooms), "--detector", str(made.passages)]
+    assert main(["map", str(made.scene), *runs, "-o", str(out), "edge_image=nearest"]) == 0
+    assert "edges judged as on the plan" in capsys.readouterr().out
+    first, second = load_map(made.map), load_map(out)
+    assert (first.edges == second.edges).all() and (first.xy_w == second.xy_w).all()
+    assert np.abs(first.p - second.p).max() > 0.01
+    # Where an edge runs along one of the 18 headings, both looked at the same image.
+    along = np.abs((first.angle_rad / np.deg2rad(20) + 0.5) % 1 - 0.5) < 1e-4
+    assert first.p[along] == pytest.approx(second.p[along], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["data", "nowhere"], "nowhere/scene.json: no such file"),
+        (["data", "nowhere", "heading=3"], "unknown key 'heading'; did you mean 'headings'?"),
+        (["train", "rooms", "--data", "nowhere"], "nowhere: is no dataset"),
+        (["map", "nowhere", "--localiser", "gone"], "gone: holds no trained network"),
+    ],
+)
+def test_mistakes_are_one_line(words, told, capsys):
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("topological_nav: ") and told in error and error.count("\n") == 1
+
+
+def test_a_room_classifier_judges_no_passages(made, capsys, tmp_path):
+    runs = ["--localiser", str(made.rooms), "--detector", str(made.rooms)]
+    assert main(["map", str(made.scene), *runs, "-o", str(tmp_path / "map.npz")]) == 2
+    assert "the detector was trained for 'rooms', expected a run of 'train passages'" in capsys.readouterr().err
+
+
+def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(rooms, "CLUSTERED", 120)
+    out = tmp_path / "rooms.png"
+    assert rooms.main([str(made.scene), "-o", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines] == ["kmeans", "gmm", "spectral"]
+    assert Image.open(out).size[0] > 800

@@ -1,0 +1,66 @@
+"""Where the camera is, against the environment's own mount; what it sees of a painted scene."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from interactive_nav.rendering.base import Lens
+from interactive_nav.rendering.mount import make_mount
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import load_scene
+from topological_nav.errors import TopologicalError
+from topological_nav.rendering import BATCH, SceneRenderer, camera_pose, shrink
+
+
+def test_the_camera_stands_where_the_robots_mount_has_it():
+    robot = get_robot("ttbot")
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
+    robot.add_to(spec)
+    model = spec.compile()
+    mount = make_mount(model, robot.base_body, robot.camera)
+    qpos = np.zeros((3, model.nq), np.float32)
+    headings, places = np.array([0.0, 1.1, -2.5]), np.array([[0.0, 0.0], [2.0, -1.0], [-3.0, 4.0]])
+    qpos[:, :2], qpos[:, 3], qpos[:, 6] = places, np.cos(headings / 2), np.sin(headings / 2)
+    expected = mount.pose(qpos)  # type: ignore[arg-type]
+    got = camera_pose(robot, places, headings, np.zeros(3))
+    assert np.allclose(got.pos_w, expected.pos_w, atol=1e-6)
+    assert np.allclose(got.axes_w, expected.axes_w, atol=1e-6)
+
+
+def test_pitch_turns_the_view_up_and_leaves_the_place():
+    robot = get_robot("ttbot")
+    up = camera_pose(robot, np.zeros(2), np.array([0.0]), np.array([math.radians(30)]))
+    assert np.allclose(up.axes_w[0, :, 0], [math.cos(math.radians(30)), 0, 0.5], atol=1e-6)
+    assert np.allclose(up.pos_w[0], robot.camera.pos_m, atol=1e-6)
+
+
+def test_a_camera_on_another_link_is_refused():
+    with pytest.raises(
+        TopologicalError, match="the camera of 'fetch' sits on .* choose a robot with a camera on its base"
+    ):
+        camera_pose(get_robot("fetch"), np.zeros(2), np.zeros(1), np.zeros(1))
+
+
+def test_shrinking_takes_means_over_squares():
+    image = np.arange(16, dtype=np.uint8).reshape(1, 4, 4, 1).repeat(3, -1)
+    # Upper left square: 0 1 4 5, mean 2.5, rounded to even.
+    assert shrink(image, 2)[0, :, :, 0].tolist() == [[2, 4], [10, 12]]
+    assert (shrink(image, 1) == image).all()
+
+
+def test_walls_have_their_colours_and_batches_of_any_size_their_order(painted):
+    renderer = SceneRenderer(load_scene(painted), Lens(16, 12, 60.0))
+    robot, n = get_robot("ttbot"), BATCH + 3
+    # Turning between the red walls on the left (looking along -x) and the green ones on the right.
+    heading = np.where(np.arange(n) % 2 == 0, np.pi, 0.0)
+    place = np.where((np.arange(n) % 2 == 0)[:, None], [-1.5, 0.0], [1.5, 0.0])
+    images = renderer.draw(camera_pose(robot, place, heading, np.full(n, -0.2)))
+    assert images.shape == (n, 12, 16, 3) and images.dtype == np.uint8
+    middle = images[:, 5:8, 6:10].astype(float).mean((1, 2))
+    red = middle[:, 0] > 2 * middle[:, 1]
+    green = middle[:, 1] > 2 * middle[:, 0]
+    assert (red == (np.arange(n) % 2 == 0)).all() and (green == ~red).all()
+    assert (images[0] == images[2]).all() and (images[-1] == images[0]).all()

@@ -1,0 +1,191 @@
+"""`python -m topological_nav data|train|map`: words on the command line in, datasets, networks and maps out.
+
+Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from scenes_mjcf.schema import SceneError
+from topological_nav.config import DataConfig, MapConfig, passage_config, room_config
+from topological_nav.errors import TopologicalError
+from topological_nav.settings import overridden, settings_help
+from train.errors import TrainError
+
+DATASET, RUNS = Path("runs/topological/data"), Path("runs/topological")
+TASKS = {"rooms": room_config, "passages": passage_config}
+
+
+class Stopped(Exception):
+    """A signal asked to stop; carries its number."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m topological_nav",
+        description="Navigation by images and a graph. Words key=value change settings: COMMAND --help lists them.",
+    )
+    commands = made.add_subparsers(dest="command", required=True)
+
+    def command(name: str, text: str, config: object) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name,
+            help=text,
+            description=text,
+            epilog=f"settings (key=default):\n{settings_help(config)}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        return sub
+
+    data = command("data", "Renders room and passage images of scenes.", DataConfig())
+    data.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
+    data.add_argument("-o", "--out", type=Path, default=DATASET, metavar="DIR", help=f"dataset (default {DATASET})")
+    train = command("train", "Trains the room classifier or the passage detector.", room_config())
+    train.add_argument("task", choices=list(TASKS), help="passages differ in: batch=32 epochs=20")
+    train.add_argument("--data", type=Path, default=DATASET, metavar="DIR", help=f"dataset (default {DATASET})")
+    train.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"run folder (default {RUNS}/TASK)")
+    plan = command("map", "Builds a scene's topological map and draws it.", MapConfig())
+    plan.add_argument("scene", metavar="SCENE", help="scene folder")
+    plan.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
+    plan.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
+    plan.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"map (default {RUNS}/maps/SCENE.npz)")
+    plan.add_argument("--route", nargs=2, type=int, metavar=("FROM", "TO"), help="draw the way between two nodes")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a command."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    settings = [word for word in words if re.match(r"\w+=", word)]
+    arguments = parser().parse_args([word for word in words if word not in settings])
+    arguments.settings = settings
+    try:
+        {"data": _data, "train": _train, "map": _map}[arguments.command](arguments)
+    except (TopologicalError, SceneError, TrainError) as error:
+        print(f"topological_nav: {error}", file=sys.stderr)
+        return 2
+    except Stopped as stopped:
+        print("topological_nav: stopped; the same command goes on", file=sys.stderr)
+        return 128 + stopped.args[0]
+    return 0
+
+
+def _data(arguments: argparse.Namespace) -> None:
+    config = overridden(DataConfig(), arguments.settings)
+    from topological_nav.data import dataset_bytes, make_dataset
+    from topological_nav.figures import dataset_figure, save
+
+    with _stops() as stops, _bar() as tell:
+
+        def progress(scene: str, done: int, total: int) -> None:
+            tell(scene, done, total)
+            if stops and done < total:
+                raise Stopped(stops[0])
+
+        header = make_dataset([Path(s) for s in arguments.scenes], arguments.out, config, progress)
+    save(dataset_figure(arguments.out), arguments.out / "preview.png")
+    images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
+    for s in header["scenes"]:
+        rand = "" if s["rooms_agreement"] is None else f", adjusted Rand index {s['rooms_agreement']:.2f}"
+        print(
+            f"{s['name']}: {s['rooms']} rooms ({s['rooms_chosen_by']}{rand}), {s['positions']} positions "
+            f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
+        )
+    size = dataset_bytes(arguments.out)
+    print(f"{arguments.out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    config = overridden(TASKS[arguments.task](), arguments.settings)
+    out = arguments.out or RUNS / arguments.task
+    from topological_nav.figures import curves_figure, save
+    from topological_nav.training import train
+    from train.run_folder import read_metrics
+
+    with _stops() as stops:
+        results = train(
+            arguments.task, arguments.data, out, config, lambda line: print(line, flush=True), lambda: bool(stops)
+        )
+        if results is None:
+            raise Stopped(stops[0])
+    save(curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+    for name, row in results.get("groups", {}).items():
+        print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
+    if mean := results["localisation"].get("mean"):
+        print(
+            f"localisation: nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
+            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
+        )
+    print(f"{out}: {results['parameters']:,} parameters")
+
+
+def _map(arguments: argparse.Namespace) -> None:
+    config = overridden(MapConfig(), arguments.settings)
+    from topological_nav.build import build_map
+    from topological_nav.figures import map_figure, save
+    from topological_nav.graph import save_map
+
+    out = arguments.out or RUNS / "maps" / f"{Path(arguments.scene).resolve().name}.npz"
+    with _bar() as tell:
+        built = build_map(Path(arguments.scene), arguments.localiser, arguments.detector, config, tell)
+    save_map(built.map, out)
+    route = None
+    if arguments.route:
+        route = built.map.plan(*arguments.route)
+        print(f"{arguments.route[0]} to {arguments.route[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
+    picture = out.with_suffix(".png")
+    save(map_figure(built, route), picture)
+    for name, value in built.scores.items():
+        print(f"{name}: {value}")
+    print(
+        f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges, {out.stat().st_size / 1024:.0f} KiB; "
+        f"drawn in {picture}"
+    )
+
+
+@contextmanager
+def _stops() -> Iterator[list[int]]:
+    from train.run import stop_signals
+
+    with stop_signals() as seen:
+        yield seen
+
+
+@contextmanager
+def _bar():
+    """A bar with the time left on a terminal, a line every tenth elsewhere."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:<14}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("starting", total=None)
+        began, told = time.perf_counter(), [0]
+
+        def tell(what: str, done: int, total: int) -> None:
+            bar.update(task, description=what, completed=done, total=total)
+            if not console.is_terminal and done * 10 // max(total, 1) > told[0]:
+                told[0] = done * 10 // total
+                left = (time.perf_counter() - began) * (total - done) / max(done, 1)
+                console.print(f"{what}: {done:,} of {total:,}, {left:.0f} s left", highlight=False, soft_wrap=True)
+
+        yield tell
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""A scene and two trained networks in, its topological map out: nodes placed, images drawn, edges judged."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from interactive_nav.rendering.base import Lens
+from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav.scene import load_scene
+from topological_nav.config import DataConfig, MapConfig
+from topological_nav.data import headings
+from topological_nav.errors import MapError, SpaceError
+from topological_nav.graph import TopologicalMap, assemble, place_nodes
+from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rooms import find_rooms, recorded_rooms
+from topological_nav.settings import overlaid, plain_settings
+from topological_nav.space import FreeSpace, free_space
+from topological_nav.training import Trained, load_trained
+
+CHUNK = 252
+"""Images drawn between two reports: fourteen calls of the renderer."""
+Progress = Callable[[str, int, int], None]
+SAME = ("robot", "engine", "width", "height", "fov_deg", "headings")
+"""What two networks' images must have in common to look through one camera."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """A map, and what it was made in and found to be."""
+
+    map: TopologicalMap
+    space: FreeSpace
+    free: np.ndarray
+    """[E] bool: whether each edge's way is free on the plan."""
+    scores: dict[str, Any]
+    """Nodes a room, connectedness, and how the edges compare with the plan."""
+
+
+def build_map(
+    scene_folder: Path, localiser_run: Path, detector_run: Path, config: MapConfig, progress: Progress = lambda *_: None
+) -> Built:
+    """Builds a scene's map.
+
+    Args:
+        scene_folder: the scene.
+        localiser_run: run folder of a network whose embedding localises.
+        detector_run: run folder of a passage detector.
+        config: of the map.
+        progress: told what is drawn, images done and images in all.
+
+    Raises:
+        RunError: a run is not finished.
+        MapError: the networks learned from different cameras, or the second judges no passages.
+        SceneError, SpaceError: the scene cannot be used.
+    """
+    localiser, detector = load_trained(localiser_run), load_trained(detector_run)
+    data = _camera_of(localiser, detector)
+    scene, robot = load_scene(scene_folder), get_robot(data.robot)
+    space = free_space(scene, robot.height_m)
+    known = recorded_rooms(scene.digest)
+    rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
+    judged = overlaid(DataConfig(), detector.about["data"], str(detector_run))
+    margin_m, points = judged.passage_margin_m, judged.passage_points
+    xy, lacking = place_nodes(space, rooms, config, margin_m, points)
+    if not len(xy):
+        raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
+    around = headings(data)
+    renderer = SceneRenderer(
+        scene, Lens(data.width, data.height, data.fov_deg or robot.camera.fov_deg), data.supersample, data.engine
+    )
+    told = _Told(progress, len(xy) * len(around))
+    images = _draw(renderer, robot, np.repeat(xy, len(around), 0), np.tile(around, len(xy)), told, "nodes")
+    embeddings = localiser.embed(images).reshape(len(xy), len(around), -1)
+
+    def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        if config.edge_image == "nearest":
+            turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
+            looked = images.reshape(len(xy), len(around), *images.shape[1:])[edges[:, 0], turn]
+        else:
+            told.total += len(edges)
+            looked = _draw(renderer, robot, xy[edges[:, 0]], angle, told, "edges")
+        return 1.0 / (1.0 + np.exp(-detector.logits(looked)[:, 0]))
+
+    about = {
+        "settings": plain_settings(config),
+        "data": plain_settings(data),
+        "localiser": localiser.about["digest"],
+        "detector": detector.about["digest"],
+        "margin_m": margin_m,
+        "points": points,
+    }
+    made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
+    free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
+    return Built(made, space, free, _scores(made, free, config, lacking))
+
+
+def _camera_of(localiser: Trained, detector: Trained) -> DataConfig:
+    if detector.about["task"] != "passages":
+        raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
+    first, second = ({**n.about["data"], "fov_deg": n.about["fov_deg"]} for n in (localiser, detector))
+    for name in SAME:
+        if first[name] != second[name]:
+            raise MapError(
+                f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
+                "train both on one dataset"
+            )
+    return overlaid(DataConfig(), first, "network.json")
+
+
+class _Told:
+    """Counts images for a progress callback."""
+
+    def __init__(self, progress: Progress, total: int):
+        self._progress, self._done, self.total = progress, 0, total
+
+    def add(self, what: str, count: int) -> None:
+        self._done += count
+        self._progress(what, self._done, self.total)
+
+
+def _draw(
+    renderer: SceneRenderer, robot: RobotSpec, xy: np.ndarray, heading: np.ndarray, told: _Told, what: str
+) -> np.ndarray:
+    """[N, H, W, 3] u8: level images from places [N, 2] along headings [N]."""
+    parts = []
+    for first in range(0, len(xy), CHUNK):
+        rows = slice(first, first + CHUNK)
+        parts.append(renderer.draw(camera_pose(robot, xy[rows], heading[rows], np.zeros(len(xy[rows])))))
+        told.add(what, len(parts[-1]))
+    return np.concatenate(parts)
+
+
+def _scores(made: TopologicalMap, free: np.ndarray, config: MapConfig, lacking: list[str]) -> dict[str, Any]:
+    open_ = made.p >= config.passable
+    parts = made.open_parts(config.passable)
+    scores: dict[str, Any] = {
+        "nodes a room": " ".join(str(n) for n in np.bincount(made.room)),
+        "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
+        "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
+        "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
+    }
+    if lacking:
+        scores["lacking"] = "; ".join(lacking)
+    return scores

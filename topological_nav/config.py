@@ -1,0 +1,164 @@
+"""Every setting of datasets, training and maps: frozen dataclasses checked on construction; docstrings are the help."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+from topological_nav.errors import SettingsError
+from topological_nav.settings import require
+
+PITCHES = ("up", "level", "down")
+"""Order of a position's images by pitch."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """What is drawn of each scene. Defaults: the report's, at a stored size of 128 x 96."""
+
+    seed: int = 0
+    """Of positions, splits and passages."""
+    robot: str = "ttbot"
+    """Whose camera draws."""
+    engine: Literal["warp", "gl"] = "warp"
+    """Who draws: MJX-Warp's ray tracer (CPU or GPU), or MuJoCo's own renderer (needs EGL or OSMesa)."""
+    width: int = 128
+    """Of a stored image, pixels."""
+    height: int = 96
+    """Of a stored image, pixels."""
+    supersample: int = 5
+    """Images are drawn this many times larger along each side and averaged: 5 x 128 x 96 is 640 x 480."""
+    fov_deg: float | None = None
+    """Vertical field of view; auto: the robot's camera's."""
+    quality: int = 90
+    """WebP quality of stored images; 100 stores them without loss."""
+    room_method: Literal["kmeans", "gmm", "spectral"] = "gmm"
+    """How free positions are clustered into rooms."""
+    num_rooms: int | None = None
+    """Rooms a scene; auto: as recorded for the scene, else chosen by BIC (gmm) or silhouette."""
+    positions: int = 100
+    """Free positions drawn in a scene for room images."""
+    clearance_m: float = 0.2
+    """Their least distance from obstacles."""
+    max_per_room: int = 10
+    """Of them kept in a room."""
+    test_share: float = 0.2
+    """Share of a room's positions (and of its passages' sources) that are for testing only."""
+    headings: int = 18
+    """Images around a position, for each pitch; a multiple of 3, because testing takes every third."""
+    pitch_deg: float = 20.0
+    """How far up and down the camera looks; the third pitch is level."""
+    passage_sources: int = 10
+    """Sources a room of passage images."""
+    passage_targets: int = 10
+    """Directions a source, evenly about it from a drawn one on."""
+    passage_clearance_m: float = 0.3
+    """Least distance of sources from obstacles."""
+    passage_length_m: float = 2.0
+    """Length of the segment that is navigable or not."""
+    passage_points: int = 50
+    """Points of the segment looked up on the map, both ends included."""
+    passage_margin_m: float = 0.225
+    """Distance from obstacles that each point needs: half of TTbot's width; 0: it may touch them."""
+    shard: int = 10
+    """Sheets of images a file: what an interrupted rendering loses at most."""
+
+    def __post_init__(self) -> None:
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "width height", 16, 2048)
+        require(self, "supersample", 1, 16)
+        require(self, "fov_deg", 1.0, 170.0)
+        require(self, "quality", 1, 100)
+        require(self, "num_rooms max_per_room positions passage_sources passage_targets shard", 1, 10**6)
+        require(self, "clearance_m passage_clearance_m passage_margin_m", 0.0, 10.0)
+        require(self, "passage_length_m", 0.05, 100.0)
+        require(self, "passage_points", 2, 10**4)
+        require(self, "pitch_deg", 0.0, 80.0)
+        if not 0.0 < self.test_share < 1.0:
+            raise SettingsError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
+        if self.headings < 3 or self.headings % 3:
+            raise SettingsError(f"headings is {self.headings}, expected a multiple of 3")
+
+    @property
+    def pitches_rad(self) -> tuple[float, float, float]:
+        """Upward angles in the order of `PITCHES`."""
+        up = math.radians(self.pitch_deg)
+        return up, 0.0, -up
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A network and how it learns. Defaults: the report's room classifier, from scratch."""
+
+    seed: int = 0
+    """The one seed of weights, order and augmentation."""
+    network: Literal["resnet18", "alexnet"] = "resnet18"
+    """Backbone."""
+    width: int = 64
+    """Channels of the backbone's first stage; 64 is the original."""
+    hidden: int = 512
+    """Units of each of the room classifier's two layers."""
+    init: str = "scratch"
+    """Where the backbone starts: scratch, selfsup (first learns without labels), or a run folder to take it from."""
+    pitch: Literal["all", "up", "level", "down"] = "all"
+    """Room images to learn from."""
+    epochs: int = 15
+    """Passes over the training images."""
+    batch: int = 20
+    """Images an update."""
+    learning_rate: float = 1e-4
+    """Adam's."""
+    label_smoothing: float = 0.1
+    """Share of a room label's weight that is spread over all rooms."""
+    augment: bool = True
+    """Vary brightness, contrast and colour, and shift images by up to a sixteenth, anew in every epoch."""
+    selfsup_epochs: int = 30
+    """Passes without labels, where init is selfsup."""
+    selfsup_batch: int = 128
+    """Pairs of images an update of them."""
+    selfsup_learning_rate: float = 1e-3
+    """Adam's, of them."""
+
+    def __post_init__(self) -> None:
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "width hidden epochs batch selfsup_epochs", 1, 10**6)
+        require(self, "selfsup_batch", 2, 10**6)
+        require(self, "learning_rate selfsup_learning_rate", 1e-9, 10.0)
+        require(self, "label_smoothing", 0.0, 0.999)
+
+
+def room_config() -> TrainConfig:
+    """The report's room classifier."""
+    return TrainConfig()
+
+
+def passage_config() -> TrainConfig:
+    """The report's passage detector."""
+    return TrainConfig(batch=32, epochs=20)
+
+
+@dataclasses.dataclass(frozen=True)
+class MapConfig:
+    """Where nodes stand, and which edges join them."""
+
+    clearance_m: float = 0.3
+    """Least distance of nodes from obstacles."""
+    min_per_room: int = 3
+    """Nodes a room, at least."""
+    spacing_m: float = 1.2
+    """No free place of a room is farther than this from one of its nodes."""
+    edge_m: float = 2.5
+    """Nodes nearer than this are joined, both ways."""
+    edge_image: Literal["exact", "nearest"] = "exact"
+    """The image that an edge is judged by: drawn along it, or the nearest of the node's own."""
+    connect: bool = True
+    """Add nodes until every free place that one can drive to is joined by free edges."""
+    passable: float = 0.5
+    """Edges with at least this probability count as open where connectedness is told."""
+
+    def __post_init__(self) -> None:
+        require(self, "clearance_m", 0.0, 10.0)
+        require(self, "min_per_room", 1, 1000)
+        require(self, "spacing_m edge_m", 0.1, 100.0)
+        require(self, "passable", 0.0, 1.0)

@@ -1,0 +1,179 @@
+"""Images in, room logits, passage logits and localisation embeddings out: flax modules without weights of their own.
+
+Image batches are u8 [N, H, W, 3] of any size from 16 pixels a side. `width` scales every layer of a backbone; 64 is
+the original's. Batch normalisation and the stem's two halvings are the originals'.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+TASKS = ("rooms", "passages")
+_EPSILON = 1e-6
+
+
+class ResNet18(nn.Module):
+    """He et al. 2016, table 1: stem, then four stages of two residual blocks."""
+
+    width: int = 64
+
+    @nn.compact
+    def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
+        """Feature maps after the third stage (conv3_x) and the fifth (conv5_x): [N, h, w, 2 width], [.., 8 width]."""
+        x = _conv(self.width, 7, 2)(x)
+        x = nn.relu(_norm(train)(x))
+        x = nn.max_pool(x, (3, 3), (2, 2), padding="SAME")
+        stages = []
+        for stage in range(4):
+            for block in range(2):
+                x = _Block(self.width * 2**stage, 2 if stage and not block else 1)(x, train)
+            stages.append(x)
+        return stages[1], stages[3]
+
+
+class _Block(nn.Module):
+    channels: int
+    stride: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array, train: bool) -> jax.Array:
+        y = nn.relu(_norm(train)(_conv(self.channels, 3, self.stride)(x)))
+        y = _norm(train)(_conv(self.channels, 3, 1)(y))
+        if x.shape != y.shape:
+            x = _norm(train)(_conv(self.channels, 1, self.stride)(x))
+        return nn.relu(x + y)
+
+
+class AlexNet(nn.Module):
+    """The five convolutions of Krizhevsky 2014 (one column), padded so that small images pass."""
+
+    width: int = 64
+
+    @nn.compact
+    def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
+        """Feature maps of the third and the fifth convolution: [N, h, w, 6 width] and [N, h', w', 4 width]."""
+        del train
+        maps = []
+        for i, (factor, kernel, stride) in enumerate(((1, 11, 4), (3, 5, 1), (6, 3, 1), (4, 3, 1), (4, 3, 1))):
+            x = nn.relu(nn.Conv(factor * self.width, (kernel, kernel), (stride, stride), padding="SAME")(x))
+            maps.append(x)
+            if i in (0, 1, 4):
+                x = nn.max_pool(x, (3, 3), (2, 2), padding="SAME")
+        return maps[2], x
+
+
+class Network(nn.Module):
+    """A backbone and the head of a task."""
+
+    task: str
+    """rooms: two layers with leaky ReLU; passages: one output, after AlexNet its own two layers with dropout."""
+    backbone: str = "resnet18"
+    width: int = 64
+    hidden: int = 512
+    outputs: int = 1
+
+    def setup(self) -> None:
+        """Makes the parts; flax calls it."""
+        self.body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width)
+        if self.task == "rooms":
+            self.layers = [nn.Dense(self.hidden), nn.Dense(self.hidden)]
+        elif self.backbone == "alexnet":
+            self.layers = [nn.Dense(64 * self.width), nn.Dense(64 * self.width)]
+            self.drop = nn.Dropout(0.5)
+        else:
+            self.layers = []
+        self.last = nn.Dense(self.outputs)
+
+    def __call__(self, images: jax.Array, train: bool = False) -> jax.Array:
+        """Logits [N, outputs]."""
+        _, x = self.body(normalised(images), train)
+        x = x.reshape(len(x), -1) if self.backbone == "alexnet" else x.mean((1, 2))
+        for layer in self.layers:
+            if self.task == "passages":
+                x = nn.relu(layer(self.drop(x, deterministic=not train)))
+            else:
+                x = nn.leaky_relu(layer(x))
+        return self.last(x)
+
+    def embed(self, images: jax.Array) -> jax.Array:
+        """[N, D] f32: both feature maps max-pooled over space, each scaled to length 1, one after the other."""
+        return joined(self.body(normalised(images), False))
+
+
+class Contrast(nn.Module):
+    """A backbone and the expander of VICReg."""
+
+    backbone: str = "resnet18"
+    width: int = 64
+
+    @nn.compact
+    def __call__(self, images: jax.Array, train: bool = True) -> jax.Array:
+        """[N, 8 width]."""
+        body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width, name="body")
+        _, x = body(normalised(images), train)
+        x = nn.relu(_norm(train)(nn.Dense(8 * self.width)(x.mean((1, 2)))))
+        return nn.Dense(8 * self.width)(x)
+
+
+def joined(maps: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """Two feature maps [N, h, w, c] to the localisation embedding [N, c1 + c2]; its length is the root of 2."""
+    parts = [m.max((1, 2)) for m in maps]
+    return jnp.concatenate([p / jnp.maximum(jnp.linalg.norm(p, axis=-1, keepdims=True), _EPSILON) for p in parts], -1)
+
+
+def normalised(images: jax.Array) -> jax.Array:
+    """Grey levels 0 to 255, u8 or f32, to f32 about 0."""
+    return (images.astype(jnp.float32) / 255.0 - 0.5) / 0.25
+
+
+def vicreg_loss(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Bardes et al. 2022, equation 6, weights 25, 25 and 1: two views' expansions [N, D] to a number."""
+    n, d = a.shape
+    invariance = jnp.square(a - b).mean()
+    spread, shared = jnp.float32(0.0), jnp.float32(0.0)
+    for z in (a, b):
+        z = z - z.mean(0)
+        spread += nn.relu(1.0 - jnp.sqrt(z.var(0, ddof=1) + 1e-4)).mean() / 2
+        covariance = z.T @ z / (n - 1)
+        shared += (jnp.square(covariance).sum() - jnp.square(jnp.diag(covariance)).sum()) / d
+    return 25.0 * invariance + 25.0 * spread + shared
+
+
+def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:
+    """Images [N, H, W, 3] u8 to f32, each with its own brightness, contrast, colour and shift.
+
+    Args:
+        key: random.
+        images: grey levels 0 to 255.
+        flip: mirror half of them left to right.
+    """
+    n, height, width, _ = images.shape
+    key_gain, key_offset, key_shift, key_flip = jax.random.split(key, 4)
+    x = images.astype(jnp.float32)
+    gain = jax.random.uniform(key_gain, (n, 2, 1, 3), minval=0.8, maxval=1.25)
+    mean = x.mean((1, 2, 3), keepdims=True)
+    x = (
+        (x - mean) * gain[:, :1, :, :1]
+        + mean * gain[:, 1:]
+        + jax.random.uniform(key_offset, (n, 1, 1, 1), minval=-20.0, maxval=20.0)
+    )
+    dy, dx = max(height // 16, 1), max(width // 16, 1)
+    padded = jnp.pad(x, ((0, 0), (dy, dy), (dx, dx), (0, 0)), mode="edge")
+    at = jax.random.randint(key_shift, (n, 2), 0, jnp.asarray([2 * dy + 1, 2 * dx + 1]))
+    x = jax.vmap(lambda p, a: jax.lax.dynamic_slice(p, (a[0], a[1], 0), (height, width, 3)))(padded, at)
+    if flip:
+        x = jnp.where(jax.random.bernoulli(key_flip, 0.5, (n, 1, 1, 1)), x[:, :, ::-1], x)
+    return jnp.clip(x, 0.0, 255.0)
+
+
+def _conv(channels: int, kernel: int, stride: int) -> Any:
+    pad = [(kernel // 2, kernel // 2)] * 2
+    return nn.Conv(channels, (kernel, kernel), (stride, stride), pad, use_bias=False)
+
+
+def _norm(train: bool) -> Any:
+    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)

@@ -1,0 +1,68 @@
+"""Arrays of small images in, compact files out, and back: sheets of images as WebP, some sheets a file."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from topological_nav.errors import DatasetError
+from train.files import whole_file
+
+COLUMNS = 18
+"""Images a row of a sheet."""
+
+
+def encode(images: np.ndarray, quality: int) -> bytes:
+    """Images [N, H, W, 3] u8 as one WebP picture, row by row; quality 100 is without loss."""
+    n, height, width, _ = images.shape
+    columns = min(COLUMNS, n)
+    rows = math.ceil(n / columns)
+    padded = np.concatenate([images, np.zeros((rows * columns - n, height, width, 3), np.uint8)])
+    sheet = padded.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
+    out = io.BytesIO()
+    Image.fromarray(sheet).save(out, "WEBP", quality=quality, lossless=quality == 100, method=4)
+    return out.getvalue()
+
+
+def decode(data: bytes, count: int, height: int, width: int) -> np.ndarray:
+    """The `count` images [N, H, W, 3] u8 of a picture made by `encode`."""
+    sheet = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+    rows, columns = sheet.shape[0] // height, sheet.shape[1] // width
+    tiles = sheet.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
+    return tiles.reshape(-1, height, width, 3)[:count]
+
+
+def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
+    """Writes groups of images [n_i, H, W, 3] as sheets into one npz file, whole or not at all; returns its bytes."""
+    coded = [np.frombuffer(encode(images, quality), np.uint8) for images in sheets]
+    arrays = {
+        "data": np.concatenate(coded),
+        "ends": np.cumsum([len(c) for c in coded]),
+        "counts": np.asarray([len(images) for images in sheets]),
+        "size": np.asarray(sheets[0].shape[1:3]),
+    }
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    return path.stat().st_size
+
+
+def read_shard(path: Path) -> np.ndarray:
+    """All images [N, H, W, 3] u8 of a file, in the order they were written.
+
+    Raises:
+        DatasetError: it is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            data, ends, counts = arrays["data"], arrays["ends"], arrays["counts"]
+            height, width = (int(v) for v in arrays["size"])
+        starts = np.concatenate([[0], ends[:-1]])
+        return np.concatenate(
+            [decode(data[a:b].tobytes(), int(n), height, width) for a, b, n in zip(starts, ends, counts, strict=True)]
+        )
+    except Exception as error:  # noqa: BLE001  (zip, npy and WebP readers raise many kinds for a damaged file)
+        raise DatasetError(f"{path}: not readable ({error}); delete it and run 'data' again") from None

@@ -1,0 +1,394 @@
+"""A dataset and settings in, a run folder out: backbone without labels where asked for, then rooms or passages.
+
+RUN/config.yaml      settings; a run that is started again with the same ones goes on
+    versions.json    packages, device, commit
+    metrics.jsonl    one line an epoch, of both phases
+    checkpoint.msgpack  the last epoch's learner
+    weights.msgpack, network.json   what was learned, and how to build it
+    results.json     scores on what was held out
+    curves.png
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import yaml
+from sklearn.metrics import confusion_matrix, f1_score
+
+from topological_nav.config import PITCHES, TrainConfig
+from topological_nav.data import PassageImages, RoomImages, load_passages, load_rooms, read_header
+from topological_nav.errors import RunError
+from topological_nav.learning import (
+    Epoch,
+    Learner,
+    decided,
+    in_batches,
+    labelled_epoch,
+    make_learner,
+    paired_epoch,
+    variable_shapes,
+    with_backbone,
+)
+from topological_nav.localise import localisation_scores
+from topological_nav.networks import Contrast, Network
+from topological_nav.settings import plain_settings
+from train.files import whole_file, write_text
+from train.run_folder import read_metrics, versions
+
+CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
+WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
+SAVE_EVERY_S = 60.0
+"""Between two checkpoints; one is written at the end of a phase and on a stop as well."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A network and its weights."""
+
+    network: Network
+    variables: dict[str, Any]
+    about: dict[str, Any]
+    """Content of network.json."""
+
+    def logits(self, images: np.ndarray) -> np.ndarray:
+        """[N, outputs] of images [N, H, W, 3] u8, of the size that it learned from.
+
+        Raises:
+            RunError: images of another size.
+        """
+        return self._rows(images, "__call__")
+
+    def embed(self, images: np.ndarray) -> np.ndarray:
+        """[N, D] localisation embeddings of images [N, H, W, 3] u8; see `Network.embed`."""
+        return self._rows(images, "embed")
+
+    def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
+        expected = (self.about["data"]["height"], self.about["data"]["width"], 3)
+        if images.shape[1:] != expected:
+            raise RunError(
+                f"images are {images.shape[1:]}, expected {expected}, the size that the network learned from"
+            )
+        method_of = _applied(self.network, method)  # type: ignore[arg-type]  (flax modules are hashable)
+        return in_batches(functools.partial(method_of, self.variables), images)
+
+
+@functools.cache
+def _applied(network: Network, method: str) -> Callable[..., jax.Array]:
+    """A network's method, compiled once."""
+    return jax.jit(lambda variables, images: network.apply(variables, images, method=method))  # type: ignore[return-value]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Work:
+    """What a run learns from and is scored by."""
+
+    task: str
+    outputs: int
+    images: np.ndarray
+    """[N, H, W, 3] u8 for learning."""
+    labels: np.ndarray
+    """[N] i32."""
+    places: np.ndarray
+    """[P, K, H, W, 3] u8, the headings around places of training, for learning without labels."""
+    held_out: np.ndarray
+    """[M, H, W, 3] u8."""
+    truth: np.ndarray
+    """[M] i32."""
+    groups: dict[str, np.ndarray]
+    """Name -> rows of `held_out` that are scored together."""
+    names: tuple[str, ...]
+    rooms: RoomImages
+
+
+def train(
+    task: str,
+    dataset: Path,
+    out: Path,
+    config: TrainConfig,
+    tell: Callable[[str], None] = lambda _: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> dict[str, Any] | None:
+    """Trains a network, or goes on with it.
+
+    Args:
+        task: rooms or passages.
+        dataset: a dataset folder.
+        out: the run folder.
+        config: settings.
+        tell: told one line an epoch.
+        should_stop: asked after every epoch.
+
+    Returns:
+        The content of results.json; None where it was stopped before the end.
+
+    Raises:
+        DatasetError: the dataset cannot be used.
+        RunError: `out` holds another run, or the backbone to start from does not fit.
+    """
+    header, data = read_header(dataset)
+    work = _work(task, dataset, config)
+    _claim(out, {"task": task, "dataset": header, **plain_settings(config)})
+    write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+    shape = (data.height, data.width)
+    network = Network(task, config.network, config.width, config.hidden, work.outputs)
+    tx = optax.adam(config.learning_rate)
+    learner = make_learner(network, shape, tx, config.seed)
+    phases: list[tuple[str, int]] = [("labels", config.epochs)]
+    if config.init == "selfsup":
+        phases.insert(0, ("pairs", config.selfsup_epochs))
+    elif config.init != "scratch":
+        learner = _started_from(learner, Path(config.init))
+    saved = _read_checkpoint(out)
+    _cut_metrics(out / METRICS, saved)
+    for phase, epochs in phases:
+        if phase == "pairs":
+            contrast, contrast_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
+            current = make_learner(contrast, shape, contrast_tx, config.seed)
+            epoch = paired_epoch(contrast, contrast_tx, config.selfsup_batch)
+            images, labels = work.places, np.zeros(0, np.int32)
+        else:
+            current, images, labels = learner, work.images, work.labels
+            epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment)
+        first = 0
+        if saved and saved["phase"] == phase:
+            first, current = saved["epoch"], _restored(current, saved["learner"], out)
+        elif saved and phase == "pairs":
+            continue  # a checkpoint of the later phase holds this one's outcome
+        current, done = _run(
+            phase, current, epoch, images, labels, range(first, epochs), config, out, tell, should_stop
+        )
+        if not done:
+            return None
+        if phase == "pairs":
+            learner = with_backbone(learner, {"params": current.params, "batch_stats": current.batch_stats})
+        else:
+            learner = current
+    variables = {"params": learner.params, "batch_stats": learner.batch_stats}
+    about = {
+        "task": task,
+        "backbone": config.network,
+        "width": config.width,
+        "hidden": config.hidden,
+        "outputs": work.outputs,
+        "names": list(work.names),
+        "data": header["settings"],
+        "fov_deg": header["fov_deg"],
+        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
+    }
+    weights = flax.serialization.to_bytes(jax.device_get(variables))
+    about["digest"] = hashlib.sha256(weights).hexdigest()
+    with whole_file(out / WEIGHTS) as partial:
+        partial.write_bytes(weights)
+    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
+    results = _scores(Trained(network, variables, about), work)
+    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+    return results
+
+
+def load_trained(run: Path) -> Trained:
+    """The network of a finished run.
+
+    Raises:
+        RunError: no such run, or it is not finished.
+    """
+    run = Path(run)
+    if not (run / DESCRIPTION).is_file():
+        raise RunError(f"{run}: holds no trained network; finish it: python -m topological_nav train TASK -o {run}")
+    about = json.loads((run / DESCRIPTION).read_text())
+    network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
+    template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
+    try:
+        zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
+        variables = flax.serialization.from_bytes(zeros, (run / WEIGHTS).read_bytes())
+    except Exception as error:  # noqa: BLE001  (msgpack and flax raise many kinds for a damaged file)
+        raise RunError(f"{run / WEIGHTS}: not readable ({' '.join(str(error).split())[:200]}); train again") from None
+    return Trained(network, jax.tree.map(jnp.asarray, variables), about)
+
+
+def _work(task: str, dataset: Path, config: TrainConfig) -> _Work:
+    rooms = load_rooms(dataset)
+    size = rooms.images.shape[3:]
+    around = rooms.images.shape[2]
+    places = rooms.images[~rooms.test].reshape(-1, around, *size)
+    if task == "passages":
+        passages: PassageImages = load_passages(dataset)
+        held = passages.test
+        groups = {"all": np.arange(int(held.sum()))}
+        return _Work(
+            task, 1, passages.images[~held], passages.free[~held].astype(np.int32), places, passages.images[held],
+            passages.free[held].astype(np.int32), groups, ("blocked", "free"), rooms,
+        )  # fmt: skip
+    pitches = list(range(3)) if config.pitch == "all" else [PITCHES.index(config.pitch)]
+    learned = rooms.images[~rooms.test][:, pitches]
+    label = np.broadcast_to(rooms.label[~rooms.test][:, None, None], learned.shape[:3])
+    held = rooms.images[rooms.test][:, :, ::3]
+    truth = np.broadcast_to(rooms.label[rooms.test][:, None, None], held.shape[:3])
+    pitch = np.broadcast_to(np.arange(3)[None, :, None], held.shape[:3]).ravel()
+    groups = {name: np.flatnonzero(pitch == i) for i, name in enumerate(PITCHES)}
+    if config.pitch == "all":
+        groups["all"] = np.arange(len(pitch))
+    else:
+        groups = {config.pitch: groups[config.pitch]}
+    return _Work(
+        task, len(rooms.names), learned.reshape(-1, *size), label.ravel().astype(np.int32), places,
+        held.reshape(-1, *size), truth.ravel().astype(np.int32), groups, rooms.names, rooms,
+    )  # fmt: skip
+
+
+def _run(
+    phase: str,
+    learner: Learner,
+    epoch: Epoch,
+    images: np.ndarray,
+    labels: np.ndarray,
+    epochs: range,
+    config: TrainConfig,
+    out: Path,
+    tell: Callable[[str], None],
+    should_stop: Callable[[], bool],
+) -> tuple[Learner, bool]:
+    """Epochs of one phase; False where a stop was asked for before the last."""
+    on_device, labels_there = jnp.asarray(images), jnp.asarray(labels)
+    began = saved_at = time.perf_counter()
+    keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
+    for number in epochs:
+        started = time.perf_counter()
+        learner, means = epoch(learner, on_device, labels_there, jax.random.fold_in(keys, number))
+        line = {"phase": phase, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
+        now = time.perf_counter()
+        if not np.isfinite(line["loss"]):
+            raise RunError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning_rate")
+        with open(out / METRICS, "a") as file:
+            file.write(json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
+        left = (now - began) / (number + 1 - epochs.start) * (epochs.stop - number - 1)
+        scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
+        tell(f"{phase}: epoch {number + 1} of {epochs.stop}  {scores}  {now - started:.1f} s  {left:.0f} s left")
+        last, stop = number + 1 == epochs.stop, should_stop()
+        if last or stop or now - saved_at > SAVE_EVERY_S:
+            state = {"phase": phase, "epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}
+            with whole_file(out / CHECKPOINT) as partial:
+                partial.write_bytes(flax.serialization.msgpack_serialize(jax.device_get(state)))
+            saved_at = now
+        if stop:
+            return learner, False
+    return learner, True
+
+
+def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
+    """Accuracy and macro F1 of what was held out, and how well the embedding localises."""
+    results: dict[str, Any] = {
+        "task": work.task,
+        "parameters": trained.about["parameters"],
+        "trained_on": len(work.images),
+    }
+    if len(work.held_out):
+        found = np.asarray(decided(jnp.asarray(trained.logits(work.held_out))))
+        results["groups"] = {
+            name: {
+                "images": len(rows),
+                "accuracy": float((found[rows] == work.truth[rows]).mean()),
+                "macro_f1": float(f1_score(work.truth[rows], found[rows], average="macro")),
+            }
+            for name, rows in work.groups.items()
+        }
+        if work.task == "passages":
+            results["confusion"] = confusion_matrix(work.truth, found, labels=[0, 1]).tolist()
+    results["localisation"] = localisation(trained, work.rooms)
+    return results
+
+
+def localisation(trained: Trained, rooms: RoomImages) -> dict[str, Any]:
+    """Scores of the embedding: training positions as nodes, every third level image of test positions as queries.
+
+    Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`.
+    """
+    level, size = PITCHES.index("level"), rooms.images.shape[3:]
+    rows, weights = {}, []
+    for scene in np.unique(rooms.scene):
+        nodes, queries = ((rooms.scene == scene) & (rooms.test == held) for held in (False, True))
+        if not nodes.any() or not queries.any():
+            continue
+        shown = rooms.images[nodes][:, level]
+        embedded = trained.embed(shown.reshape(-1, *size)).reshape(*shown.shape[:2], -1)
+        asked = rooms.images[queries][:, level, ::3]
+        each = asked.shape[1]
+        name = rooms.names[rooms.label[nodes][0]].rpartition("/")[0]
+        rows[name] = localisation_scores(
+            trained.embed(asked.reshape(-1, *size)),
+            np.repeat(rooms.xy_w[queries], each, 0),
+            np.repeat(rooms.label[queries], each),
+            embedded,
+            rooms.xy_w[nodes],
+            rooms.label[nodes],
+        )
+        weights.append(int(queries.sum()))
+    if rows:
+        keys = next(iter(rows.values()))
+        rows["mean"] = {k: float(np.average([r[k] for r in rows.values()], weights=weights)) for k in keys}
+    return rows
+
+
+def _claim(out: Path, settings: dict[str, Any]) -> None:
+    path = out / CONFIG
+    if path.is_file():
+        there = yaml.safe_load(path.read_text())
+        for name, value in settings.items():
+            if there.get(name) != value:
+                shown = (there.get(name), value) if name != "dataset" else ("another", "this one")
+                raise RunError(
+                    f"{out}: the run there has {name} = {shown[0]!r}, this one {shown[1]!r}; "
+                    "choose another folder (-o) or delete it"
+                )
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    write_text(path, yaml.safe_dump(settings, sort_keys=False))
+
+
+def _read_checkpoint(out: Path) -> dict[str, Any] | None:
+    path = out / CHECKPOINT
+    if not path.is_file():
+        return None
+    try:
+        return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
+    except Exception as error:  # noqa: BLE001  (msgpack raises many kinds for a damaged file)
+        raise RunError(f"{path}: not readable ({error}); delete it to begin again") from None
+
+
+def _restored(template: Learner, state: Any, out: Path) -> Learner:
+    try:
+        learner = flax.serialization.from_state_dict(template, state)
+    except (ValueError, KeyError) as error:
+        raise RunError(f"{out / CHECKPOINT}: does not fit the network ({error}); delete it to begin again") from None
+    return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
+
+
+def _cut_metrics(path: Path, saved: dict[str, Any] | None) -> None:
+    """Drops the lines after the checkpoint that a run goes on from: their epochs are run again."""
+    if path.is_file():
+        order = {"pairs": 0, "labels": 1}
+        until = (order[saved["phase"]], saved["epoch"]) if saved else (-1, 0)
+        kept = [line for line in read_metrics(path) if (order[line["phase"]], line["epoch"]) <= until]
+        write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
+
+
+def _started_from(learner: Learner, run: Path) -> Learner:
+    donor = load_trained(run)
+    try:
+        return with_backbone(learner, donor.variables)
+    except ValueError as error:
+        raise RunError(
+            f"init: {run} does not fit: {error}; it is {donor.about['backbone']} of width {donor.about['width']}"
+        ) from None
