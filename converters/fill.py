@@ -1,9 +1,10 @@
 """Cleaned scan in; holes that furniture left in floor and walls closed with plane patches that join without cracks.
 
-Wall planes are found by RANSAC, the floor's is known (its waves were taken out). In each plane the patch is the
-difference between what ought to be surface there and what the scan shows. Its border runs through the very
-vertices of the scan's border: a patch vertex that falls on a scan edge splits that scan face, one on another
-patch's edge splits that edge, so that scan and patches are one mesh.
+Wall planes are found by RANSAC, as the floor's was (`converters.floor`), whose waves are taken out by now. In each
+plane the patch is the difference between what ought to be surface there and what the scan shows. Its border runs
+through the very vertices of the scan's border: a patch vertex that falls on a scan edge splits that scan face, one on
+another patch's edge splits that edge, so that scan and patches are one mesh. Where the scan's border stands out of the
+plane or ends before it, `converters.join` closes what is left.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ MIN_WALL_M2 = 0.5
 MAX_WALLS = 60
 BESIDE_M = 0.10
 """Surface parallel to a plane and this near to it stands in its place."""
+IN_PLANE_M = 0.005
+"""Border of surfaces across a plane, this near to it, is border in it."""
 MIN_PATCH_M2 = 1e-6
 
 
@@ -195,7 +198,8 @@ def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plan
     borders: list[np.ndarray] = []
     for k, (plane, region, tolerance) in enumerate(wanted):
         inside = seen_in_plane(vertices, faces, plane, tolerance)
-        borders.append(edges[np.isin(owner, inside)])
+        close = np.abs(plane.distance(vertices)) < IN_PLANE_M  # a wall's lower edge borders the floor, too
+        borders.append(edges[np.isin(owner, inside) | close[edges].all(axis=1)])
         seen = _union(vertices, faces[inside], plane) if len(inside) else Polygon()
         missing = shapely.make_valid(region.difference(seen))
         flat = plane.flatten(vertices[np.unique(borders[k])])

@@ -279,9 +279,7 @@ def hidden_surfaces(
     return [(ground, floor, FLOOR_TOLERANCE_M), *walls]
 
 
-def _seen(
-    vertices: np.ndarray, faces: np.ndarray, plane: Plane, tolerance_m: float
-) -> tuple[BaseGeometry, np.ndarray]:
+def _seen(vertices: np.ndarray, faces: np.ndarray, plane: Plane, tolerance_m: float) -> tuple[BaseGeometry, np.ndarray]:
     """Union of the faces that show a plane, and their corners (m, 3, 2), in its coordinates."""
     corners = plane.flatten(vertices)[faces[seen_in_plane(vertices, faces, plane, tolerance_m)]]
     return (shapely.union_all(shapely.polygons(corners)) if len(corners) else Polygon()), corners

@@ -123,23 +123,21 @@ def split_at(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tup
 
 def _fan(vertices: np.ndarray, ring: list[int]) -> list[tuple[int, int, int]]:
     """Triangles over a triangle's outline with extra points on its edges: ears of the largest least angle."""
-    ring = list(ring)
-    triangles = []
+    ring, triangles = list(ring), []
+    around = vertices[ring] - vertices[ring].mean(axis=0)
+    left = float(np.linalg.norm(np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)))
     while len(ring) > 3:
-        best, best_quality = 0, -1.0
-        for k in range(len(ring)):
-            p, q, r = (vertices[ring[m % len(ring)]] for m in (k - 1, k, k + 1))
-            doubled = float(np.linalg.norm(np.cross(q - p, r - p)))
-            longest = max(float(np.linalg.norm(v)) for v in (q - p, r - q, p - r))
-            rest = [ring[m] for m in range(len(ring)) if m != k]
-            # What is left must still have area: never cut off the last corner that stands out.
-            normal = np.cross(vertices[rest[1]] - vertices[rest[0]], vertices[rest[2 % len(rest)]] - vertices[rest[0]])
-            flat_rest = len(rest) == 3 and float(np.linalg.norm(normal)) < 1e-14
-            quality = -0.5 if flat_rest else doubled / max(longest**2, 1e-18)
-            if quality > best_quality:
-                best, best_quality = k, quality
-        triangles.append((ring[best - 1], ring[best], ring[(best + 1) % len(ring)]))
-        del ring[best]
+        corner = vertices[ring]
+        one, other = corner - np.roll(corner, 1, axis=0), np.roll(corner, -1, axis=0) - corner
+        doubled = np.linalg.norm(np.cross(one, other), axis=1)
+        longest = np.max([np.linalg.norm(v, axis=1) for v in (one, other, one + other)], axis=0)
+        quality = doubled / np.maximum(longest**2, 1e-18)
+        # What is left must still have area: never cut off the last corner that stands out.
+        quality[left - doubled < 1e-6 * left] = -1.0
+        k = int(np.argmax(quality))
+        triangles.append((ring[k - 1], ring[k], ring[(k + 1) % len(ring)]))
+        left -= float(doubled[k])
+        del ring[k]
     triangles.append((ring[0], ring[1], ring[2]))
     return triangles
 
@@ -212,9 +210,7 @@ def cut_teeth(
     chosen = np.unique(of[near])
     a, b = vertices[edges[chosen, 0]], vertices[edges[chosen, 1]]
     count = np.ceil(np.linalg.norm(b - a, axis=1) / step_m).astype(int)
-    new = [
-        start + (end - start) * k / n for start, end, n in zip(a, b, count, strict=True) for k in range(1, int(n))
-    ]
+    new = [start + (end - start) * k / n for start, end, n in zip(a, b, count, strict=True) for k in range(1, int(n))]
     if not new:
         return vertices, faces, np.arange(len(faces))
     result = np.vstack([vertices, new])
@@ -283,6 +279,8 @@ class _Zip:
         for a, b, tip in ((i, j, k), (j, k, i), (k, i, j)):
             edge = _edge(a, b)
             if edge in self.open:
+                if self.open[edge].tip == tip:
+                    return np.inf  # the face that is there
                 poor |= int(self._folded(edge, tip))
                 surfaces.append(self.open[edge].surface)
             elif self.used.get(edge, 0):
@@ -293,10 +291,12 @@ class _Zip:
                     return np.inf
         if shared and (shared > 1 or new):
             return np.inf  # an edge of three faces, for nothing
+        if new > 1 and not all(self.around[v] for v in (i, j, k)):
+            return np.inf  # the border there is closed by now
         p, q, r = self.vertices[[i, j, k]]
         if new == 3 or np.linalg.norm(np.cross(q - p, r - p)) < 1e-10:
             return np.inf
-        if new == 1 and len(set(surfaces)) == 1 and surfaces[0] != ZIP:
+        if len(surfaces) > 1 and len(set(surfaces)) == 1 and surfaces[0] != ZIP:
             return np.inf
         return longest + self.reach_m * (poor + 2 * shared)
 
@@ -305,7 +305,8 @@ class _Zip:
         corners = ((i, j, k), (j, k, i), (k, i, j))
         met = [(self.open[_edge(a, b)], a < b) for a, b, _ in corners if _edge(a, b) in self.open]
         against = sum(1 if side.rising == rises else -1 for side, rises in met)
-        plane = max(side.plane for side, _ in met)
+        ends = [self.open[_edge(v, w)].plane for v in (i, j, k) for w in self.around[v]]
+        plane = max(ends)
         self.faces.append((i, k, j) if against > 0 else (i, j, k))
         self.planes.append(plane)
         fresh = []
@@ -347,7 +348,7 @@ def close_cracks(
     edges, owner = border_edges(faces)
     plane = patch_plane[owner]
     own = plane >= 0
-    if not own.any() or own.all():
+    if not own.any() or len(np.unique(plane)) < 2:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     patch_spots, _ = _points_on(vertices, edges[own], STEP_M)
     reach = np.asarray(KDTree(patch_spots).query(vertices[edges].mean(axis=1))[0]) < 2 * reach_m + STEP_M

@@ -30,7 +30,7 @@ from converters.floor import level_floor
 from converters.gates import Gate, evaluate
 from converters.holes import fill_holes
 from converters.manifest import make_manifest
-from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
+from converters.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.objects import Hull, PlacedObject, name_objects, place_object, rotation_of, to_world
 from converters.physical import Physical, physical_properties
 from converters.proposals import propose_instances
@@ -199,7 +199,7 @@ def _structure_visual(
 ) -> tuple[VisualMesh, float]:
     """The cleaned scan, levelled, filled, simplified and textured; and the area of the patches, m2."""
     kept = np.flatnonzero(keep)
-    level = level_floor(vertices_w, raw.scan.labels)
+    level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
     filled, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
     both = ColourCloud(
@@ -275,9 +275,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         placements, rows = align_objects(raw)
         for k, confidence in retrieved.items():
             rows[k]["retrieved_confidence"] = confidence
-        floor_height = raw.floor_height_m
-        if floor_height is None:
-            floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)
+        floor_height = floor_of(raw)
         vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
         walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
     decompose_config = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from converters.alignment import yaw_matrix
-from converters.errors import SceneRejected
-from converters.maps import Grid, find_floor_height, main_direction, make_floor_plan, resample, sample_faces
+from converters.maps import Grid, main_direction, make_floor_plan, resample, sample_faces
 from converters.raw import GivenMap
 from converters.walls import border_cells, cover_rectangles, wall_boxes
 from tests.converters import tiny_raw
@@ -66,19 +65,6 @@ def test_grid_cells_and_centres_agree_when_turned():
 def test_main_direction_finds_the_rooms_turn(yaw):
     vertices, faces, labels = tiny_raw.scan()
     assert main_direction(vertices @ yaw_matrix(yaw).T, faces, labels) == pytest.approx(yaw, abs=1e-3)
-
-
-def test_floor_height_ignores_stray_labels():
-    vertices, _, labels = tiny_raw.scan()
-    labels = labels.copy()
-    labels[np.flatnonzero(labels == 1)[:400]] = 2  # wall taken for floor
-    assert find_floor_height(vertices, labels) == pytest.approx(tiny_raw.FLOOR_M)
-
-
-def test_a_scan_without_floor_labels_is_refused():
-    vertices, _, labels = tiny_raw.scan()
-    with pytest.raises(SceneRejected, match="0 vertices carry the floor label"):
-        find_floor_height(vertices, np.ones_like(labels))
 
 
 def room_plan(yaw: float = 0.0, given=None, keep=None):
