@@ -88,8 +88,8 @@ def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[i
 def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
     """Boxes from the floor up around everything traversable, each as high as what stands there.
 
-    No box stands where a door's leaf turns. A box may reach over what is higher than itself (that has boxes of its own),
-    never over what is lower.
+    No box stands where a door's leaf turns. A box may reach over what is higher than itself (that has boxes of its
+    own), never over what is lower.
     """
     free = plan.traversable if plan.leaf is None else plan.traversable | plan.leaf
     needed = border_cells(free)

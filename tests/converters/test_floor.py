@@ -21,7 +21,7 @@ def patches(centres: np.ndarray, slope: np.ndarray, side_m: float = 0.05):
 
 
 def test_clutter_labelled_floor_does_not_move_the_plane():
-    """Six in ten labels are wrong: clutter above, a reflection below. The median is 2.5 cm off, the fit 2 mm at most."""
+    """Six in ten labels are wrong: clutter above, a reflection below. The median is 2.5 cm off, the fit 2 mm"""
     rng = np.random.default_rng(0)
     slope = np.array([math.tan(math.radians(1.0)), 0.0])
     xy = rng.uniform(0, 4, (1000, 2))
