@@ -32,8 +32,6 @@ BESIDE_M = 0.10
 """Surface parallel to a plane and this near to it stands in its place."""
 IN_PLANE_M = 0.005
 """Border of surfaces across a plane, this near to it, is border in it."""
-SEAMS = 2
-"""Times that cracks are closed: the second time meets the first one's own ends."""
 MIN_PATCH_M2 = 1e-6
 
 
@@ -230,15 +228,15 @@ def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plan
     split, source = split_at(joined, faces, np.arange(total, len(joined)))
     plane_of = np.concatenate([np.full(len(split), -1), patch_plane])
     source = np.concatenate([source, np.full(len(corners_of), -1)])
-    all_faces = np.vstack([split, corners_of])
-    for _ in range(SEAMS):
-        joined, all_faces, cut = cut_teeth(joined, all_faces, plane_of)
-        plane_of, source = plane_of[cut], source[cut]
-        more, more_plane = close_cracks(joined, all_faces, plane_of)
-        all_faces = np.vstack([all_faces, more])
-        plane_of = np.concatenate([plane_of, more_plane])
-        source = np.concatenate([source, np.full(len(more), -1)])
-    return Filled(joined, all_faces, source, plane_of)
+    joined, all_faces, cut = cut_teeth(joined, np.vstack([split, corners_of]), plane_of)
+    plane_of, source = plane_of[cut], source[cut]
+    more, more_plane = close_cracks(joined, all_faces, plane_of)
+    return Filled(
+        joined,
+        np.vstack([all_faces, more]),
+        np.concatenate([source, np.full(len(more), -1)]),
+        np.concatenate([plane_of, more_plane]),
+    )
 
 
 def _merged(spots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

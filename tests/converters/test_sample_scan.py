@@ -20,12 +20,10 @@ pytestmark = [pytest.mark.data, pytest.mark.slow]
 LIMIT_S = 180.0
 
 
-def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_path):
+def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_path, hull_cache):
     start = time.monotonic()
     out = tmp_path / "scenes" / "room"
-    converted = convert(
-        sample_data / "scan2cad_scene0470_00", out, ConvertConfig(format="scan2cad"), cache=tmp_path / "cache"
-    )
+    converted = convert(sample_data / "scan2cad_scene0470_00", out, ConvertConfig(format="scan2cad"), cache=hull_cache)
     seconds = time.monotonic() - start
     assert seconds < LIMIT_S, f"took {seconds:.0f} s"
     manifest, gates = check_folder(out)
