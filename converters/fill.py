@@ -1,9 +1,10 @@
 """Cleaned scan in; holes that furniture left in floor and walls closed with plane patches that join without cracks.
 
-Wall planes are found by RANSAC, the floor's is known (its waves were taken out). In each plane the patch is the
-difference between what ought to be surface there and what the scan shows. Its border runs through the very
-vertices of the scan's border: a patch vertex that falls on a scan edge splits that scan face, one on another
-patch's edge splits that edge, so that scan and patches are one mesh.
+Wall planes are found by RANSAC, as the floor's was (`converters.floor`), whose waves are taken out by now. In each
+plane the patch is the difference between what ought to be surface there and what the scan shows. Its border runs
+through the very vertices of the scan's border: a patch vertex that falls on a scan edge splits that scan face, one on
+another patch's edge splits that edge, so that scan and patches are one mesh. Where the scan's border stands out of the
+plane or ends before it, `converters.join` closes what is left.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from converters.cut import face_areas, face_labels
+from converters.join import SAME_M, border_edges, close_cracks, cut_teeth, on_segments, split_at
 from converters.raw import CEILING, FLOOR, STRUCTURE_LABELS
 
 WALL_TOLERANCE_M = 0.04
@@ -26,8 +28,10 @@ WALL_TOLERANCE_M = 0.04
 RANSAC_DRAWS = 150
 MIN_WALL_M2 = 0.5
 MAX_WALLS = 60
-SAME_M = 1e-5
-"""Points closer than this are one vertex."""
+BESIDE_M = 0.10
+"""Surface parallel to a plane and this near to it stands in its place."""
+IN_PLANE_M = 0.005
+"""Border of surfaces across a plane, this near to it, is border in it."""
 MIN_PATCH_M2 = 1e-6
 
 
@@ -114,12 +118,18 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
 
 
 def seen_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane, tolerance_m: float) -> np.ndarray:
-    """Indices of the faces that lie in the plane: every corner within the tolerance, and not folded to a line."""
-    close = np.abs(plane.distance(vertices)) < tolerance_m
-    candidates = np.flatnonzero(close[faces].all(axis=1))
-    flat = plane.flatten(vertices)[faces[candidates]]
-    e1, e2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
-    return candidates[np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) > 1e-9]
+    """Indices of the faces that show the plane, those folded to a line in it left out.
+
+    Every corner lies within the tolerance; or within `BESIDE_M` where the face is also parallel to the plane (panels
+    and pillars that stand out of a wall, and what the reconstruction bent): a patch over it would be a second layer.
+    """
+    off = np.abs(plane.distance(vertices))[faces].max(axis=1)
+    candidates = np.flatnonzero(off < max(tolerance_m, BESIDE_M))
+    corners = vertices[faces[candidates]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    along = np.abs(normal @ plane.normal)
+    shown = (off[candidates] < tolerance_m) | (along > 0.7 * np.linalg.norm(normal, axis=1))
+    return candidates[shown & (along > 1e-9)]
 
 
 def _union(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> BaseGeometry:
@@ -146,113 +156,6 @@ class Filled:
     """(m',) the given face that each comes from, -1 for patches."""
     patch_plane: np.ndarray
     """(m',) index of the plane that a patch face lies in, -1 for scan faces."""
-
-
-def on_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which segment each point lies inside, ends excluded, to `SAME_M`.
-
-    Args:
-        points: (n, d).
-        a: (k, d) starts.
-        b: (k, d) ends.
-
-    Returns:
-        segment (n,) index or -1, share (n,) of the way from start to end.
-    """
-    segment, share = np.full(len(points), -1), np.zeros(len(points))
-    if len(a) == 0 or len(points) == 0:
-        return segment, share
-    length = np.linalg.norm(b - a, axis=1)
-    near = KDTree((a + b) / 2).query_ball_point(points, float(length.max()) / 2 + SAME_M)
-    for i, found in enumerate(near):
-        k = np.asarray(found, np.int64)
-        k = k[length[k] > 2 * SAME_M]
-        if len(k) == 0:
-            continue
-        along = ((points[i] - a[k]) * (b[k] - a[k])).sum(axis=1) / length[k] ** 2
-        off = np.linalg.norm(a[k] + along[:, None] * (b[k] - a[k]) - points[i], axis=1)
-        off[(along * length[k] < SAME_M) | ((1 - along) * length[k] < SAME_M)] = np.inf
-        best = int(np.argmin(off))
-        if off[best] < SAME_M:
-            segment[i], share[i] = k[best], along[best]
-    return segment, share
-
-
-def _split_at(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Splits faces along border edges so that every point lying inside such an edge becomes its vertex.
-
-    Args:
-        vertices: (n, 3), the points included (their indices are the last ones).
-        faces: (m, 3).
-        points: (k,) indices of the points.
-
-    Returns:
-        faces (m', 3), source (m',) face that each comes from.
-    """
-    if len(points) == 0:
-        return faces, np.arange(len(faces))
-    edges, owner = border_edges(faces)
-    edge, share = on_segments(vertices[points], vertices[edges[:, 0]], vertices[edges[:, 1]])
-    on_edge: dict[int, list[tuple[float, int]]] = {}
-    for point, e, along in zip(points, edge, share, strict=True):
-        if e >= 0:
-            on_edge.setdefault(int(e), []).append((float(along), int(point)))
-    by_face: dict[int, dict[tuple[int, int], list[int]]] = {}
-    for e, found in on_edge.items():
-        key = (int(edges[e, 0]), int(edges[e, 1]))
-        by_face.setdefault(int(owner[e]), {})[key] = [p for _, p in sorted(found)]
-    keep = np.ones(len(faces), bool)
-    new, source = [], []
-    for f, cuts in by_face.items():
-        keep[f] = False
-        corners = faces[f]
-        ring: list[int] = []
-        for k in range(3):
-            i, j = int(corners[k]), int(corners[(k + 1) % 3])
-            ring += [i, *cuts.get((i, j), [])]
-        for triangle in _fan(vertices, ring):
-            new.append(triangle)
-            source.append(f)
-    if not new:
-        return faces, np.arange(len(faces))
-    return np.vstack([faces[keep], np.array(new)]), np.concatenate([np.flatnonzero(keep), np.array(source)])
-
-
-def _fan(vertices: np.ndarray, ring: list[int]) -> list[tuple[int, int, int]]:
-    """Triangles over a triangle's outline with extra points on its edges: ears of the largest least angle."""
-    ring = list(ring)
-    triangles = []
-    while len(ring) > 3:
-        best, best_quality = 0, -1.0
-        for k in range(len(ring)):
-            p, q, r = (vertices[ring[m % len(ring)]] for m in (k - 1, k, k + 1))
-            doubled = float(np.linalg.norm(np.cross(q - p, r - p)))
-            longest = max(float(np.linalg.norm(v)) for v in (q - p, r - q, p - r))
-            rest = [ring[m] for m in range(len(ring)) if m != k]
-            # What is left must still have area: never cut off the last corner that stands out.
-            normal = np.cross(vertices[rest[1]] - vertices[rest[0]], vertices[rest[2 % len(rest)]] - vertices[rest[0]])
-            flat_rest = len(rest) == 3 and float(np.linalg.norm(normal)) < 1e-14
-            quality = -0.5 if flat_rest else doubled / max(longest**2, 1e-18)
-            if quality > best_quality:
-                best, best_quality = k, quality
-        triangles.append((ring[best - 1], ring[best], ring[(best + 1) % len(ring)]))
-        del ring[best]
-    triangles.append((ring[0], ring[1], ring[2]))
-    return triangles
-
-
-def border_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directed edges that only one face has.
-
-    Returns:
-        edges (k, 2), face (k,).
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    owner = np.tile(np.arange(len(faces)), 3)
-    key = np.sort(edges, axis=1)
-    _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    single = count[inverse.reshape(-1)] == 1
-    return edges[single], owner[single]
 
 
 def _insert_on_rings(rings: list[np.ndarray], flat: np.ndarray) -> list[np.ndarray]:
@@ -290,14 +193,16 @@ def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plan
         The joined mesh; patch faces look along the planes' normals.
     """
     total = len(vertices)
-    border = np.unique(border_edges(faces)[0])
+    edges, owner = border_edges(faces)
     patches: list[tuple[int, list[np.ndarray], Polygon]] = []
+    borders: list[np.ndarray] = []
     for k, (plane, region, tolerance) in enumerate(wanted):
         inside = seen_in_plane(vertices, faces, plane, tolerance)
+        close = np.abs(plane.distance(vertices)) < IN_PLANE_M  # a wall's lower edge borders the floor, too
+        borders.append(edges[np.isin(owner, inside) | close[edges].all(axis=1)])
         seen = _union(vertices, faces[inside], plane) if len(inside) else Polygon()
         missing = shapely.make_valid(region.difference(seen))
-        flat = plane.flatten(vertices[border])
-        flat = flat[np.abs(plane.distance(vertices[border])) < tolerance]
+        flat = plane.flatten(vertices[np.unique(borders[k])])
         for polygon in polygons_of(missing):
             rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
             patches.append((k, _insert_on_rings(rings, flat), polygon))
@@ -311,7 +216,7 @@ def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plan
             points = points[np.abs(plane.distance(points)) < SAME_M]
             patches[i] = (k, _insert_on_rings(rings, plane.flatten(points)), polygon)
 
-    corners_of, patch_plane, spots = _triangulate(vertices, border_edges(faces)[0], wanted, patches)
+    corners_of, patch_plane, spots = _triangulate(vertices, borders, wanted, patches)
     # New points at one place, from whichever patch, are one vertex.
     new_points, same = _merged(spots)
     corners_of = (
@@ -320,12 +225,17 @@ def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plan
     whole = (np.diff(np.sort(corners_of, axis=1), axis=1) > 0).all(axis=1)
     corners_of, patch_plane = corners_of[whole], patch_plane[whole]
     joined = np.vstack([vertices, new_points])
-    split, source = _split_at(joined, faces, np.arange(total, len(joined)))
+    split, source = split_at(joined, faces, np.arange(total, len(joined)))
+    plane_of = np.concatenate([np.full(len(split), -1), patch_plane])
+    source = np.concatenate([source, np.full(len(corners_of), -1)])
+    joined, all_faces, cut = cut_teeth(joined, np.vstack([split, corners_of]), plane_of)
+    plane_of, source = plane_of[cut], source[cut]
+    more, more_plane = close_cracks(joined, all_faces, plane_of)
     return Filled(
         joined,
-        np.vstack([split, corners_of]),
-        np.concatenate([source, np.full(len(corners_of), -1)]),
-        np.concatenate([np.full(len(split), -1), patch_plane]),
+        np.vstack([all_faces, more]),
+        np.concatenate([source, np.full(len(more), -1)]),
+        np.concatenate([plane_of, more_plane]),
     )
 
 
@@ -342,7 +252,7 @@ def _merged(spots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _triangulate(
     vertices: np.ndarray,
-    edges: np.ndarray,
+    borders: list[np.ndarray],
     wanted: list[tuple[Plane, BaseGeometry, float]],
     patches: list[tuple[int, list[np.ndarray], Polygon]],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -357,9 +267,7 @@ def _triangulate(
     faces, planes = [], []
     spots: list[np.ndarray] = []
     for number in sorted({k for k, _, _ in patches}):
-        plane, _, tolerance = wanted[number]
-        close = np.abs(plane.distance(vertices)) < tolerance
-        near = edges[close[edges].all(axis=1)]
+        plane, near = wanted[number][0], borders[number]
         corner = np.unique(near)
         tree = KDTree(plane.flatten(vertices[corner])) if len(corner) else None
         starts, ends = vertices[near[:, 0]], vertices[near[:, 1]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import shapely
 from scipy import ndimage
@@ -43,6 +45,12 @@ COLUMN_GAP = 6
 """Columns: wider stretches without wall are openings."""
 SKIRT_M = 0.25
 """Width of the floor strip that joins a wall patch to the floor."""
+RIM_M = 0.05
+"""The uppermost part of a wall that is not filled: the scan's own edge is ragged."""
+BEHIND_M = 0.25
+"""So far behind a wall no floor is filled."""
+CORNER_M = 0.15
+"""Two walls that end this near to their common line meet in it."""
 SEEN_BORDER_SHARE = 0.35
 """Least share of a wall patch's border (its foot apart) that runs along seen wall: else it may be an opening."""
 
@@ -84,22 +92,26 @@ def _passage(plan: FloorPlan, plane: Plane, along_m: float) -> bool:
 
 
 def wall_region(
-    plan: FloorPlan, plane: Plane, vertices: np.ndarray, faces: np.ndarray, objects: tuple[PlacedObject, ...]
+    plan: FloorPlan,
+    plane: Plane,
+    seen: BaseGeometry,
+    extent: BaseGeometry,
+    ends: tuple[float, float],
+    objects: tuple[PlacedObject, ...],
 ) -> BaseGeometry:
     """What furniture hid of one wall, in the plane's coordinates (along the wall, height); doors hide nothing.
 
-    The shadow of each near object on the wall, down to the floor and within the wall's seen length and height,
-    less what the scan shows; pieces that touch too little seen wall, and openings that one can walk through, are
-    left open.
+    The shadow of each near object on the wall, down to the floor and within the wall's extent, less what the scan
+    shows; pieces that touch too little seen wall, and openings that one can walk through, are left open.
+
+    Args:
+        plan: of the floor.
+        plane: of the wall.
+        seen: union of the faces that show it, plane coordinates.
+        extent: where there is wall, seen or hidden, plane coordinates.
+        ends: of the wall, along it, m.
+        objects: as annotated.
     """
-    inside = seen_in_plane(vertices, faces, plane, WALL_TOLERANCE_M)
-    if len(inside) == 0:
-        return Polygon()
-    corners = plane.flatten(vertices)[faces[inside]]
-    seen = shapely.union_all(shapely.polygons(corners))
-    extent = _columns(corners)
-    if extent.is_empty:
-        return Polygon()
     shadows, doors = [], []
     for placed in objects:
         points = to_world(placed, placed.vertices_b)
@@ -108,9 +120,13 @@ def wall_region(
             continue
         u, v = plane.flatten(points).T
         margin = SHADOW_MARGIN_M
-        box = shapely.box(u.min() - margin, LIFT_M, u.max() + margin, v.max() + margin)
+        left, right = u.min() - margin, u.max() + margin
+        # A strip between a shadow and a corner is hidden too.
+        left = min(left, ends[0]) if abs(left - ends[0]) < CORNER_M else left
+        right = max(right, ends[1]) if abs(right - ends[1]) < CORNER_M else right
+        box = shapely.box(left, LIFT_M, right, v.max() + margin)
         (doors if placed.hinge is not None else shadows).append(box)
-    if not shadows:
+    if not shadows or extent.is_empty:
         return Polygon()
     region = shapely.union_all(shadows).intersection(extent)
     if doors:
@@ -129,56 +145,101 @@ def wall_region(
     return shapely.union_all(closed) if closed else Polygon()
 
 
-def _columns(corners: np.ndarray) -> BaseGeometry:
+def wall_ends(planes: list[Plane], spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Where walls end: at the corner with another wall where that is near, so that both end in one line.
+
+    Args:
+        planes: of the walls.
+        spans: least and greatest coordinate along each that is seen, m.
+
+    Returns:
+        The same, moved to corners.
+    """
+    ends = []
+    for i, (plane, span) in enumerate(zip(planes, spans, strict=True)):
+        moved = list(span)
+        nearest = [CORNER_M, CORNER_M]
+        for j, other in enumerate(planes):
+            turn = float(plane.u @ other.normal)
+            if i == j or abs(turn) < 0.5:
+                continue
+            along = float((other.origin - plane.origin) @ other.normal) / turn
+            corner = plane.origin + along * plane.u
+            at = float((corner - other.origin) @ other.u)
+            if not spans[j][0] - CORNER_M < at < spans[j][1] + CORNER_M:
+                continue
+            for k in (0, 1):
+                if abs(along - span[k]) < nearest[k]:
+                    nearest[k], moved[k] = abs(along - span[k]), along
+        ends.append((moved[0], moved[1]))
+    return ends
+
+
+def wall_extent(corners: np.ndarray, ends: tuple[float, float]) -> BaseGeometry:
     """Region from the floor up to the seen wall's top, along the stretches where wall is seen at all.
+
+    A column in which too little is seen is as high as the lower of the seen ones beside it. All end `RIM_M` below, in
+    what is seen: nothing is built on top of it.
 
     Args:
         corners: (m, 3, 2) of the wall's seen faces, plane coordinates.
+        ends: of the wall, along it, m.
     """
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) / 2
-    low, high = corners[..., 0].min(), corners[..., 0].max()
-    count = max(int((high - low) / COLUMN_M), 1)
-    column = np.clip(((corners[..., 0].mean(axis=1) - low) / COLUMN_M).astype(int), 0, count - 1)
-    covered = np.bincount(column, area, count) / COLUMN_M > COLUMN_SEEN_M
-    padded = np.pad(covered, COLUMN_GAP)
+    low, high = ends
+    count = max(math.ceil((high - low) / COLUMN_M), 1)
+    edges = np.linspace(low, high, count + 1)
+    middle = corners[..., 0].mean(axis=1)
+    column = np.clip(np.searchsorted(edges, middle) - 1, 0, count - 1)
+    inside = (middle > low - COLUMN_M) & (middle < high + COLUMN_M)
+    seen = np.bincount(column[inside], area[inside], count) / COLUMN_M > COLUMN_SEEN_M
+    if not seen.any():
+        return Polygon()
+    padded = np.pad(seen, COLUMN_GAP)
     covered = ndimage.binary_closing(padded, np.ones(2 * COLUMN_GAP + 1))[COLUMN_GAP:-COLUMN_GAP]
-    top = float(corners[..., 1].max())
-    runs, number = ndimage.label(covered)  # pyright: ignore[reportGeneralTypeIssues]
-    boxes = []
-    for k in range(1, number + 1):
-        index = np.flatnonzero(runs == k)
-        last = high if index[-1] == count - 1 else low + (index[-1] + 1) * COLUMN_M
-        boxes.append(shapely.box(low + index[0] * COLUMN_M, LIFT_M, last, max(top, 2 * LIFT_M)))
-    return shapely.union_all(boxes) if boxes else Polygon()
+    # At a corner the last columns may be hidden altogether.
+    first, last = np.flatnonzero(covered)[[0, -1]]
+    covered[: first if first <= COLUMN_GAP else 0] = True
+    covered[last if count - last <= COLUMN_GAP + 1 else count :] = True
+    top = np.zeros(count)
+    np.maximum.at(top, column[inside], corners[..., 1].max(axis=1)[inside])
+    known = np.flatnonzero(seen)
+    at = np.arange(count)
+    before = known[np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(known) - 1)]
+    after = known[np.clip(np.searchsorted(known, at), 0, len(known) - 1)]
+    top = np.minimum(top[before], top[after])
+    boxes = [
+        shapely.box(edges[k], LIFT_M, edges[k + 1], max(top[k] - RIM_M, 2 * LIFT_M)) for k in np.flatnonzero(covered)
+    ]
+    return shapely.union_all(boxes, grid_size=1e-9)
 
 
-def skirts(plane: Plane, region: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
-    """Floor strips in front of and behind the wall patches that stand on the floor, world x, y.
+def floor_sides(plane: Plane, region: BaseGeometry, extent: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
+    """Floor in front of the wall patches that stand on it, and what lies behind the wall, world x, y.
 
     Args:
         plane: of the wall; its normal looks into the room.
         region: to be filled, in the plane's coordinates.
+        extent: of the wall, the same.
 
     Returns:
         Strip to add to the floor's region, strip to take out of it.
     """
-    add, cut = [], []
-    for piece in polygons_of(region):
-        foot = piece.intersection(shapely.box(piece.bounds[0], LIFT_M - 1e-6, piece.bounds[2], LIFT_M + 1e-6))
-        if foot.is_empty:
-            continue
-        left, _, right, _ = foot.bounds
-        if right - left < 1e-3:
-            continue
-        ends = [plane.lift(np.array([[u, LIFT_M]]))[0, :2] for u in (left, right)]
-        for strips, direction in ((add, 1.0), (cut, -1.0)):
-            off = direction * SKIRT_M * plane.normal[:2]
-            strips.append(shapely.make_valid(Polygon([ends[0], ends[1], ends[1] + off, ends[0] + off])))
-    return (
-        shapely.union_all(add) if add else Polygon(),
-        shapely.union_all(cut) if cut else Polygon(),
-    )
+    strips = []
+    for geometry, direction, width in ((region, 1.0, SKIRT_M), (extent, -1.0, BEHIND_M)):
+        strips.append([])
+        for piece in polygons_of(geometry):
+            foot = piece.intersection(shapely.box(piece.bounds[0], LIFT_M - 1e-6, piece.bounds[2], LIFT_M + 1e-6))
+            for part in shapely.get_parts(foot):
+                left, _, right, _ = part.bounds
+                if not right - left > 1e-3:  # empty: not a number
+                    continue
+                ends = [plane.lift(np.array([[u, LIFT_M]]))[0, :2] for u in (left, right)]
+                off = direction * width * plane.normal[:2]
+                strips[-1].append(shapely.make_valid(Polygon([ends[0], ends[1], ends[1] + off, ends[0] + off])))
+    add, cut = (shapely.union_all(s) if s else Polygon() for s in strips)
+    return add, cut
 
 
 def hidden_surfaces(
@@ -198,18 +259,30 @@ def hidden_surfaces(
         objects: as annotated; what they hid is filled.
     """
     ground = floor_plane(LIFT_M)
-    inside = seen_in_plane(vertices, faces, ground, FLOOR_TOLERANCE_M)
-    seen = shapely.union_all(shapely.polygons(vertices[faces[inside]][..., :2])) if len(inside) else Polygon()
-    floor = floor_region(plan, seen, objects)
+    floor = floor_region(plan, _seen(vertices, faces, ground, FLOOR_TOLERANCE_M)[0], objects)
+    shown = [_seen(vertices, faces, plane, WALL_TOLERANCE_M) for plane in planes]
+    planes = [plane for plane, (_, corners) in zip(planes, shown, strict=True) if len(corners)]
+    shown = [s for s in shown if len(s[1])]
+    ends = wall_ends(planes, [(float(c[..., 0].min()), float(c[..., 0].max())) for _, c in shown])
     walls: list[tuple[Plane, BaseGeometry, float]] = []
-    for plane in planes:
-        region = wall_region(plan, plane, vertices, faces, objects)
-        if region.is_empty:
-            continue
-        add, cut = skirts(plane, region)
-        floor = floor.difference(cut).union(add)
-        walls.append((plane, region, WALL_TOLERANCE_M))
+    front, behind = [], []
+    for plane, (seen, corners), end in zip(planes, shown, ends, strict=True):
+        extent = wall_extent(corners, end)
+        region = wall_region(plan, plane, seen, extent, end, objects)
+        add, cut = floor_sides(plane, region, extent)
+        front.append(add)
+        behind.append(cut)
+        if not region.is_empty:
+            walls.append((plane, region, WALL_TOLERANCE_M))
+    if walls:
+        floor = floor.union(shapely.union_all(front)).difference(shapely.union_all(behind))
     return [(ground, floor, FLOOR_TOLERANCE_M), *walls]
+
+
+def _seen(vertices: np.ndarray, faces: np.ndarray, plane: Plane, tolerance_m: float) -> tuple[BaseGeometry, np.ndarray]:
+    """Union of the faces that show a plane, and their corners (m, 3, 2), in its coordinates."""
+    corners = plane.flatten(vertices)[faces[seen_in_plane(vertices, faces, plane, tolerance_m)]]
+    return (shapely.union_all(shapely.polygons(corners)) if len(corners) else Polygon()), corners
 
 
 def fill_holes(

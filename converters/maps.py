@@ -18,7 +18,7 @@ from converters.alignment import yaw_matrix
 from converters.cut import face_labels
 from converters.errors import SceneRejected
 from converters.objects import PlacedObject, to_world
-from converters.raw import CEILING, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
+from converters.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 
 RESOLUTION_M = 0.05
 BAND_M = (0.02, 1.2)
@@ -90,25 +90,12 @@ class FloorPlan:
     traversable: np.ndarray
     """(rows, columns) bool: floor, nothing static in the band, in a piece worth standing on."""
     wall_height_m: float
+    leaf: np.ndarray | None = None
+    """(rows, columns) bool: wall that a door's leaf touches as it turns, at the hinge mostly, cells being coarser than
+    leaves. Not traversable, but no box may stand there. None: no such cell."""
     height_m: np.ndarray | None = None
     """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing is known.
     None: the wall's height everywhere."""
-
-
-def find_floor_height(vertices: np.ndarray, labels: np.ndarray) -> float:
-    """Height of the floor: median of the floor-labelled vertices, once more within 0.15 m of itself.
-
-    Raises:
-        SceneRejected: too few floor labels.
-    """
-    z = vertices[labels == FLOOR, 2]
-    if len(z) < 50:
-        raise SceneRejected(
-            f"scan: {len(z)} vertices carry the floor label ({FLOOR}), expected at least 50; "
-            "label the floor or give its height in floors.txt"
-        )
-    first = float(np.median(z))
-    return float(np.median(z[np.abs(z - first) < 0.15]))
 
 
 def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
@@ -261,7 +248,10 @@ def make_floor_plan(
         under |= _footprint(grid, placed)
         if placed.hinge is not None:
             swept |= swept_by_door(grid, placed)
-    occupied &= ~swept
+    # What is left of the door's scan in its sweep goes, walls stay.
+    walls = np.isin(label, STRUCTURE_LABELS) & (label != DOOR)
+    occupied &= ~swept | (grid.count(points[solid & walls]) >= 3)
+    leaf = occupied & swept
     closed = ndimage.binary_closing(floor_seen, iterations=CLOSE_CELLS) | under | floor_seen
     if given is not None:
         closed |= _given_floor(grid, given)
@@ -279,7 +269,7 @@ def make_floor_plan(
     tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
     tall = round(tall, 3)
     height = _heights(grid, points, label, occupied, tall)
-    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, tall, height)
+    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, tall, leaf, height)
 
 
 def _heights(grid: Grid, points: np.ndarray, label: np.ndarray, occupied: np.ndarray, tall_m: float) -> np.ndarray:

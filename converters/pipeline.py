@@ -5,9 +5,11 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import fcntl
 import functools
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import threading
@@ -30,7 +32,7 @@ from converters.floor import level_floor
 from converters.gates import Gate, evaluate
 from converters.holes import fill_holes
 from converters.manifest import make_manifest
-from converters.maps import FloorPlan, find_floor_height, main_direction, make_floor_plan, resample
+from converters.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.objects import Hull, PlacedObject, name_objects, place_object, rotation_of, to_world
 from converters.physical import Physical, physical_properties
 from converters.proposals import propose_instances
@@ -60,6 +62,9 @@ STAGES = {
     "gates": 3.0,
 }
 """Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
+
+STALE_S = 1.0
+"""An unfinished folder younger than this may be of a conversion that is just starting."""
 
 PARALLEL_OBJECTS = 8
 """From so many objects on, starting processes for their textures pays."""
@@ -199,7 +204,7 @@ def _structure_visual(
 ) -> tuple[VisualMesh, float]:
     """The cleaned scan, levelled, filled, simplified and textured; and the area of the patches, m2."""
     kept = np.flatnonzero(keep)
-    level = level_floor(vertices_w, raw.scan.labels)
+    level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
     filled, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
     both = ColourCloud(
@@ -275,9 +280,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         placements, rows = align_objects(raw)
         for k, confidence in retrieved.items():
             rows[k]["retrieved_confidence"] = confidence
-        floor_height = raw.floor_height_m
-        if floor_height is None:
-            floor_height = find_floor_height(raw.scan.vertices, raw.scan.labels)
+        floor_height = floor_of(raw)
         vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
         walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
     decompose_config = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)
@@ -357,6 +360,8 @@ def fresh_folder(target: Path, overwrite: bool) -> Iterator[Path]:
 @contextlib.contextmanager
 def _part_folder(target: Path, overwrite: bool) -> Iterator[Path]:
     """An empty folder beside `target`; gone at the end unless it was published."""
+    if target.parent.is_dir():
+        remove_stale(target)
     if target.exists() and not overwrite:
         raise SceneRejected(f"{target}: exists already; give another OUT or add --overwrite")
     if target.exists() and not target.is_dir():
@@ -365,12 +370,61 @@ def _part_folder(target: Path, overwrite: bool) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
+        lock = _lock(temporary)
     except OSError as error:
         raise SceneRejected(f"{target}: cannot be written ({error.strerror}); give another OUT") from error
     try:
         yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _lock(folder: Path) -> int | None:
+    """Holds a folder until the descriptor is closed or the process dies, however it dies; None: another holds it.
+
+    A lock and not the process id in the folder's name: ids are used again, and mean nothing in another container.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def remove_stale(target: Path) -> None:
+    """Removes what a conversion into `target` left that was killed (SIGKILL, power): its unfinished folder.
+
+    Was it killed while it replaced an older `target`, that one is put back. Folders of conversions that run are locked
+    and stay.
+
+    Args:
+        target: of the conversion that is about to start.
+    """
+    running = False
+    for kind in ("part", "old"):
+        name = re.compile(re.escape(f".{target.name}.{kind}-") + r"\d+")
+        for folder in sorted(p for p in target.parent.iterdir() if name.fullmatch(p.name)):
+            with contextlib.suppress(OSError):
+                young = time.time() - folder.stat().st_mtime < STALE_S
+                lock = None if young and kind == "part" else _lock(folder)
+                if lock is None:
+                    running = True
+                    continue
+                if kind == "part":
+                    shutil.rmtree(folder, ignore_errors=True)
+                elif not running:  # else it may be in use: a running one replaces the target
+                    if target.exists():
+                        shutil.rmtree(folder, ignore_errors=True)
+                    else:
+                        folder.rename(target)
+                os.close(lock)
 
 
 def publish(folders: dict[Path, Path]) -> None:

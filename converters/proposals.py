@@ -2,7 +2,8 @@
 
 The labels are put into a voxel grid; connected voxels of one class are an instance. What a scan tears apart
 (the seat of a swivel chair above its base: the thin column is missing) or names twice (table and desk) is
-merged by footprint.
+merged by footprint. Things of one class that touch are parted where their common footprint has a neck, and where it is
+too long for one of its class.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from converters.alignment import yaw_matrix
 from converters.cad import Y_UP_TO_Z_UP
@@ -43,6 +45,16 @@ SIZES_M = {
     "basket": ((0.15, 0.6), (0.15, 0.8)),
 }
 """Category -> usual ranges of the longer horizontal side and of the height."""
+LONGEST = {"chair": 1.6, "basket": 2.0, "door": math.inf}
+"""Category -> greatest usual ratio of the horizontal sides, of things that stand in rows. A long table may be two, or
+one; a row of chairs is no chair."""
+FLAT = ("door",)
+"""Seen from above a line, whose breadth says nothing."""
+NECK_SHARE = 0.6
+"""Where a footprint is narrower than this share of the narrower side's width, two things touch."""
+CORE_CELLS = 2.0
+PART_SHARE = 0.7
+"""A part of a piece is a thing from this share of the class's least usual width on."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,11 +137,124 @@ def _stacked(one: _Piece, other: _Piece) -> bool:
 
 
 def _same_box(one: _Piece, other: _Piece) -> bool:
+    if one.label == other.label:
+        return False  # joined, or parted, already
     low = np.maximum(one.voxels.min(axis=0), other.voxels.min(axis=0))
     high = np.minimum(one.voxels.max(axis=0), other.voxels.max(axis=0)) + 1
     shared = np.prod(np.maximum(high - low, 0))
     size = min(np.prod(np.ptp(p.voxels, axis=0) + 1) for p in (one, other))
     return bool(shared > SAME_BOX_SHARE * size)
+
+
+def _basins(mask: np.ndarray) -> np.ndarray:
+    """Basins around the local maxima of the distance to the outline, from the highest down (a watershed).
+
+    A basin that meets a higher one where the distance is at least `NECK_SHARE` of its own greatest joins it.
+
+    Args:
+        mask: (rows, columns) bool.
+
+    Returns:
+        (rows, columns) number of the basin from 1 on, 0 outside.
+    """
+    distance = np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1)))
+    distance = np.where(np.pad(mask, 1), ndimage.gaussian_filter(distance, 0.7), 0.0)
+    basin = np.zeros(distance.shape, np.int64)
+    peak, parent = [0.0], [0]
+
+    def root(k: int) -> int:
+        while parent[k] != k:
+            k = parent[k]
+        return k
+
+    rows, columns = np.nonzero(np.pad(mask, 1))
+    for i in np.argsort(-distance[rows, columns], kind="stable"):
+        r, c = int(rows[i]), int(columns[i])
+        around = sorted(
+            {root(int(k)) for k in basin[r - 1 : r + 2, c - 1 : c + 2].ravel() if k}, key=lambda k: -peak[k]
+        )
+        if not around:
+            peak.append(float(distance[r, c]))
+            parent.append(len(parent))
+            basin[r, c] = len(parent) - 1
+            continue
+        for k in around[1:]:
+            if distance[r, c] >= NECK_SHARE * peak[k]:
+                parent[k] = around[0]
+        basin[r, c] = around[0]
+    final = np.array([root(k) for k in range(len(parent))])[basin]
+    # Cells along the outline were flooded from whichever side came first: they go with the nearest inner ones.
+    core = (final > 0) & (distance >= CORE_CELLS)
+    if core.any():
+        nearest = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
+        assert nearest is not None
+        final = np.where(final > 0, final[nearest[0], nearest[1]], 0)
+    return final[1:-1, 1:-1]
+
+
+def _wide(points: np.ndarray) -> tuple[float, float]:
+    """Longer and shorter horizontal side of the upright box of points, m."""
+    half = upright_box(points).half
+    return 2 * float(max(half[:2])), 2 * float(min(half[:2]))
+
+
+def _part(piece: _Piece, chosen: np.ndarray, of_point: np.ndarray, of_voxel: np.ndarray) -> list[_Piece]:
+    """One piece for each of the chosen numbers; what has another number goes to the nearest of them."""
+    if len(chosen) < 2:
+        return [piece]
+    middles = KDTree(piece.voxels[np.isin(of_voxel, chosen)])
+    known = of_voxel[np.isin(of_voxel, chosen)]
+    of_voxel = np.where(np.isin(of_voxel, chosen), of_voxel, known[middles.query(piece.voxels)[1]])
+    nearest = KDTree(piece.points[np.isin(of_point, chosen)])
+    known = of_point[np.isin(of_point, chosen)]
+    of_point = np.where(np.isin(of_point, chosen), of_point, known[nearest.query(piece.points)[1]])
+    return [_Piece(piece.label, piece.points[of_point == k], piece.voxels[of_voxel == k]) for k in chosen]
+
+
+def _split_at_necks(piece: _Piece, origin: np.ndarray, voxel_m: float) -> list[_Piece]:
+    """The things of a piece that touch where its footprint is narrow."""
+    category = LABEL_CATEGORIES[piece.label]
+    if category in FLAT:
+        return [piece]
+    least = SIZES_M[category][0][0]
+    low = piece.voxels[:, :2].min(axis=0) - 1
+    mask = np.zeros(np.ptp(piece.voxels[:, :2], axis=0) + 3, bool)
+    mask[tuple((piece.voxels[:, :2] - low).T)] = True
+    # Gaps between slats and legs are part of the footprint; the space between two things is not closed by so little.
+    mask = np.asarray(ndimage.binary_fill_holes(ndimage.binary_closing(mask, np.ones((3, 3)))), bool)
+    basin = _basins(mask)
+    of_voxel = basin[tuple((piece.voxels[:, :2] - low).T)]
+    cell = np.floor((piece.points[:, :2] - origin[:2]) / voxel_m).astype(np.int64) - low
+    of_point = basin[tuple(cell.T)]
+    large = [
+        k
+        for k in np.unique(of_voxel[of_voxel > 0])
+        if (of_voxel == k).sum() >= MIN_VOXELS and _wide(piece.points[of_point == k])[0] >= PART_SHARE * least
+    ]
+    return _part(piece, np.array(large), of_point, of_voxel)
+
+
+def _split_row(piece: _Piece, origin: np.ndarray, voxel_m: float) -> list[_Piece]:
+    """The things of a piece that is too long for one: equal lengths, as many as have the usual shape."""
+    category = LABEL_CATEGORIES[piece.label]
+    if category not in LONGEST:
+        return [piece]
+    (least, most), ratio = SIZES_M[category][0], LONGEST[category]
+    long, short = _wide(piece.points)
+    if long <= most and long <= ratio * short:
+        return [piece]
+    # Chairs and baskets are about as wide as deep.
+    count = math.ceil(long / most) if math.isinf(ratio) else max(round(long / short), 2)
+    if long / count < least or short > most:
+        return [piece]
+    box = upright_box(piece.points)
+    axis = box.rotation[:2, int(np.argmax(box.half[:2]))]
+    along = [
+        (xy - box.centre[:2]) @ axis / long + 0.5
+        for xy in (piece.points[:, :2], (piece.voxels[:, :2] + 0.5) * voxel_m + origin[:2])
+    ]
+    of_point, of_voxel = (np.clip((a * count).astype(int), 0, count - 1) for a in along)
+    return _part(piece, np.arange(count), of_point, of_voxel)
 
 
 def _inside_range(value: float, limits: tuple[float, float]) -> float:
@@ -164,7 +289,9 @@ def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposa
     for wanted in LABEL_CATEGORIES:
         if (label == wanted).any():
             found = _merge(_components(points[label == wanted], wanted, origin, voxel_m), _stacked)
-            pieces += [p for p in found if len(p.voxels) >= MIN_VOXELS]
+            found = [p for p in found if len(p.voxels) >= MIN_VOXELS]
+            found = [part for p in found for part in _split_at_necks(p, origin, voxel_m)]
+            pieces += [part for p in found for part in _split_row(p, origin, voxel_m)]
     pieces = _merge(pieces, _same_box)
     other = ~np.isin(label, (UNLABELLED, WALL, 2, 22))
     other_voxels = np.unique(np.floor((points[other] - origin) / voxel_m).astype(np.int64), axis=0)

@@ -20,7 +20,7 @@ from shapely import MultiPoint
 
 from converters.emit import CATEGORY_COLOURS
 from converters.errors import SceneRejected
-from converters.maps import find_floor_height
+from converters.floor import fit_floor
 from converters.proposals import Proposal, as_scan2cad, bounds, box_corners, box_iou, propose_instances
 from converters.raw import CEILING, RawScene
 from converters.retrieval import (
@@ -49,7 +49,7 @@ class Proposed:
 def floor_of(raw: RawScene) -> float:
     """Height of the floor in the scan frame, m."""
     given = raw.floor_height_m
-    return given if given is not None else find_floor_height(raw.scan.vertices, raw.scan.labels)
+    return given if given is not None else fit_floor(raw.scan.vertices, raw.scan.faces, raw.scan.labels).height_m
 
 
 def _nearest_proposal(raw: RawScene, proposals: tuple[Proposal, ...], k: int) -> int | None:

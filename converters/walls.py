@@ -88,10 +88,12 @@ def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[i
 def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
     """Boxes from the floor up around everything traversable, each as high as what stands there.
 
-    A box may reach over what is higher than itself (that has boxes of its own), never over what is lower.
+    No box stands where a door's leaf turns. A box may reach over what is higher than itself (that has boxes of its
+    own), never over what is lower.
     """
-    needed = border_cells(plan.traversable)
-    allowed = ~plan.traversable & ndimage.binary_dilation(needed, np.ones((3, 3)), iterations=DEPTH_CELLS)
+    free = plan.traversable if plan.leaf is None else plan.traversable | plan.leaf
+    needed = border_cells(free)
+    allowed = ~free & ndimage.binary_dilation(needed, np.ones((3, 3)), iterations=DEPTH_CELLS)
     height = np.full(needed.shape, plan.wall_height_m) if plan.height_m is None else plan.height_m
     turn = yaw_matrix(plan.grid.yaw)
     side = plan.grid.resolution_m

@@ -171,9 +171,12 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def open_browser(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> None:
-    """Serves mjviser's page until Ctrl-C."""
+    """Serves mjviser's page until Ctrl-C; it opens on the whole scene."""
     viser, mjviser = importlib.import_module("viser"), importlib.import_module("mjviser")
-    mjviser.Viewer(model, data, server=viser.ViserServer(port=port)).run()
+    model.stat.extent /= 3  # mjviser looks from three extents away, and follows a body of its choice
+    viewer = mjviser.Viewer(model, data, server=viser.ViserServer(port=port))
+    viewer.scene.camera_tracking_enabled = False
+    viewer.run()
 
 
 def _parser() -> argparse.ArgumentParser:

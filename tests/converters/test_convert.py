@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from converters import pipeline
 from converters.__main__ import main
 from converters.errors import SceneRejected
 from converters.gates import LIMITS, Limit
@@ -217,13 +218,11 @@ def test_check_exits_one_when_a_gate_fails(tiny_scene, tmp_path, capsys):
     assert "FAIL  drift_hulls" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_interruption_leaves_nothing(pristine, tmp_path, sent, code):
-    environment = os.environ | {"INTERACTIVE_NAV_CACHE": str(tmp_path / "cache"), "PYTHONUNBUFFERED": "1"}
-    out = tmp_path / "scenes" / "out"
+def _start_conversion(source: Path, out: Path, cache: Path) -> subprocess.Popen[str]:
+    """Runs `convert` in a process of its own; returns once it is at work."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "converters", "convert", str(pristine / "gibson"), str(out)],
-        env=environment,
+        [sys.executable, "-m", "converters", "convert", str(source), str(out)],
+        env=os.environ | {"INTERACTIVE_NAV_CACHE": str(cache), "PYTHONUNBUFFERED": "1"},
         cwd=Path(__file__).parents[2],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -235,8 +234,38 @@ def test_interruption_leaves_nothing(pristine, tmp_path, sent, code):
     while not (out.parent.is_dir() and list(out.parent.iterdir())) and time.monotonic() < deadline:
         time.sleep(0.02)
     time.sleep(0.5)  # inside the decomposition
+    return process
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interruption_leaves_nothing(pristine, tmp_path, sent, code):
+    out = tmp_path / "scenes" / "out"
+    process = _start_conversion(pristine / "gibson", out, tmp_path / "cache")
     process.send_signal(sent)
     _, error = process.communicate(timeout=30)
     assert process.returncode == code
     assert "nothing was written" in error and "Traceback" not in error
     assert list(out.parent.iterdir()) == []
+
+
+def test_the_next_conversion_clears_what_a_killed_one_left_and_not_what_runs(pristine, tmp_path, hull_cache):
+    out = tmp_path / "scenes" / "out"
+    process = _start_conversion(pristine / "gibson", out, tmp_path / "cache")
+    (running,) = out.parent.iterdir()
+    os.utime(running, (0, 0))
+    pipeline.remove_stale(out)
+    assert running.is_dir()  # its lock is held
+    process.kill()
+    process.communicate(timeout=30)
+    assert running.is_dir()
+    other = out.parent / ".output.part-1"
+    other.mkdir()
+    older = out.parent / ".out.old-77"
+    older.mkdir()
+    (older / "scene.json").write_text("kept")
+    os.utime(running, (0, 0))
+    # Killed while it replaced a scene: that one is there again, and is not overwritten unasked.
+    with pytest.raises(SceneRejected, match="exists already"):
+        convert(pristine / "gibson", out, ConvertConfig(), cache=hull_cache)
+    assert (out / "scene.json").read_text() == "kept"
+    assert sorted(p.name for p in out.parent.iterdir()) == [".output.part-1", "out"]  # another scene's stays

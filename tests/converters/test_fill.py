@@ -86,10 +86,11 @@ def test_a_patch_that_stops_inside_splits_the_scan_faces_it_meets():
     top = ends[(np.abs(ends[:, :, 2] - filled.vertices[faces].reshape(-1, 3)[:, 2].max()) < 1e-9).all(axis=1)]
     covered = top[(top[:, :, 0].min(axis=1) > 0.53 - 1e-9) & (top[:, :, 0].max(axis=1) < 1.27 + 1e-9)]
     assert len(covered) == 0  # nothing of the wall's edge is open between 0.53 and 1.27
-    assert (filled.source_face >= 0).sum() == len(faces) + 2  # two faces were split in two
-    assert face_areas(filled.vertices, filled.faces[filled.source_face >= 0]).sum() == pytest.approx(
-        face_areas(vertices, faces).sum()
-    )
+    # Scan faces were split, not moved: each is covered by its parts.
+    scan = filled.source_face >= 0
+    assert len(faces) < scan.sum() < len(faces) + 20
+    parts = np.bincount(filled.source_face[scan], face_areas(filled.vertices, filled.faces[scan]), len(faces))
+    np.testing.assert_allclose(parts, face_areas(vertices, faces), atol=1e-12)
 
 
 def test_nothing_missing_changes_nothing():

@@ -51,8 +51,50 @@ def test_a_seat_above_its_base_is_one_chair_and_a_table_named_desk_in_part_is_on
     assert chair.extent_m[2] == pytest.approx(1.05, abs=0.02)
 
 
+def chair(turn: float, x: float, y: float = 0.0) -> trimesh.Trimesh:
+    """A plain chair, 0.46 x 0.46 x 0.9 m: seat, back, four legs."""
+    parts = [box((0.46, 0.46, 0.05), (0, 0, 0.45)), box((0.46, 0.04, 0.45), (0, 0.21, 0.67))]
+    parts += [box((0.05, 0.05, 0.45), (i, j, 0.22)) for i in (-0.2, 0.2) for j in (-0.2, 0.2)]
+    mesh = trimesh.util.concatenate(parts)
+    assert isinstance(mesh, trimesh.Trimesh)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(turn, (0, 0, 1)))
+    return mesh.apply_translation((x, y, 0))
+
+
+@pytest.mark.parametrize(
+    ("places"),
+    [
+        [(0.0, 0.0, 0.0), (math.pi / 4, 0.56, 0.0)],  # a corner against a side
+        [(0.2, 0.0, 0.0), (0.7, 0.45, 0.38)],  # corner to corner
+        [(0.0, 0.0, 0.0), (0.0, 0.46, 0.0)],  # side to side, no gap at all
+        [(0.0, 0.0, 0.0), (0.0, 0.46, 0.0), (0.0, 0.92, 0.0)],
+    ],
+)
+def test_chairs_that_touch_are_told_apart(places):
+    found = propose_instances(scan_of(*((chair(*p), 5) for p in places)))
+    assert len(found) == len(places)
+    for turn, x, y in places:
+        truth = bounds(np.asarray(chair(turn, x, y).vertices))
+        assert max(box_iou(truth, bounds(p.points)) for p in found) > 0.8
+    assert all(p.confidence > 0.6 for p in found)
+    assert sum(len(p.points) for p in found) > 1000 and len({id(p.points) for p in found}) == len(found)
+
+
+def test_one_thing_is_not_parted():
+    """An L of a sofa, a long table on a leg at one end, a door, a swivel chair on its star of legs."""
+    corner = (box((2.2, 0.9, 0.8), (0, 0, 0.4)), 6), (box((0.9, 1.0, 0.8), (0.65, 0.95, 0.4)), 6)
+    table = (box((2.8, 0.9, 0.05), (6, 0, 0.72)), 7), (box((0.1, 0.8, 0.7), (5, 0, 0.35)), 7)
+    door = (box((1.0, 0.05, 2.0), (10, 0, 1.0)), 8)
+    star = [(box((0.6, 0.05, 0.05), (14, 0, 0.05)), 5) for _ in range(5)]
+    for k, (mesh, _) in enumerate(star):
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(k * math.pi / 5, (0, 0, 1), (14, 0, 0)))
+    seat = (box((0.42, 0.42, 0.5), (14, 0, 0.7)), 5)
+    found = propose_instances(scan_of(*corner, *table, door, *star, seat))
+    assert sorted(p.category for p in found) == ["chair", "door", "sofa", "table"]
+
+
 def test_noise_is_dropped_and_an_odd_size_lowers_the_confidence():
-    crumb, giant = box((0.05, 0.05, 0.05), (5, 0, 0)), box((2.0, 0.5, 0.9), (0, 0, 0.45))
+    crumb, giant = box((0.05, 0.05, 0.05), (5, 0, 0)), box((2.0, 1.5, 0.9), (0, 0, 0.45))
     (only,) = propose_instances(scan_of((crumb, 5), (giant, 5)))
     assert only.confidence == pytest.approx(0.5, abs=0.01)  # twice as wide as chairs are
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from converters.alignment import yaw_matrix
-from converters.errors import SceneRejected
-from converters.maps import Grid, find_floor_height, main_direction, make_floor_plan, resample, sample_faces
+from converters.maps import Grid, main_direction, make_floor_plan, resample, sample_faces
+from converters.objects import BodyHinge, PlacedObject, convex_hull
 from converters.raw import GivenMap
 from converters.walls import border_cells, cover_rectangles, wall_boxes
 from tests.converters import tiny_raw
@@ -68,23 +68,10 @@ def test_main_direction_finds_the_rooms_turn(yaw):
     assert main_direction(vertices @ yaw_matrix(yaw).T, faces, labels) == pytest.approx(yaw, abs=1e-3)
 
 
-def test_floor_height_ignores_stray_labels():
-    vertices, _, labels = tiny_raw.scan()
-    labels = labels.copy()
-    labels[np.flatnonzero(labels == 1)[:400]] = 2  # wall taken for floor
-    assert find_floor_height(vertices, labels) == pytest.approx(tiny_raw.FLOOR_M)
-
-
-def test_a_scan_without_floor_labels_is_refused():
-    vertices, _, labels = tiny_raw.scan()
-    with pytest.raises(SceneRejected, match="0 vertices carry the floor label"):
-        find_floor_height(vertices, np.ones_like(labels))
-
-
-def room_plan(yaw: float = 0.0, given=None, keep=None):
+def room_plan(yaw: float = 0.0, given=None, keep=None, objects=()):
     vertices, faces, labels = tiny_raw.scan()
     faces = faces[np.isin(labels[faces[:, 0]], (1, 2))] if keep is None else faces[keep(labels[faces[:, 0]])]
-    return make_floor_plan((vertices - [0, 0, 0.3]) @ yaw_matrix(yaw).T, faces, labels, (), given, yaw)
+    return make_floor_plan((vertices - [0, 0, 0.3]) @ yaw_matrix(yaw).T, faces, labels, objects, given, yaw)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3])
@@ -141,3 +128,38 @@ def test_the_sources_map_adds_floor_that_the_scan_missed():
     plan = make_floor_plan(low, kept, labels, (), given, 0.0)
     assert without.traversable.sum() * 0.05**2 < 2.2 * 2.5
     assert plan.traversable.sum() == room_plan().traversable.sum()
+
+
+def door_at_the_wall() -> PlacedObject:
+    """A leaf of 0.8 x 0.04 m, square to the wall x = 0, its hinge in it, that turns flat against it both ways."""
+    leaf = convex_hull(np.array([(x, y, z) for x in (-0.4, 0.4) for y in (-0.02, 0.02) for z in (0.0, 1.4)]))
+    hinge = BodyHinge(np.array([-0.4, 0.0, 0.0]), (-math.pi / 2, math.pi / 2), False)
+    place = np.array([0.43, 1.25, 0.0])
+    colours = np.zeros((len(leaf.faces), 3), np.uint8)
+    turn = np.array([1.0, 0, 0, 0])
+    return PlacedObject("door_0", "door", "d", leaf.vertices, leaf.faces, colours, (leaf,), (), place, turn, hinge)
+
+
+def test_walls_beside_a_doors_sweep_stay_and_the_leaf_meets_no_box():
+    door = door_at_the_wall()
+    bare, plan = room_plan(), room_plan(objects=(door,))
+    np.testing.assert_array_equal(plan.occupied, bare.occupied)
+    assert not (plan.traversable & bare.occupied).any()
+    assert plan.leaf is not None and plan.leaf.sum() >= 20  # the leaf lies along 1.6 m of wall, in cells of 5 cm
+    boxes = wall_boxes(plan)
+    assert door.hinge is not None
+    leaf = door.hulls_b[0].vertices
+    side = np.linspace(0, 1, 30)[:, None]
+    for angle in np.linspace(*door.hinge.range_rad, 25):
+        turned = (leaf - door.hinge.origin_b) @ yaw_matrix(angle).T + door.hinge.origin_b + door.position_w
+        ends = turned[np.argsort(turned[:, 2])[:4], :2]
+        points = np.vstack([a * (1 - side) + b * side for a in ends for b in ends])
+        for box in boxes:
+            inside = np.abs((points - box.centre[:2]) @ box.rotation[:2, :2]) < box.half[:2]
+            assert not inside.all(axis=1).any()
+    # Behind the leaf the wall is still closed: nothing but the leaf's own cells lost its box.
+    covered = np.zeros(plan.grid.shape, bool)
+    centres = plan.grid.centres_w()
+    for box in boxes:
+        covered |= (np.abs((centres - box.centre[:2]) @ box.rotation[:2, :2]) < box.half[:2]).all(axis=-1)
+    assert covered[border_cells(plan.traversable | plan.leaf)].all()

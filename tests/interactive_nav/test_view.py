@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import types
+
 import mujoco
 import numpy as np
 import pytest
@@ -72,6 +75,26 @@ def test_the_chosen_viewer_is_given_the_model(room, monkeypatch):
     assert view.main([str(room), "--robot", "turtlebot", "--objects", "1", "--port", "9000"]) == 0
     # World, structure, the room's cube, robot with two wheels, one small object.
     assert opened == [(7, 9000)]
+
+
+def test_the_browsers_page_opens_on_the_whole_scene(room, monkeypatch):
+    """With stand-ins for viser and mjviser 0.0.14, which looks from 3 x extent at the centre, or a body."""
+    seen = {}
+
+    class Viewer:
+        def __init__(self, model, data, server):
+            self.scene = types.SimpleNamespace(camera_tracking_enabled=True)
+            seen.update(distance_m=3 * model.stat.extent, server=server, time=data.time)
+
+        def run(self):
+            seen["tracking"] = self.scene.camera_tracking_enabled
+
+    monkeypatch.setitem(sys.modules, "viser", types.SimpleNamespace(ViserServer=lambda port: f"port {port}"))
+    monkeypatch.setitem(sys.modules, "mjviser", types.SimpleNamespace(Viewer=Viewer))
+    model = view.build_model(room, None, [])
+    extent = float(model.stat.extent)
+    view.open_browser(model, mujoco.MjData(model), 8123)
+    assert seen == {"distance_m": pytest.approx(extent), "server": "port 8123", "time": 0.0, "tracking": False}
 
 
 def test_what_is_placed_stands_free_at_rest_and_is_seen(two_rooms):
