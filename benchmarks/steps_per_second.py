@@ -1,11 +1,11 @@
 """Environment steps per second of a scene, without and with learning: settings in, one JSON row a measurement out.
 
-    python -m benchmarks.steps_per_second --backend warp --num-envs 4096 --mode simulation ppo
+    python -m benchmarks.steps_per_second --backend warp --num-envs 4096 --mode simulation train
 
 `simulation` drives random wheel commands through `AutoResetEnv.step`; new episodes are drawn as old ones
 end. `physics`, `task` and `observed` are the same with parts left out, for their shares of a step.
-`ppo` trains with `python -m train`'s own code and a preset, and reads the rate that it logs, compiling
-and checkpoints apart. Rows carry device, versions and commit, and are appended to
+`train` trains with `python -m train`'s own code and a preset of any algorithm, and reads the rate that it
+logs, compiling and checkpoints apart. Rows carry device, versions and commit, and are appended to
 `benchmarks/results/steps_per_second.jsonl`.
 """
 
@@ -34,7 +34,7 @@ from interactive_nav.wrappers import AutoResetEnv
 from train import config_io
 from train.run import train_run
 
-MODES = ("physics", "task", "observed", "simulation", "ppo")
+MODES = ("physics", "task", "observed", "simulation", "train")
 COUNTED = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
 """Failures summed over ended episodes."""
 PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
@@ -169,22 +169,30 @@ def simulation(
     }
 
 
-def ppo(
-    scenes: list[str], backend: str, num_envs: int, steps: int, settings: dict[str, Any], preset: str
+def training(
+    scenes: list[str],
+    backend: str,
+    num_envs: int,
+    steps: int,
+    settings: dict[str, Any],
+    preset: str,
+    learner: list[str],
 ) -> dict[str, Any]:
-    """Rate of `python -m train` with a preset: median over its log lines."""
+    """Rate of `python -m train` with a preset and `learner` words laid over it: median over its log lines."""
+    algorithm = config_io.load(preset).algorithm
     with tempfile.TemporaryDirectory() as folder:
         overrides = [
             f"env.scenes=[{','.join(scenes)}]",
             f"env.backend={backend}",
-            f"ppo.num_envs={num_envs}",
+            f"{algorithm}.num_envs={num_envs}",
             f"run.num_timesteps={steps * num_envs}",
             "run.log_every_steps=1",
             f"run.checkpoint_every_steps={10 * steps * num_envs}",
             f"run.out_dir={folder}",
             "run.name=benchmark",
             "run.tensorboard=false",
-            *(f"env.{k}={v}" for k, v in settings.items()),
+            *(f"env.{k}={json.dumps(v)}" for k, v in settings.items()),
+            *learner,
         ]
         _, run_folder, _ = train_run(config_io.load(preset, overrides), Console(quiet=True))
         lines = [json.loads(line) for line in run_folder.metrics.read_text(encoding="utf-8").splitlines()]
@@ -194,7 +202,9 @@ def ppo(
         "env_steps_per_s": round(statistics.median(rates)),
         "compile_s": round(last["compile_s"], 1),
         "steps": steps,
+        "mode": algorithm,
         "preset": preset,
+        "learner": learner,
         "episodes": sum(line["episodes"] for line in lines),
         "nonfinite": sum(line.get("episode/nonfinite", 0.0) * line["episodes"] for line in lines),
         "overflow_steps": sum(line.get("episode/overflow_steps", 0.0) * line["episodes"] for line in lines),
@@ -211,7 +221,8 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, nargs="+", default=[64])
     parser.add_argument("--steps", type=int, default=200, help="control steps of every environment")
     parser.add_argument("--mode", nargs="+", choices=MODES, default=["simulation"])
-    parser.add_argument("--preset", default="turtlebot_ppo", help="of `python -m train`, for ppo")
+    parser.add_argument("--preset", default="turtlebot_ppo", help="of `python -m train`, for train")
+    parser.add_argument("--learner", nargs="*", default=[], metavar="key=value", help="laid over the preset, for train")
     parser.add_argument("--set", nargs="*", default=[], metavar="key=value", help="environment settings")
     parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
     parser.add_argument("--out", default="benchmarks/results/steps_per_second.jsonl")
@@ -232,8 +243,8 @@ def main() -> None:
                 "date": datetime.date.today().isoformat(),
             }
             measure = (args.scenes, args.backend, num_envs, args.steps, settings)
-            if mode == "ppo":
-                row |= ppo(*measure, args.preset)
+            if mode == "train":
+                row |= training(*measure, args.preset, args.learner)
             else:
                 row |= {"robot": args.robot, "devices": args.devices}
                 row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
