@@ -93,7 +93,8 @@ def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
     """
     free = plan.traversable if plan.leaf is None else plan.traversable | plan.leaf
     needed = border_cells(free)
-    allowed = ~free & ndimage.binary_dilation(needed, np.ones((3, 3)), iterations=DEPTH_CELLS)
+    near = np.asarray(ndimage.binary_dilation(needed, np.ones((3, 3)), iterations=DEPTH_CELLS), bool)
+    allowed = ~free & near
     height = np.full(needed.shape, plan.wall_height_m) if plan.height_m is None else plan.height_m
     turn = yaw_matrix(plan.grid.yaw)
     side = plan.grid.resolution_m

@@ -45,7 +45,7 @@ def records(data: bytes) -> Iterator[bytes]:
 
 def logged(path: Path) -> list[dict[str, float]]:
     """The history in an offline run's file, once its last record is there: W&B's own process writes it."""
-    from wandb.proto import wandb_internal_pb2
+    from wandb.proto import wandb_internal_pb2  # pyright: ignore[reportMissingImports]
 
     for _ in range(200):
         read = []
