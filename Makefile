@@ -10,11 +10,11 @@ EPISODES ?= 200
 DEMO := demo
 say = @printf '\n\033[1m== %s\033[0m\n'
 
-.PHONY: help sync demo test docs lint types format check lock clean-demo
+.PHONY: help sync demo test test-all docs lint types format check lock clean-demo
 
 help:
 	@echo "make demo    generate and convert a small building, train a TurtleBot, score it, draw it (SEED=$(SEED))"
-	@echo "make test    all tests, slow ones included"
+	@echo "make test    tests, slow ones included; make test-all: the heaviest too"
 	@echo "make docs    the documentation as HTML, in docs/_build/html"
 	@echo "make lint | types | format | check (lint, types and test) | sync (environment) | lock | clean-demo"
 
@@ -68,6 +68,10 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 
 test: sync .venv/.oracles
 	$(say) "Tests (two workers; the slow ones compile MJX on the CPU)"
+	@$(PY) -m pytest -n 2 --dist loadfile -m "not heavy"
+
+test-all: sync .venv/.oracles
+	$(say) "All tests, the heavy ones too"
 	@$(PY) -m pytest -n 2 --dist loadfile
 
 lint: sync

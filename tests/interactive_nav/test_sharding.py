@@ -72,6 +72,7 @@ def scene(tmp_path_factory):
     return write_room(tmp_path_factory.mktemp("sharding") / "room", (4.0, 3.0), ())
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_two_devices_step_as_one(scene):
     done = subprocess.run(

@@ -65,6 +65,7 @@ def test_the_phase_without_labels_comes_first_and_learns(whole):
     assert lines[1]["loss"] < lines[0]["loss"]
 
 
+@pytest.mark.heavy
 def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_path):
     """Stopped in either phase, after one epoch and after three; the third call ends it."""
     out, config = tmp_path / "run", whole[1]

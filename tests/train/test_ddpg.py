@@ -138,7 +138,9 @@ def test_number_of_critics_and_the_same_policy_either_way():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("env", "share"), [(ToyEnv(), False), (ToyPixels(), True)], ids=["vector", "picture, shared encoder"]
+    ("env", "share"),
+    [(ToyEnv(), False), pytest.param(ToyPixels(), True, marks=pytest.mark.heavy)],
+    ids=["vector", "picture, shared encoder"],
 )
 def test_learns_the_toy(env, share):
     """From random (0.03 success) to at least 0.9 in 14,336 steps; in the pictures only the image shows the goal."""

@@ -72,6 +72,7 @@ def test_train_resume_and_evaluate(tmp_path, capsys):
     assert str(tmp_path / "absent") in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_a_policy_that_sees_trains_and_is_scored(tmp_path, capsys):
     room = write_room(tmp_path / "room")

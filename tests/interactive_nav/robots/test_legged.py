@@ -212,6 +212,7 @@ def test_it_stands_walks_a_metre_stops_and_turns(name, folder):
     assert motion.yaw_rad[-1, 4] > 0.3 and motion.pos_w[30, 4, 0] > 0
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_mjx_walks_the_ant_alike(folder):
     world = hall_world(get_robot("ant", "twist"), folder)

@@ -98,6 +98,7 @@ def test_kinematic_mode_floats_and_takes_six_velocities(folder):
     np.testing.assert_allclose(motion.pos_w[-1, 1] - motion.pos_w[-11, 1], [0.5, 0.0, 0.2], atol=5e-3)
 
 
+@pytest.mark.heavy
 def test_mjx_flies_the_same_path(folder):
     world = hall_world(get_robot("quadrotor", "twist"), folder)
     commands = schedule((0.6, 0.8, 0.8))[:, None]

@@ -100,6 +100,7 @@ def test_time_limit_stops_jobs_on_the_cluster_cleanly(cluster, tmp_path, monkeyp
         assert not running(last_line(log)["pid"])
 
 
+@pytest.mark.heavy
 def test_a_lost_node_is_a_failure_like_another(cluster, tmp_path, monkeypatch):
     import ray
 
