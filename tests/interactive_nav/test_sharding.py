@@ -82,6 +82,7 @@ def test_two_devices_step_as_one(scene):
     assert done.stdout.strip().endswith("equal")
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_two_processes_share_one_batch(scene):
     with socket.socket() as probe:

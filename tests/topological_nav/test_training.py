@@ -57,6 +57,7 @@ def whole(made, tmp_path_factory):
     return out, config
 
 
+@pytest.mark.heavy
 def test_the_phase_without_labels_comes_first_and_learns(whole):
     lines = read_metrics(whole[0] / "metrics.jsonl")
     assert [(line["phase"], line["epoch"]) for line in lines] == [

@@ -254,7 +254,7 @@ WIDER: dict[str, Any] = {"policy_hidden_layer_sizes": (64, 64), "q_hidden_layer_
     ("env", "steps", "settings"),
     [
         (ToyEnv(), 8_192, {"grad_steps_per_update": 16, "initial_alpha": 0.05, **WIDER}),
-        (ToyPixels(), 12_288, {"initial_alpha": 0.01}),
+        pytest.param(ToyPixels(), 12_288, {"initial_alpha": 0.01}, marks=pytest.mark.heavy),
     ],
     ids=["vector", "picture"],
 )

@@ -54,7 +54,7 @@ def test_evidence_on_c_mujoco(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ("turtlebot", "husky"))
+@pytest.mark.parametrize("name", ("turtlebot", pytest.param("husky", marks=pytest.mark.heavy)))
 def test_evidence_on_mjx_jax(name):
     assert _failures(name, "jax") == []
 

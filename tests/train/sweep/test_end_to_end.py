@@ -13,6 +13,7 @@ from train.sweep.__main__ import main
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.heavy
 def test_from_a_file_to_pictures(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
