@@ -156,7 +156,7 @@ def _map(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _stops() -> Iterator[list[int]]:
-    from train.run import stop_signals
+    from train.signals import stop_signals
 
     with stop_signals() as seen:
         yield seen

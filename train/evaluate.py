@@ -22,7 +22,6 @@ from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
 from interactive_nav.episodes import load as load_episodes
 from train import checkpoint, config_io
 from train.algorithms import ALGORITHMS
-from train.asked import EvaluationAsked, paths_beside
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig
 from train.errors import ConfigError, TrainError
@@ -30,6 +29,7 @@ from train.files import whole_file
 from train.planners import Planner
 from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
 from train.rollout import Episodes, Player, episode_keys
+from train.row_files import EvaluationAsked, paths_beside
 from train.rows import episode_table, score_table, write_parquet
 from train.run import check_fits, make_env
 from train.run_folder import FAILURES, RunFolder, claim, versions

@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import flax.serialization
@@ -30,6 +28,7 @@ from train.files import write_text
 from train.learner import Snapshot, TrainResult, Update
 from train.progress import TrainingDisplay, describe
 from train.run_folder import FAILURES, RunFolder, claim, read_metrics, versions
+from train.signals import stop_signals
 
 
 def make_env(config: EnvConfig) -> Any:
@@ -42,25 +41,6 @@ def make_env(config: EnvConfig) -> Any:
         return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
     except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM into the list it yields; a second one acts as it always would."""
-    seen: list[int] = []
-    usual: dict[int, Any] = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-
-    def remember(number: int, _: FrameType | None) -> None:
-        seen.append(number)
-        signal.signal(number, usual[number])
-
-    for number in usual:
-        signal.signal(number, remember)
-    try:
-        yield seen
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
 
 
 class FolderCallbacks:

@@ -40,7 +40,7 @@ The kinds of ids 7 and 10 are not public (a shoe and a pot, in some order).
 NUM_CLASSES = 11
 """Divides a class id into the observation's [0, 1], as the original does."""
 DESK_ID = 11
-"""Id of desks with `segmentation_classes='five'`, the paper's chair, desk, door, sofa and table."""
+"""Id of desks with `segmentation_classes=5`, the paper's chair, desk, door, sofa and table."""
 
 
 @flax.struct.dataclass

@@ -11,9 +11,9 @@ import pytest
 
 from tests.train.synthetic import paper_like, run_rows, write_results, yardstick_rows
 from train import figures
-from train.asked import paths_beside
 from train.figures import curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
+from train.row_files import paths_beside
 from train.rows import write_parquet
 
 

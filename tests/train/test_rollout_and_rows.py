@@ -14,10 +14,10 @@ import pytest
 
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train import rollout
-from train.asked import EvaluationAsked, files_of_run
 from train.errors import RunFolderError
 from train.policies import make_follower, make_random
 from train.rollout import Player, episode_keys, run_episodes
+from train.row_files import EvaluationAsked, files_of_run
 from train.rows import episode_table, interval, read_notes, read_rows, write_parquet
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from train.asked import paths_beside
 from train.errors import RunFolderError, TrainError
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
@@ -21,6 +20,7 @@ from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
 from train.files import whole_file
+from train.row_files import paths_beside
 from train.rows import read_notes, read_rows
 from train.run_folder import read_metrics
 from train.statistics import run_means

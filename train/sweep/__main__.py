@@ -11,11 +11,12 @@ from rich.console import Console
 
 from train.errors import ConfigError, TrainError
 from train.run_folder import claim
+from train.signals import stop_signals
 from train.sweep import spec
 from train.sweep.devices import Machine, find_gpus
 from train.sweep.folder import SweepFolder
 from train.sweep.local import Launcher, LocalLauncher
-from train.sweep.scheduler import STAGES, Programs, Scheduler, collected_signals
+from train.sweep.scheduler import STAGES, Programs, Scheduler
 from train.sweep.spec import Sweep
 from train.sweep.table import SweepDisplay, status_table, totals
 
@@ -96,7 +97,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         launcher = make_launcher(arguments.launcher, arguments.ray_address, sweep)
         stages = (arguments.only,) if arguments.only else STAGES
         try:
-            with collected_signals() as stops, SweepDisplay(console) as display:
+            with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:
                 display.event(f"{folder.root}: {len(sweep.runs)} runs")
                 outcome = Scheduler(
                     folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs

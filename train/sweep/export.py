@@ -11,9 +11,9 @@ from typing import Any
 import pyarrow as pa
 
 from train import checkpoint
-from train.asked import files_of_run, paths_beside
 from train.errors import CheckpointError, RunFolderError
 from train.files import write_text
+from train.row_files import files_of_run, paths_beside
 from train.rows import read_rows
 from train.run_folder import RunFolder, read_metrics
 from train.statistics import run_means

@@ -20,10 +20,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from train.asked import EvaluationAsked, files_of_run, paths_beside
 from train.config_io import to_yaml
 from train.errors import RunFolderError
 from train.files import write_text
+from train.row_files import EvaluationAsked, files_of_run, paths_beside
 from train.rows import read_notes
 from train.run_folder import RunFolder
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep

@@ -7,8 +7,7 @@ import dataclasses
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from types import FrameType
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from train.sweep.folder import (
@@ -79,24 +78,6 @@ class Display(Protocol):
     def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:
         """How far the runs are; must be cheap to call often."""
         ...
-
-
-@contextlib.contextmanager
-def collected_signals() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM into the list that it yields."""
-    seen: list[int] = []
-    usual: dict[int, Any] = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-
-    def remember(number: int, _: FrameType | None) -> None:
-        seen.append(number)
-
-    for number in usual:
-        signal.signal(number, remember)
-    try:
-        yield seen
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
 
 
 class Scheduler:

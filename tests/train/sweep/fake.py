@@ -18,8 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from train.asked import EvaluationAsked
 from train.files import whole_file
+from train.row_files import EvaluationAsked
 
 
 def fates(run: Path) -> dict[str, list[str]]:
