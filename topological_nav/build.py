@@ -18,9 +18,10 @@ from topological_nav.errors import MapError, SpaceError
 from topological_nav.graph import TopologicalMap, assemble, place_nodes
 from topological_nav.rendering import SceneRenderer, camera_pose
 from topological_nav.rooms import find_rooms, recorded_rooms
-from topological_nav.settings import overlaid, plain_settings
+from topological_nav.settings import overlaid
 from topological_nav.space import FreeSpace, free_space
 from topological_nav.training import Trained, load_trained
+from train.config_io import to_dict
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""
@@ -87,8 +88,8 @@ def build_map(
         return 1.0 / (1.0 + np.exp(-detector.logits(looked)[:, 0]))
 
     about = {
-        "settings": plain_settings(config),
-        "data": plain_settings(data),
+        "settings": to_dict(config),
+        "data": to_dict(data),
         "localiser": localiser.about["digest"],
         "detector": detector.about["digest"],
         "margin_m": margin_m,

@@ -28,9 +28,10 @@ from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.passages import Passages, draw_passages, held_out
 from topological_nav.rendering import SceneRenderer, camera_pose
 from topological_nav.rooms import Rooms, agreement, find_rooms, recorded_rooms
-from topological_nav.settings import overlaid, plain_settings
+from topological_nav.settings import overlaid
 from topological_nav.shards import read_shard, write_shard
 from topological_nav.space import FreeSpace, free_space, spread
+from train.config_io import to_dict
 from train.files import whole_file, write_text
 
 FORMAT = 1
@@ -149,7 +150,7 @@ def make_dataset(
     plans = [plan_scene(scene, space, config) for scene, space in zip(scenes, spaces, strict=True)]
     header = {
         "format": FORMAT,
-        "settings": plain_settings(config),
+        "settings": to_dict(config),
         "fov_deg": lens_of(config, robot).fov_deg,
         "camera_m": list(robot.camera.pos_m),
         "scenes": [_about(scene, plan) for scene, plan in zip(scenes, plans, strict=True)],

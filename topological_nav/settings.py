@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-import yaml
-
 from topological_nav.errors import SettingsError
-from train.config_io import field_docs
+from train import config_io
+from train.errors import ConfigError
 
-AUTO = "auto"
-"""How None ("chosen for you") is written in files and on the command line."""
 Config = TypeVar("Config")
 
 
@@ -25,16 +19,7 @@ def overridden(config: Config, words: Sequence[str]) -> Config:
     Raises:
         SettingsError: a word without `=`, an unknown name, or a value that the setting cannot have.
     """
-    plain: dict[str, Any] = {}
-    for word in words:
-        name, equals, text = word.partition("=")
-        if not equals or not name:
-            raise SettingsError(f"{word!r}: expected key=value, for example seed=1")
-        try:
-            plain[name] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            plain[name] = text
-    return overlaid(config, plain, "setting")
+    return _told(lambda: config_io.overlay(config, config_io.read_words(words, "seed=1"), "setting"))
 
 
 def overlaid(config: Config, plain: Mapping[str, Any], where: str) -> Config:
@@ -48,33 +33,21 @@ def overlaid(config: Config, plain: Mapping[str, Any], where: str) -> Config:
     Raises:
         SettingsError: an unknown name, or a value that the setting cannot have.
     """
-    hints = typing.get_type_hints(type(config))
-    changes = {}
-    for name, value in plain.items():
-        if name not in hints:
-            near = difflib.get_close_matches(str(name), hints, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(hints)}"
-            raise SettingsError(f"{where}: unknown key '{name}'; {hint}")
-        changes[name] = _converted(value, hints[name], f"{where}: {name}")
+    return _told(lambda: config_io.overlay(config, plain, where))
+
+
+def _told(make: Callable[[], Config]) -> Config:
     try:
-        return dataclasses.replace(config, **changes)  # type: ignore[type-var]
-    except SettingsError:
-        raise
-    except ValueError as error:
-        raise SettingsError(f"{where}: {error}") from None
-
-
-def plain_settings(config: Any) -> dict[str, Any]:
-    """The settings as YAML holds them: lists for tuples, `auto` for None."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
-    return {k: AUTO if v is None else list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+        return make()
+    except ConfigError as error:
+        raise SettingsError(str(error)) from None
 
 
 def settings_help(config: Any) -> str:
     """One line a setting: name, default, meaning."""
-    docs, hints = field_docs(type(config)), typing.get_type_hints(type(config))
+    docs, hints = config_io.field_docs(type(config)), typing.get_type_hints(type(config))
     lines = []
-    for name, value in plain_settings(config).items():
+    for name, value in config_io.to_dict(config).items():
         shown = ",".join(map(str, value)) if isinstance(value, list) else value
         choice = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is Literal else ()
         lines.append((f"{name}={shown}", docs[name] + (f" [{' | '.join(choice)}]" if choice else "")))
@@ -88,30 +61,3 @@ def require(config: Any, names: str, low: float, high: float) -> None:
         value = getattr(config, name)
         if value is not None and not low <= value <= high:
             raise SettingsError(f"{name} is {value!r}, expected between {low:g} and {high:g}")
-
-
-def _converted(value: Any, kind: Any, where: str) -> Any:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is types.UnionType:
-        return None if value is None or value == AUTO else _converted(value, arguments[0], where)
-    if origin is Literal:
-        if value not in arguments:
-            raise SettingsError(f"{where} is {value!r}, expected one of {', '.join(arguments)}")
-        return value
-    if origin is tuple:
-        items = [part for part in value.split(",") if part] if isinstance(value, str) else value
-        items = items if isinstance(items, list | tuple) else [items]
-        return tuple(_converted(item, arguments[0], where) for item in items)
-    if kind is bool and isinstance(value, bool):
-        return value
-    if kind is str and isinstance(value, str | int | float) and not isinstance(value, bool):
-        return str(value)
-    if kind in (int, float) and not isinstance(value, bool):
-        try:
-            number = float(value)  # YAML takes 1e-4 for text
-        except (TypeError, ValueError):
-            number = None
-        if number is not None and (kind is float or number.is_integer()):
-            return kind(number)
-    expected = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]
-    raise SettingsError(f"{where} is {value!r}, expected {expected}")

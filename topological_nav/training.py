@@ -44,7 +44,7 @@ from topological_nav.learning import (
 )
 from topological_nav.localise import localisation_scores
 from topological_nav.networks import Contrast, Network
-from topological_nav.settings import plain_settings
+from train.config_io import to_dict
 from train.files import whole_file, write_text
 from train.run_folder import read_metrics, versions
 
@@ -140,7 +140,7 @@ def train(
     """
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
-    _claim(out, {"task": task, "dataset": header, **plain_settings(config)})
+    _claim(out, {"task": task, "dataset": header, **to_dict(config)})
     write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
     shape = (data.height, data.width)
     network = Network(task, config.network, config.width, config.hidden, work.outputs)

@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import yaml
 
@@ -21,6 +21,7 @@ from train.config import AUTO as AUTO_SIZES
 from train.config import TrainConfig, validate
 from train.errors import ConfigError
 
+Config = TypeVar("Config")
 PRESET_DIR = Path(__file__).parent / "configs"
 AUTO = "auto"  # how None ("chosen for you") is written in files and on the command line
 
@@ -68,7 +69,7 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    return _overlay(base or TrainConfig(), {} if plain is None else plain, where, "")
+    return overlay(base or TrainConfig(), {} if plain is None else plain, where, known=list(flatten(TrainConfig())))
 
 
 def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
@@ -96,7 +97,7 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
         path = PRESET_DIR / f"{name_or_path}.yaml"
         if not path.is_file():
             raise ConfigError(
-                f"--config: no preset {name_or_path!r}{_nearest(name_or_path, presets())}; "
+                f"--config: no preset {name_or_path!r}{nearest(name_or_path, presets())}; "
                 f"expected one of {', '.join(presets())}, or the path of a .yaml file"
             )
     try:
@@ -118,11 +119,22 @@ def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
     Raises:
         ConfigError: a word without `=`, an unknown name, a wrong type or a value out of range.
     """
+    return overlay(config, read_words(words), "override", known=list(flatten(TrainConfig())))
+
+
+def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") -> dict[str, Any]:
+    """`dotted.name=value` words as a nested mapping; values are read as YAML.
+
+    All words at once, so that two values that only fit together may both change.
+
+    Raises:
+        ConfigError: a word without `=`, or a section that was given a value.
+    """
     nested: dict[str, Any] = {}
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or not name:
-            raise ConfigError(f"override {word!r}: expected key=value, for example ppo.learning_rate=1e-4")
+            raise ConfigError(f"override {word!r}: expected key=value, for example {example}")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
@@ -135,8 +147,7 @@ def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
                 raise ConfigError(f"override {word!r}: {section} was given a value by an earlier override")
             place = inner
         place[last] = value
-    # All words at once, so that two values that only fit together may both change.
-    return _overlay(config, nested, "override", "")
+    return nested
 
 
 def help_text() -> str:
@@ -181,7 +192,19 @@ def field_docs(config_type: type) -> dict[str, str]:
     return docs
 
 
-def _overlay(base: Any, plain: Any, where: str, prefix: str) -> Any:
+def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Sequence[str] = ()) -> Config:
+    """A dataclass of settings with nested plain values laid over it, here and in other programs.
+
+    Args:
+        base: what `plain` does not name.
+        plain: nested mapping as read from YAML.
+        where: file or word the values come from, for messages.
+        prefix: dotted name of `base` inside the whole, with its dot.
+        known: dotted names elsewhere that a wrong key may have meant.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type or a value out of range.
+    """
     if not isinstance(plain, Mapping):
         section = prefix.rstrip(".") or "the file"
         raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
@@ -190,14 +213,14 @@ def _overlay(base: Any, plain: Any, where: str, prefix: str) -> Any:
     for key, value in plain.items():
         name = f"{prefix}{key}"
         if key not in hints:
-            known = [f"{prefix}{field}" for field in hints] + list(flatten(TrainConfig()))
-            raise ConfigError(f"{where}: unknown key {name!r}{_nearest(name, known)} (--help lists them)")
+            names = [*(f"{prefix}{field}" for field in hints), *known]
+            raise ConfigError(f"{where}: unknown key {name!r}{nearest(name, names)} (--help lists them)")
         if dataclasses.is_dataclass(hints[key]):
-            changes[key] = _overlay(getattr(base, key), value, where, f"{name}.")
+            changes[key] = overlay(getattr(base, key), value, where, f"{name}.", known)
         else:
             changes[key] = _convert(value, hints[key], f"{where}: {name}")
     try:
-        return dataclasses.replace(base, **changes)
+        return dataclasses.replace(base, **changes)  # type: ignore[type-var]
     except ConfigError:
         raise
     except ValueError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
@@ -213,7 +236,7 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         return _convert(value, arguments[0], where)
     if origin is Literal:
         if value not in arguments:
-            near = _nearest(str(value), arguments)
+            near = nearest(str(value), arguments)
             raise ConfigError(f"{where}: got {_shown(value)}, expected one of {', '.join(arguments)}{near}")
         return value
     if origin is tuple:
@@ -245,7 +268,8 @@ def _scalar(value: Any, kind: type) -> Any:
     return float(value)
 
 
-def _nearest(word: str, known: Sequence[str]) -> str:
+def nearest(word: str, known: Sequence[str]) -> str:
+    """`, did you mean 'X'?` for the known name that a wrong one looks like, or nothing."""
     tails = {name.rpartition(".")[2]: name for name in reversed(known)}  # of equal names the first section's
     tail = word.rpartition(".")[2]
     if tail in tails:  # the right name in the wrong section, or without its section
@@ -257,6 +281,3 @@ def _nearest(word: str, known: Sequence[str]) -> str:
 
 def _shown(value: Any) -> str:
     return f"{value!r} ({type(value).__name__})"
-
-
-overlay, nearest = _overlay, _nearest  # for configs of other programs (`train.sweep`)

@@ -52,7 +52,7 @@ def test_the_nearest_image_of_a_node_may_judge_its_edges(made, tmp_path, capsys)
     ("words", "told"),
     [
         (["data", "nowhere"], "nowhere/scene.json: no such file"),
-        (["data", "nowhere", "heading=3"], "unknown key 'heading'; did you mean 'headings'?"),
+        (["data", "nowhere", "heading=3"], "unknown key 'heading', did you mean 'headings'?"),
         (["train", "rooms", "--data", "nowhere"], "nowhere: is no dataset"),
         (["map", "nowhere", "--localiser", "gone"], "gone: holds no trained network"),
     ],

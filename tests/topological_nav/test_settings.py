@@ -4,7 +4,8 @@ import pytest
 
 from topological_nav.config import DataConfig, TrainConfig, passage_config, room_config
 from topological_nav.errors import SettingsError
-from topological_nav.settings import overlaid, overridden, plain_settings, settings_help
+from topological_nav.settings import overlaid, overridden, settings_help
+from train.config_io import to_dict
 
 
 def test_words_are_read_by_the_types_of_the_settings():
@@ -17,13 +18,13 @@ def test_words_are_read_by_the_types_of_the_settings():
 @pytest.mark.parametrize(
     ("word", "told"),
     [
-        ("epoch=3", "unknown key 'epoch'; did you mean 'epochs'?"),
+        ("epoch=3", "unknown key 'epoch', did you mean 'epochs'?"),
         ("epochs", "expected key=value"),
-        ("epochs=2.5", "epochs is 2.5, expected a whole number"),
+        ("epochs=2.5", "epochs: got 2.5 .float., expected a whole number"),
         ("epochs=0", "epochs is 0, expected between 1"),
-        ("network=vgg", "network is 'vgg', expected one of resnet18, alexnet"),
-        ("augment=1", "augment is 1, expected true or false"),
-        ("learning_rate=fast", "learning_rate is 'fast', expected a number"),
+        ("network=vgg", "network: got 'vgg' .str., expected one of resnet18, alexnet"),
+        ("augment=1", "augment: got 1 .int., expected true or false"),
+        ("learning_rate=fast", "learning_rate: got 'fast' .str., expected a number"),
     ],
 )
 def test_wrong_words_are_refused(word, told):
@@ -38,8 +39,8 @@ def test_headings_must_leave_every_third_for_testing():
 
 def test_settings_written_down_are_read_back():
     config = DataConfig(seed=3, fov_deg=None, room_method="spectral")
-    assert plain_settings(config)["fov_deg"] == "auto"
-    assert overlaid(DataConfig(), plain_settings(config), "file") == config
+    assert to_dict(config)["fov_deg"] == "auto"
+    assert overlaid(DataConfig(), to_dict(config), "file") == config
 
 
 def test_defaults_are_the_reports():
@@ -55,4 +56,4 @@ def test_defaults_are_the_reports():
 def test_help_names_every_setting_with_its_meaning():
     text = settings_help(TrainConfig())
     assert "network=resnet18" in text and "[resnet18 | alexnet]" in text
-    assert len(text.splitlines()) == len(plain_settings(TrainConfig()))
+    assert len(text.splitlines()) == len(to_dict(TrainConfig()))
