@@ -19,6 +19,7 @@ import json
 import os
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from typing import Any
@@ -71,6 +72,20 @@ def _gpu_memory_mib() -> float | None:
         return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0])
     except (OSError, subprocess.CalledProcessError, ValueError, IndexError):
         return None
+
+
+def _peak_memory_mib() -> dict[str, float] | None:
+    """Most memory that this process has held on its first GPU: JAX's arrays, and Warp's beside them."""
+    device = jax.devices()[0]
+    if device.platform == "cpu":
+        return None
+    stats = device.memory_stats() or {}
+    peak = {"jax": stats.get("peak_bytes_in_use", 0) / 2**20}
+    if "warp" in sys.modules:
+        import warp
+
+        peak["warp"] = warp.get_mempool_used_mem_high(f"cuda:{device.local_hardware_id or 0}") / 2**20
+    return {name: round(mib) for name, mib in peak.items()}
 
 
 def _physics_only(env, num_envs: int):
@@ -161,6 +176,7 @@ def simulation(
         "env_steps": chunk * len(rates) * num_envs,
         **totals,
         "running": {name: int(getattr(nav, name).sum()) for name in COUNTED if hasattr(nav, name)},
+        "peak_memory_mib": _peak_memory_mib(),
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "contacts_per_env": getattr(physics, "contacts_per_env", None),
         "constraints_per_env": getattr(physics, "constraints_per_env", None),
@@ -208,6 +224,7 @@ def training(
         "episodes": sum(line["episodes"] for line in lines),
         "nonfinite": sum(line.get("episode/nonfinite", 0.0) * line["episodes"] for line in lines),
         "overflow_steps": sum(line.get("episode/overflow_steps", 0.0) * line["episodes"] for line in lines),
+        "peak_memory_mib": _peak_memory_mib(),
     }
 
 

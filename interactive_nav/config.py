@@ -129,7 +129,7 @@ class NavConfig:
     """The time limit is a truncation, at which learners bootstrap; else it looks like any other end."""
     solver_iterations: int = 10
     """Newton iterations of the constraint solver per physics step."""
-    contact_time_constant_s: float = 0.04
+    contact_time_constant_s: float = 0.05
     """Time constant of contacts (MuJoCo's solref); MuJoCo raises it to twice the timestep where it is less. This one
     lets 0.02 s stay within 10 % of a fine reference in pushes (docs/fidelity.md)."""
     cone: str = "pyramidal"

@@ -1,0 +1,165 @@
+"""What an environment step spends its time on, kernel by kernel, on a GPU: settings in, a table and JSON rows out.
+
+    python -m benchmarks.kernels --scenes scenes_mjcf/alder scenes_mjcf/birch --num-envs 8192
+
+Runs `AutoResetEnv.step` under JAX's profiler, which sees Warp's kernels too, and adds up the device time of each kernel.
+`busy` is the share of the time between the first and the last kernel in which at least one ran: the rest is launching.
+The kernels' row is appended to `benchmarks/results/kernels.jsonl`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import datetime
+import json
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.table import Table
+
+import interactive_nav
+from benchmarks.steps_per_second import _commit, _versions
+from interactive_nav.wrappers import AutoResetEnv
+
+PARTS = (
+    ("collision", r"broadphase|narrowphase|ccd|collision|contact_match|contact_sort|plane|nxn|sap_"),
+    ("constraint rows", r"efc|friction_dof|limit_|contact_init|jac_|equality|constraint\.|_constraint_"),
+    ("solver", r"solve|linesearch|cholesky|gradient|JTDAJ|update_constraint|mul_m|search|jaref|beta"),
+    ("rendering", r"render|megakernel|bvh|ray"),
+    ("smooth dynamics", r"smooth|kinematics|com_|crb|rne|cinert|passive|forward|euler|implicit|derivative|qfrc|actuat|"
+     r"next_|tendon|factor|camlight|sensor|cacc|cvel"),
+    ("copies", r"memcpy|memset|copy"),
+)  # fmt: skip
+"""Parts of a step by what their kernels are called; the first that fits. XLA's own fusions are the task's."""
+
+
+def part_of(kernel: str) -> str:
+    """The part of a step that a kernel belongs to, by its name."""
+    for part, pattern in PARTS:
+        if re.search(pattern, kernel, re.IGNORECASE):
+            return part
+    return "task, observation, window (XLA)"
+
+
+def plain_name(kernel: str) -> str:
+    """A kernel's name without Warp's hashes and XLA's numbers."""
+    name = re.sub(r"(_[0-9a-f]{8})+(_cuda_kernel_(forward|backward))?$", "", kernel)
+    return re.sub(r"[._]\d+$", "", name)
+
+
+def busy_share(spans: list[tuple[float, float]]) -> float:
+    """Share of the time from the first begin to the last end that intervals (begin, end) cover."""
+    if not spans:
+        return 0.0
+    spans = sorted(spans)
+    first = reached = spans[0][0]
+    covered = 0.0
+    for begin, end in spans:
+        covered += max(0.0, end - max(begin, reached))
+        reached = max(reached, end)
+    return covered / max(reached - first, 1e-12)
+
+
+def device_events(folder: Path) -> list[tuple[str, float, float]]:
+    """(name, begin, end) in ns of every kernel and copy on the first GPU in a profile.
+
+    Raises:
+        ValueError: the profile has no GPU in it.
+    """
+    found = []
+    for path in folder.rglob("*.xplane.pb"):
+        for plane in jax.profiler.ProfileData.from_file(str(path)).planes:
+            if "GPU:0" not in plane.name:
+                continue
+            for line in plane.lines:
+                if "Stream" not in line.name:
+                    continue  # summaries by module or operation, which would count twice
+                found += [(e.name, e.start_ns, e.start_ns + e.duration_ns) for e in line.events]
+    if not found:
+        raise ValueError(f"{folder}: no kernels of a GPU in the profile; it needs an NVIDIA GPU and CUPTI")
+    return found
+
+
+def profile(env: Any, num_envs: int, steps: int) -> dict[str, Any]:
+    """Device time of `steps` environment steps by kernel."""
+    batch = AutoResetEnv(env)
+
+    def advance(state, key):
+        def one(state, key):
+            action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
+            return batch.step(state, action), None
+
+        return jax.lax.scan(one, state, jax.random.split(key, steps))[0]
+
+    state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
+    program = jax.jit(advance)
+    for i in range(3):
+        state = jax.block_until_ready(program(state, jax.random.PRNGKey(i)))
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            jax.block_until_ready(program(state, jax.random.PRNGKey(9)))
+        events = device_events(Path(folder))
+    spent: dict[str, float] = collections.Counter()
+    launched: dict[str, int] = collections.Counter()
+    for name, begin, end in events:
+        spent[plain_name(name)] += end - begin
+        launched[plain_name(name)] += 1
+    total = sum(spent.values())
+    parts: dict[str, float] = collections.Counter()
+    for name, ns in spent.items():
+        parts[part_of(name)] += ns
+    return {
+        "num_envs": num_envs,
+        "steps": steps,
+        "device_ms_per_step": round(total / steps / 1e6, 3),
+        "launches_per_step": round(sum(launched.values()) / steps, 1),
+        "busy": round(busy_share([(begin, end) for _, begin, end in events]), 4),
+        "parts_ms": {k: round(v / steps / 1e6, 3) for k, v in sorted(parts.items(), key=lambda kv: -kv[1])},
+        "kernels": [
+            {"name": k, "part": part_of(k), "ms": round(v / steps / 1e6, 4), "launches": round(launched[k] / steps, 1)}
+            for k, v in sorted(spent.items(), key=lambda kv: -kv[1])[:60]
+        ],
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measures, prints and appends a row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
+    parser.add_argument("--robot", default="turtlebot")
+    parser.add_argument("--num-envs", type=int, default=8192)
+    parser.add_argument("--steps", type=int, default=4, help="environment steps under the profiler")
+    parser.add_argument("--set", nargs="*", default=[], metavar="key=value", help="environment settings")
+    parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
+    parser.add_argument("--out", default="benchmarks/results/kernels.jsonl")
+    args = parser.parse_args(argv)
+    settings = {k: json.loads(v) for k, v in (item.split("=", 1) for item in args.set)}
+    env = interactive_nav.make(args.robot, args.scenes, backend="warp", **settings)
+    row = {"robot": args.robot, "scenes": args.scenes, "settings": settings}
+    row |= profile(env, args.num_envs, args.steps)
+    row |= {
+        "device": jax.devices()[0].device_kind,
+        "versions": _versions(),
+        "commit": args.commit or _commit(),
+        "date": datetime.date.today().isoformat(),
+    }
+    with open(args.out, "a", encoding="utf-8") as out:
+        out.write(json.dumps(row) + "\n")
+    console = Console(width=120)
+    table = Table("kernel", "part", "ms a step", "launches a step", title=f"{row['device_ms_per_step']} ms a step")
+    for kernel in row["kernels"][:25]:
+        table.add_row(kernel["name"], kernel["part"], f"{kernel['ms']:.3f}", f"{kernel['launches']:.1f}")
+    console.print(table)
+    for part, ms in row["parts_ms"].items():
+        console.print(f"{part}: {ms:.3f} ms, {ms / row['device_ms_per_step']:.0%}")
+    console.print(f"GPU busy {row['busy']:.1%} of the time")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
