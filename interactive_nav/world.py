@@ -304,7 +304,7 @@ def build_empty_spec(
         _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
     _add_structure(spec, np.zeros((0, 10)), n_walls)
     _add_sensors(spec, robot, named, config)
-    _soften(spec, config)
+    _soften(spec, robot, config)
     model = spec.compile()
     return spec, model, _layout(model, robot, named)
 
@@ -333,13 +333,17 @@ def _build_spec(
             slots.append((name, kind))
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
     _add_sensors(spec, robot, slots, config)
-    _soften(spec, config)
+    _soften(spec, robot, config)
     return spec, slots
 
 
-def _soften(spec: mujoco.MjSpec, config: NavConfig) -> None:
+def _soften(spec: mujoco.MjSpec, robot: RobotSpec, config: NavConfig) -> None:
     for geom in spec.geoms:
         geom.solref = [config.contact_time_constant_s, 1.0]
+    if robot.contact_time_constant_s is not None:
+        for geom in spec.body(robot.base_body).find_all("geom"):
+            geom.solref = [robot.contact_time_constant_s, 1.0]
+            geom.solmix = 1e6  # a contact's is the mean of both geoms', weighted by this: the robot's holds
 
 
 def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:

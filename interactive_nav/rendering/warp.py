@@ -66,6 +66,9 @@ class WarpRenderer(Renderer):
         hidden = half[..., :1] < 0
         centre = jnp.where(hidden, jnp.asarray(_HIDDEN_W), centre)
         half = jnp.where(hidden, _HIDDEN_HALF_M, half)
+        order = jnp.argsort(morton_codes(centre[..., :2], hidden[..., 0]), axis=1)
+        centre, half = (jnp.take_along_axis(x, order[..., None], 1) for x in (centre, half))
+        axes = jnp.take_along_axis(axes, order[..., None, None], 1)
         floor = jnp.zeros((n, 1, 3))
         upright = jnp.broadcast_to(jnp.eye(3), (n, 1, 3, 3))
         # MuJoCo's cameras look along -z with x to the right.
@@ -91,7 +94,31 @@ class WarpRenderer(Renderer):
         geom = seg.reshape(*shape, 2)[..., 0]
         depth = depth.reshape(shape)
         met = (geom >= 0) & (depth > NEAR_M) & (depth < FAR_M)
+        # The floor keeps its place behind the boxes.
+        index = jnp.concatenate([order, jnp.full((n, 1), self._tables.num_boxes, order.dtype)], 1)
+        geom = jnp.take_along_axis(index, jnp.maximum(geom, 0).reshape(n, -1), 1).reshape(geom.shape)
         return jnp.where(met, depth, 0.0), jnp.where(met, geom, -1)
+
+
+def morton_codes(xy_m: jax.Array, hidden: jax.Array) -> jax.Array:
+    """Places on a Z-order curve, so that neighbours in its order are neighbours in the plane; hidden ones come last.
+
+    The renderer's tree of boxes keeps its shape, halves of halves of their order, and only its bounds follow
+    the boxes: it is as good as that order.
+
+    Args:
+        xy_m: [N, B, 2] centres.
+        hidden: [N, B] bool; these have no part in the curve's extent.
+
+    Returns:
+        [N, B] i32.
+    """
+    low = jnp.min(jnp.where(hidden[..., None], jnp.inf, xy_m), 1, keepdims=True)
+    high = jnp.max(jnp.where(hidden[..., None], -jnp.inf, xy_m), 1, keepdims=True)
+    cell = jnp.clip((xy_m - low) / jnp.maximum(high - low, 1e-6) * 1023.0, 0, 1023).astype(jnp.int32)
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        cell = (cell | (cell << shift)) & mask  # spreads the bits
+    return jnp.where(hidden, 1 << 30, cell[..., 0] | (cell[..., 1] << 1))
 
 
 class WarpColour:

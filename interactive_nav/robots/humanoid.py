@@ -344,5 +344,6 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
         control_modes=_MODES,
         control=gait_law(GAIT) if twist else None,
         control_every_substep=twist,
+        contact_time_constant_s=0.04,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

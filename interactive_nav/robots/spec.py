@@ -93,6 +93,8 @@ class RobotSpec:
     """Command to actuator controls; none: the command is the controls."""
     control_every_substep: bool = False
     """The control law runs at every physics step, not once a control period."""
+    contact_time_constant_s: float | None = None
+    """Of the robot's own contacts, where its gait needs a certain one; None: the environment's."""
     twist: TwistMap | None = None
     """None: scripted drivers cannot drive this mode."""
     kind: str = "wheeled"
