@@ -2,7 +2,9 @@
 
     python -m benchmarks.kernels --scenes scenes_mjcf/alder scenes_mjcf/birch --num-envs 8192
 
-Runs `AutoResetEnv.step` under JAX's profiler, which sees Warp's kernels too, and adds up the device time of each kernel.
+Runs `AutoResetEnv.step`, or parts of it, under JAX's profiler, which sees Warp's kernels too, and adds up the device
+time of each kernel. Two parts' difference is what lies between them: `--part simulation` less `observed` is drawing new
+episodes.
 `busy` is the share of the time between the first and the last kernel in which at least one ran: the rest is launching.
 The kernels' row is appended to `benchmarks/results/kernels.jsonl`.
 """
@@ -23,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 import interactive_nav
-from benchmarks.steps_per_second import _commit, _versions
+from benchmarks.steps_per_second import MODES, _commit, _versions, step_of
 from interactive_nav.wrappers import AutoResetEnv
 
 PARTS = (
@@ -85,14 +87,15 @@ def device_events(folder: Path) -> list[tuple[str, float, float]]:
     return found
 
 
-def profile(env: Any, num_envs: int, steps: int) -> dict[str, Any]:
-    """Device time of `steps` environment steps by kernel."""
+def profile(env: Any, num_envs: int, steps: int, part: str = "simulation") -> dict[str, Any]:
+    """Device time of `steps` environment steps by kernel; `part` as in `benchmarks.steps_per_second`."""
     batch = AutoResetEnv(env)
+    step = step_of(env, part, num_envs, batch)
 
     def advance(state, key):
         def one(state, key):
             action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
-            return batch.step(state, action), None
+            return step(state, action), None
 
         return jax.lax.scan(one, state, jax.random.split(key, steps))[0]
 
@@ -104,13 +107,13 @@ def profile(env: Any, num_envs: int, steps: int) -> dict[str, Any]:
         with jax.profiler.trace(folder):
             jax.block_until_ready(program(state, jax.random.PRNGKey(9)))
         events = device_events(Path(folder))
-    spent: dict[str, float] = collections.Counter()
+    spent: collections.defaultdict[str, float] = collections.defaultdict(float)
     launched: dict[str, int] = collections.Counter()
     for name, begin, end in events:
         spent[plain_name(name)] += end - begin
         launched[plain_name(name)] += 1
     total = sum(spent.values())
-    parts: dict[str, float] = collections.Counter()
+    parts: collections.defaultdict[str, float] = collections.defaultdict(float)
     for name, ns in spent.items():
         parts[part_of(name)] += ns
     return {
@@ -133,6 +136,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
     parser.add_argument("--robot", default="turtlebot")
     parser.add_argument("--num-envs", type=int, default=8192)
+    parser.add_argument("--part", choices=MODES[:-1], default="simulation")
     parser.add_argument("--steps", type=int, default=4, help="environment steps under the profiler")
     parser.add_argument("--set", nargs="*", default=[], metavar="key=value", help="environment settings")
     parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
@@ -140,8 +144,8 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     settings = {k: json.loads(v) for k, v in (item.split("=", 1) for item in args.set)}
     env = interactive_nav.make(args.robot, args.scenes, backend="warp", **settings)
-    row = {"robot": args.robot, "scenes": args.scenes, "settings": settings}
-    row |= profile(env, args.num_envs, args.steps)
+    row: dict[str, Any] = {"robot": args.robot, "scenes": args.scenes, "settings": settings, "part": args.part}
+    row |= profile(env, args.num_envs, args.steps, args.part)
     row |= {
         "device": jax.devices()[0].device_kind,
         "versions": _versions(),

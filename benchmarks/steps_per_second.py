@@ -110,6 +110,17 @@ def _without_reset(env, num_envs: int, observe: bool):
     return step
 
 
+def step_of(env: Any, part: str, num_envs: int, batch: Any = None) -> Any:
+    """State and actions to state, with parts left out: see `simulation`; `batch` is what resets itself."""
+    parts = {
+        "physics": _physics_only(env, num_envs),
+        "task": _without_reset(env, num_envs, observe=False),
+        "observed": _without_reset(env, num_envs, observe=True),
+        "simulation": (batch or AutoResetEnv(env)).step,
+    }
+    return parts[part]
+
+
 def simulation(
     robot: str,
     scenes: list[str],
@@ -129,13 +140,7 @@ def simulation(
     batch: Any = AutoResetEnv(env)
     if devices > 1:
         batch = ShardedEnv(batch, jax.devices()[:devices])
-    parts = {
-        "physics": _physics_only(env, num_envs),
-        "task": _without_reset(env, num_envs, observe=False),
-        "observed": _without_reset(env, num_envs, observe=True),
-        "simulation": batch.step,
-    }
-    step = parts[part]
+    step = step_of(env, part, num_envs, batch)
     chunk = 20
 
     def advance(state, key):

@@ -266,7 +266,8 @@ def step_targets(walk, stand, phase, command, base, xp):
         out[f"{side}_hip_x"] = -p.width * going - left * (
             p.sway * sway
             + swing * p.place_side * base.left
-            + stance * (p.roll * base.roll + p.roll_rate * base.roll_rate)
+            # On both feet this would push to and fro: the legs, the floor and the hips are one closed chain.
+            + going * stance * (p.roll * base.roll + p.roll_rate * base.roll_rate)
         )
         out[f"{side}_hip_z"] = left * p.turn * turn / (4.0 * p.frequency_hz) * xp.cos(phase + shift)
     out["abdomen_x"] = p.waist * sway + p.waist_roll * base.roll

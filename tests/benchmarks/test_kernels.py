@@ -14,7 +14,7 @@ def test_busy_is_what_the_intervals_cover():
 @pytest.mark.parametrize(
     ("kernel", "name", "part"),
     [
-        ("_nxn_broadphase__locals__kernel_079a3fb8_cuda_kernel_forward", "_nxn_broadphase__locals__kernel", "collision"),
+        ("_nxn_broadphase__kernel_079a3fb8_cuda_kernel_forward", "_nxn_broadphase__kernel", "collision"),
         ("_efc_contact_init__locals__kernel_3a7c064e_b7c9424", None, "constraint rows"),
         ("_update_gradient_JTDAJ_dense_tiled__locals__kernel_87ae7184", None, "solver"),
         ("build_megakernel__locals___render_megakernel_0638279c", None, "rendering"),

@@ -222,6 +222,27 @@ def test_mjx_walks_the_ant_alike(folder):
     np.testing.assert_allclose(jax_.qpos, native.qpos, atol=0.02)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_nudge_of_the_standing_humanoid_dies_out(axis, folder):
+    robot = get_robot("humanoid", "twist")
+    world = hall_world(robot, folder)
+    model = world.models[0]
+    data = mujoco.MjData(model)
+    data.qpos[:] = world.rest_qpos[0]
+    at, dof, way = world.layout.robot_qpos, world.layout.robot_qvel, []
+    data.qpos[at : at + 7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]
+    for k in range(400):
+        if k == 75:  # 0.05 rad/s of roll or pitch
+            data.qvel[dof + 3 + axis] += 0.05
+        state = RobotState(data.qpos[at : at + 24], data.qvel[dof : dof + 23], np.float64(0.02 * k))
+        data.ctrl[:] = robot.controls(np.zeros(2), state)
+        mujoco.mj_step(model, data)
+        way.append(data.qpos[at : at + 2].copy())
+    # It does not set out: less than 1 cm in 6.5 s, and still at the end.
+    assert np.linalg.norm(np.array(way[75:]) - way[74], axis=1).max() < 0.01
+    assert np.ptp(way[-50:], axis=0).max() < 1e-3
+
+
 def test_base_motion_by_hand():
     # Heading 90 degrees left, then leaning 0.1 rad forward: velocity along world y is forward.
     yaw, lean = math.pi / 2, 0.1
