@@ -240,7 +240,7 @@ def test_a_nudge_of_the_standing_humanoid_dies_out(axis, folder):
         way.append(data.qpos[at : at + 2].copy())
     # It does not set out: less than 1 cm in 6.5 s, and still at the end.
     assert np.linalg.norm(np.array(way[75:]) - way[74], axis=1).max() < 0.01
-    assert np.ptp(way[-50:], axis=0).max() < 1e-3
+    assert np.ptp(way[-50:], axis=0).max() < 2e-3
 
 
 def test_base_motion_by_hand():
