@@ -71,6 +71,7 @@ SWEEP = (
     *({"sim_dt_s": 0.02, "solver_iterations": n} for n in (2, 4, 6, 50)),
     {"sim_dt_s": 0.02, "cone": "elliptic"},
     {"sim_dt_s": 0.01, "cone": "elliptic"},
+    {"contact_time_constant_s": 0.04},
 )
 """Settings compared on `native`, beside the defaults."""
 

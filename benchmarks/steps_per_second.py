@@ -34,6 +34,7 @@ from interactive_nav.sharding import ShardedEnv
 from interactive_nav.wrappers import AutoResetEnv
 from train import config_io
 from train.run import train_run
+from train.run_folder import commit
 
 MODES = ("physics", "task", "observed", "simulation", "train")
 COUNTED = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
@@ -52,11 +53,8 @@ def _versions() -> dict[str, str]:
 
 
 def _commit() -> str:
-    try:
-        out = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return out.stdout.strip()
+    found = commit()
+    return "unknown" if found is None else found[:7] + ("+dirty" if found.endswith("+dirty") else "")
 
 
 @functools.lru_cache(maxsize=1)

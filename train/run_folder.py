@@ -181,12 +181,24 @@ def versions() -> dict[str, Any]:
         "cpu_count": os.cpu_count(),
         "matmul_precision": str(getattr(jax.config, "jax_default_matmul_precision", None) or "default"),
         "commit": commit(),
-        "argv": sys.argv,
+        "argv": command(),
     }
 
 
+def command() -> list[str]:
+    """What was run, without the folder that it lies in on this machine."""
+    program = Path(sys.argv[0])
+    module = program.parent.name if program.name == "__main__.py" else program.name
+    return [module, *sys.argv[1:]]
+
+
 def commit() -> str | None:
-    """The project's git commit, with `+dirty` if files differ from it; None outside a git checkout."""
+    """The project's git commit, with `+dirty` if files differ from it; None outside a git checkout.
+
+    The environment variable GIT_COMMIT says it for a copy of the files whose git knows another.
+    """
+    if os.environ.get("GIT_COMMIT"):
+        return os.environ["GIT_COMMIT"]
     root = Path(__file__).resolve().parents[1]
 
     def git(*words: str) -> str | None:

@@ -294,3 +294,17 @@ def test_failures_are_summed_over_logged_episodes(tmp_path):
     folder.metrics.write_text("".join(json.dumps(line) + "\n" for line in lines))
     # 4 x 0.25 + 2 x 1.5 = 4 and 2 x 2 = 4; what is 0 is left out.
     assert failures(folder) == {"overflow_steps": 4.0, "unconverged_steps": 4.0}
+
+
+def test_a_run_tells_its_command_without_the_machines_folders(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/somewhere/train/__main__.py", "--config", "demo"])
+    assert run_folder.command() == ["train", "--config", "demo"]
+    monkeypatch.setattr("sys.argv", ["/somewhere/my_sweep.py"])
+    assert run_folder.command() == ["my_sweep.py"]
+
+
+def test_the_environment_may_tell_the_commit(monkeypatch):
+    monkeypatch.setenv("GIT_COMMIT", "abc1234")
+    assert run_folder.commit() == "abc1234"
+    monkeypatch.delenv("GIT_COMMIT")
+    assert run_folder.commit() != "abc1234"
