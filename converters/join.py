@@ -45,6 +45,32 @@ class OpenBorder:
     """Of it, what other open border faces within `REACH_M`: a gap, and not the rim of what was scanned."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Edges:
+    """Undirected edges of a mesh."""
+
+    ends: np.ndarray
+    """(k, 2) vertices, the lower number first."""
+    count: np.ndarray
+    """(k,) faces of each."""
+    of_face: np.ndarray
+    """(m, 3) edge from each corner to the next."""
+
+
+def edges_of(faces: np.ndarray) -> Edges:
+    every = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    ends, inverse, count = np.unique(every, axis=0, return_inverse=True, return_counts=True)
+    return Edges(ends, count, inverse.reshape(-1, 3))
+
+
+def edge_pieces(edges: Edges) -> np.ndarray:
+    """(m,) number of the piece, connected over edges, that each face lies in."""
+    m, e = len(edges.of_face), len(edges.ends)
+    rows, columns = np.repeat(np.arange(m), 3), m + edges.of_face.ravel()
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(m + e, m + e))
+    return connected_components(graph, directed=False)[1][:m]
+
+
 def border_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Directed edges that only one face has.
 
@@ -168,7 +194,7 @@ def open_border(
     A crack is open border that other open border faces within the reach: border that is at least `FACING` times as far
     away along the border as it is straight across; and a hole that is no wider than the reach, whatever its shape. What
     is near without that is the border's own continuation, as where the outline of the scan goes on beside the end of a
-    patch.
+    patch; and what a narrow patch itself lies between is no gap.
 
     Args:
         vertices: (n, 3) m.
@@ -181,7 +207,13 @@ def open_border(
     spots, of = _points_on(vertices, edges, SPOT_M)
     whole = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     length = (whole / np.bincount(of, minlength=len(edges)))[of]
-    faced = _faced(vertices, edges, spots, of, plane[of] >= 0, reach_m)
+    a, b, tip = vertices[edges[:, 0]], vertices[edges[:, 1]], vertices[faces[owner].sum(axis=1) - edges.sum(axis=1)]
+    along = (b - a) / np.maximum(whole, 1e-12)[:, None]
+    inward = (tip - a) - ((tip - a) * along).sum(axis=1, keepdims=True) * along
+    piece = edge_pieces(edges_of(faces))
+    floating = ~np.isin(piece, piece[patch_plane < 0])[owner]
+    surface = np.where(floating, plane.max(initial=0) + 1 + piece[owner], plane)
+    faced = _faced(vertices, edges, spots, of, surface, inward, reach_m)
     result = {}
     for k in np.unique(patch_plane[patch_plane >= 0]):
         own = plane[of] == k
@@ -192,12 +224,28 @@ def open_border(
 
 
 def _faced(
-    vertices: np.ndarray, edges: np.ndarray, spots: np.ndarray, of: np.ndarray, asked: np.ndarray, reach_m: float
+    vertices: np.ndarray,
+    edges: np.ndarray,
+    spots: np.ndarray,
+    of: np.ndarray,
+    surface: np.ndarray,
+    inward: np.ndarray,
+    reach_m: float,
 ) -> np.ndarray:
-    """(n,) bool: which of the asked spots on border edges other border faces.
+    """(n,) bool: which spots on patches' border other border faces over a gap.
 
     The way along the border goes from spot to spot on an edge and over the vertices that edges share.
+
+    Args:
+        vertices: (v, 3) m.
+        edges: (k, 2) of the border.
+        spots: (n, 3) on them.
+        of: (n,) edge of each spot.
+        surface: (k,) plane of each edge's face, or number of its piece where that joins no scan; -1 for the scan's.
+        inward: (k, 3) from the edge into its face.
+        reach_m: how near.
     """
+    asked = surface[of] >= 0
     border = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(len(vertices),) * 2)
     hole = connected_components(border, directed=False)[1][edges[:, 0]][of]
     low, high = np.full((hole.max(initial=0) + 1, 3), np.inf), np.full((hole.max(initial=0) + 1, 3), -np.inf)
@@ -226,8 +274,10 @@ def _faced(
         for row, i in enumerate(block):
             there = here[tree.query_ball_point(spots[i], reach_m)]
             straight = np.linalg.norm(spots[there] - spots[i], axis=1)
+            # The other side of the same patch, with the patch between.
+            own = (surface[of[there]] == surface[of[i]]) & ((spots[there] - spots[i]) @ inward[of[i]] > 0)
             # To the spots' spacing: what is nearer than that along the border is the spot's own neighbourhood.
-            result[i] = (along_m[row, number[there]] > FACING * straight + 2 * SPOT_M).any()
+            result[i] = (along_m[row, number[there]] > FACING * straight + 2 * SPOT_M)[~own].any()
     return result
 
 

@@ -8,15 +8,11 @@ shape: after it no edge of the loop is open.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from converters.cut import face_areas
-from converters.join import FACING, REACH_M, SAME_M
+from converters.join import FACING, REACH_M, SAME_M, edge_pieces, edges_of
 
 HOLE_M2 = 0.3
 """Holes up to this size that patches surround are closed, as are those inside the seen floor (`converters.holes`)."""
@@ -29,24 +25,6 @@ FLAT_M2 = 1e-2
 """What a triangle without area costs."""
 LONG = 1e-4
 """Share of the squared lengths of the inner edges in the cost: of triangulations of equal area that of short edges."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Edges:
-    """Undirected edges of a mesh."""
-
-    ends: np.ndarray
-    """(k, 2) vertices, the lower number first."""
-    count: np.ndarray
-    """(k,) faces of each."""
-    of_face: np.ndarray
-    """(m, 3) edge from each corner to the next."""
-
-
-def _edges(faces: np.ndarray) -> _Edges:
-    every = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-    ends, inverse, count = np.unique(every, axis=0, return_inverse=True, return_counts=True)
-    return _Edges(ends, count, inverse.reshape(-1, 3))
 
 
 def without_flaps(faces: np.ndarray, may_go: np.ndarray) -> np.ndarray:
@@ -62,7 +40,7 @@ def without_flaps(faces: np.ndarray, may_go: np.ndarray) -> np.ndarray:
     keep = np.ones(len(faces), bool)
     while True:
         index = np.flatnonzero(keep)
-        edges = _edges(faces[index])
+        edges = edges_of(faces[index])
         count = edges.count[edges.of_face]
         found = np.flatnonzero((count % 2 == 1).all(axis=1) & (count == 1).any(axis=1) & may_go[index])
         touched: set[int] = set()
@@ -88,8 +66,8 @@ def without_dust(vertices: np.ndarray, faces: np.ndarray, patch_plane: np.ndarra
     Returns:
         keep (m,) bool.
     """
-    edges = _edges(faces)
-    piece = _pieces(edges)
+    edges = edges_of(faces)
+    piece = edge_pieces(edges)
     length = np.linalg.norm(vertices[edges.ends[:, 0]] - vertices[edges.ends[:, 1]], axis=1) * (edges.count % 2)
     around = np.bincount(piece, length[edges.of_face].sum(axis=1))
     size = np.bincount(piece, face_areas(vertices, faces))
@@ -100,7 +78,7 @@ def without_dust(vertices: np.ndarray, faces: np.ndarray, patch_plane: np.ndarra
 
 def border_loops(faces: np.ndarray) -> list[np.ndarray]:
     """Simple closed loops of edges with an odd number of faces, each as its vertices (k,) in order."""
-    edges = _edges(faces)
+    edges = edges_of(faces)
     around: dict[int, list[int]] = {}
     for a, b in edges.ends[edges.count % 2 == 1].tolist():
         around.setdefault(a, []).append(b)
@@ -176,13 +154,13 @@ def close_loops(
     Returns:
         faces (m', 3), the given face (m',) that each is or is part of, -1 for new ones, plane (m',).
     """
-    edges = _edges(faces)
+    edges = edges_of(faces)
     key = {(int(a), int(b)): k for k, (a, b) in enumerate(edges.ends)}
     first = np.full(len(edges.ends), -1)
     first[edges.of_face[::-1].ravel()] = np.repeat(np.arange(len(faces))[::-1], 3)
     plane_at = np.full(len(edges.ends), -1)
     np.maximum.at(plane_at, edges.of_face.ravel(), np.repeat(patch_plane, 3))
-    piece = _pieces(edges)
+    piece = edge_pieces(edges)
     own_outline = set(np.unique(piece[~np.isin(piece, piece[patch_plane < 0])]).tolist())
     new: list[np.ndarray] = []
     new_plane: list[int] = []
@@ -268,14 +246,6 @@ def _runs(face: np.ndarray, a: int, b: int) -> bool:
     return (a, b) in zip(corners, [*corners[1:], corners[0]], strict=True)
 
 
-def _pieces(edges: _Edges) -> np.ndarray:
-    """(m,) number of the piece, connected over edges, that each face lies in."""
-    m, e = len(edges.of_face), len(edges.ends)
-    rows, columns = np.repeat(np.arange(m), 3), m + edges.of_face.ravel()
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(m + e, m + e))
-    return connected_components(graph, directed=False)[1][:m]
-
-
 def _flip_flat(
     vertices: np.ndarray, faces: np.ndarray, source: np.ndarray, plane: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -287,7 +257,7 @@ def _flip_flat(
         flat = np.flatnonzero((source < 0) & (height < SAME_M))
         if len(flat) == 0:
             break
-        edges = _edges(faces)
+        edges = edges_of(faces)
         keep = np.ones(len(faces), bool)
         added: list[tuple[list[int], int, int]] = []
         done: set[int] = set()

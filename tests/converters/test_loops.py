@@ -165,3 +165,17 @@ def test_a_hole_smaller_than_the_reach_is_a_crack_whatever_its_shape():
         found = open_border(vertices, faces, np.repeat([-1, 0], [24, 24]), 0.1)[0]
         assert found.open_m == pytest.approx(48 * radius * np.sin(np.pi / 24))
         assert (found.crack_m == pytest.approx(found.open_m)) == crack and (found.crack_m == 0) != crack
+
+
+def test_the_two_sides_of_a_narrow_patch_are_no_crack():
+    """A strip of 0.08 m beside a slit of the same width: the slit counts, on the strip's side, not the strip."""
+    vertices, faces = sheet(0.08, 1.6)
+    middle = vertices[faces].mean(axis=1)
+    keep = (middle[:, 1] < 0.4) | (middle[:, 1] > 0.48) & (middle[:, 1] < 0.56)
+    faces, middle = faces[keep], middle[keep]
+    plane = np.where(middle[:, 1] > 0.48, 0, -1)
+    found = open_border(vertices, faces, plane)[0]
+    assert found.open_m == pytest.approx(2 * (1.6 + 0.08))
+    # Its far side is 0.16 m from the scan; of its ends what is nearer than the reach.
+    assert found.crack_m == pytest.approx(1.6 + 2 * 0.02, abs=0.011)
+    assert open_border(vertices, faces[plane == 0], plane[plane == 0])[0].crack_m == 0.0
