@@ -21,11 +21,13 @@ from shapely.geometry.base import BaseGeometry
 
 from converters.cut import face_areas, face_labels
 from converters.join import SAME_M, border_edges, close_cracks, cut_teeth, on_segments, split_at
+from converters.loops import close_loops, without_dust, without_flaps
 from converters.raw import CEILING, FLOOR, STRUCTURE_LABELS
 
 WALL_TOLERANCE_M = 0.04
 """Reconstructed walls wave by this much about their plane."""
 RANSAC_DRAWS = 150
+REFINED = 10
 MIN_WALL_M2 = 0.5
 MAX_WALLS = 60
 BESIDE_M = 0.10
@@ -74,7 +76,8 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
 
     A draw is one upright face: its middle and the horizontal direction of its normal are a hypothesis; its
     support is the area of the faces within `WALL_TOLERANCE_M` whose normals agree within 25 degrees. The best
-    of `RANSAC_DRAWS` is refined by least squares over its support, which is then taken out. A plane's normal looks
+    of `RANSAC_DRAWS` is refined by least squares over its support, and over the support of that while it grows (Chum,
+    Matas and Kittler 2003, Locally optimized RANSAC), which is then taken out. A plane's normal looks
     to the side that its faces look to: the room, as scans are made from inside.
 
     Args:
@@ -106,12 +109,19 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
                 best, best_support = index[agree], support
         if best is None or best_support < MIN_WALL_M2:
             break
-        weight = area[best] / area[best].sum()
-        centre = weight @ middle[best, :2]
-        spread = (middle[best, :2] - centre).T @ ((middle[best, :2] - centre) * weight[:, None])
-        x, y = np.linalg.eigh(spread)[1][:, 1]
-        if np.array([y, -x]) @ (weight @ flat[best]) < 0:  # the normal looks to where the scan's faces look
-            x, y = -x, -y
+        # A face's normal is a poor direction for a long wall: the support of the plane through the support, and again.
+        for _ in range(REFINED):
+            weight = area[best] / area[best].sum()
+            centre = weight @ middle[best, :2]
+            spread = (middle[best, :2] - centre).T @ ((middle[best, :2] - centre) * weight[:, None])
+            x, y = np.linalg.eigh(spread)[1][:, 1]
+            if np.array([y, -x]) @ (weight @ flat[best]) < 0:  # the normal looks to where the scan's faces look
+                x, y = -x, -y
+            near = np.abs((middle[index, :2] - centre) @ [y, -x]) < WALL_TOLERANCE_M
+            again = index[near & (flat[index] @ [y, -x] > 0.9)]
+            if area[again].sum() < best_support * (1 + 1e-6):
+                break
+            best, best_support = again, float(area[again].sum())
         planes.append(Plane(np.array([*centre, 0.0]), np.array([x, y, 0.0]), np.array([0.0, 0.0, 1.0])))
         left[best] = False
     return planes
@@ -231,12 +241,14 @@ def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plan
     joined, all_faces, cut = cut_teeth(joined, np.vstack([split, corners_of]), plane_of)
     plane_of, source = plane_of[cut], source[cut]
     more, more_plane = close_cracks(joined, all_faces, plane_of)
-    return Filled(
-        joined,
-        np.vstack([all_faces, more]),
-        np.concatenate([source, np.full(len(more), -1)]),
-        np.concatenate([plane_of, more_plane]),
-    )
+    all_faces, plane_of = np.vstack([all_faces, more]), np.concatenate([plane_of, more_plane])
+    source = np.concatenate([source, np.full(len(more), -1)])
+    keep = without_flaps(all_faces, plane_of >= 0)
+    all_faces, plane_of, source = all_faces[keep], plane_of[keep], source[keep]
+    keep = without_dust(joined, all_faces, plane_of)
+    all_faces, plane_of, source = all_faces[keep], plane_of[keep], source[keep]
+    all_faces, given, plane_of = close_loops(joined, all_faces, plane_of)
+    return Filled(joined, all_faces, np.where(given >= 0, source[given], -1), plane_of)
 
 
 def _merged(spots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from shapely.geometry.base import BaseGeometry
 
 from converters.alignment import yaw_matrix
 from converters.fill import (
+    BESIDE_M,
     WALL_TOLERANCE_M,
     Filled,
     Plane,
@@ -51,6 +52,8 @@ BEHIND_M = 0.25
 """So far behind a wall no floor is filled."""
 CORNER_M = 0.15
 """Two walls that end this near to their common line meet in it."""
+SAME_WALL = 0.9
+"""Least cosine between the normals of two planes of one bent wall."""
 SEEN_BORDER_SHARE = 0.35
 """Least share of a wall patch's border (its foot apart) that runs along seen wall: else it may be an opening."""
 
@@ -215,8 +218,8 @@ def wall_extent(corners: np.ndarray, ends: tuple[float, float]) -> BaseGeometry:
     return shapely.union_all(boxes, grid_size=1e-9)
 
 
-def floor_sides(plane: Plane, region: BaseGeometry, extent: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
-    """Floor in front of the wall patches that stand on it, and what lies behind the wall, world x, y.
+def floor_sides(plane: Plane, region: BaseGeometry, extent: BaseGeometry) -> tuple[BaseGeometry, ...]:
+    """Floor in front of the wall patches that stand on it, what lies behind the wall, and before it, world x, y.
 
     Args:
         plane: of the wall; its normal looks into the room.
@@ -224,10 +227,10 @@ def floor_sides(plane: Plane, region: BaseGeometry, extent: BaseGeometry) -> tup
         extent: of the wall, the same.
 
     Returns:
-        Strip to add to the floor's region, strip to take out of it.
+        Strip to add to the floor's region, strip to take out of it, strip that no other wall may take out of it.
     """
     strips = []
-    for geometry, direction, width in ((region, 1.0, SKIRT_M), (extent, -1.0, BEHIND_M)):
+    for geometry, direction, width in ((region, 1.0, SKIRT_M), (extent, -1.0, BEHIND_M), (extent, 1.0, BEHIND_M)):
         strips.append([])
         for piece in polygons_of(geometry):
             foot = piece.intersection(shapely.box(piece.bounds[0], LIFT_M - 1e-6, piece.bounds[2], LIFT_M + 1e-6))
@@ -238,8 +241,7 @@ def floor_sides(plane: Plane, region: BaseGeometry, extent: BaseGeometry) -> tup
                 ends = [plane.lift(np.array([[u, LIFT_M]]))[0, :2] for u in (left, right)]
                 off = direction * width * plane.normal[:2]
                 strips[-1].append(shapely.make_valid(Polygon([ends[0], ends[1], ends[1] + off, ends[0] + off])))
-    add, cut = (shapely.union_all(s) if s else Polygon() for s in strips)
-    return add, cut
+    return tuple(shapely.union_all(s) if s else Polygon() for s in strips)
 
 
 def hidden_surfaces(
@@ -265,18 +267,35 @@ def hidden_surfaces(
     shown = [s for s in shown if len(s[1])]
     ends = wall_ends(planes, [(float(c[..., 0].min()), float(c[..., 0].max())) for _, c in shown])
     walls: list[tuple[Plane, BaseGeometry, float]] = []
-    front, behind = [], []
+    front, behind, before = [], [], []
     for plane, (seen, corners), end in zip(planes, shown, ends, strict=True):
         extent = wall_extent(corners, end)
         region = wall_region(plan, plane, seen, extent, end, objects)
-        add, cut = floor_sides(plane, region, extent)
-        front.append(add)
-        behind.append(cut)
+        for strips, strip in zip((front, behind, before), floor_sides(plane, region, extent), strict=True):
+            strips.append(strip)
+        for other, built, _ in walls:  # of one bent wall two planes may be found
+            region = region.difference(_beside(plane, other, built))
         if not region.is_empty:
             walls.append((plane, region, WALL_TOLERANCE_M))
     if walls:
-        floor = floor.union(shapely.union_all(front)).difference(shapely.union_all(behind))
+        # The other face of a thin wall has its own floor before it.
+        inside = shapely.union_all(behind).difference(shapely.union_all(before))
+        floor = floor.union(shapely.union_all(front)).difference(inside)
     return [(ground, floor, FLOOR_TOLERANCE_M), *walls]
+
+
+def _beside(plane: Plane, other: Plane, region: BaseGeometry) -> BaseGeometry:
+    """The part of another wall's region that stands in a plane's place, in its coordinates."""
+    if float(plane.normal @ other.normal) < SAME_WALL:
+        return Polygon()
+    moved = shapely.transform(region, lambda flat: plane.flatten(other.lift(flat)))
+    low, bottom, high, top = moved.bounds if not moved.is_empty else (0.0,) * 4
+    # Both are upright: the distance is linear along the wall.
+    along = np.linspace(low, high, 200)
+    near = np.abs(other.distance(plane.lift(np.stack([along, np.zeros_like(along)], axis=1)))) < BESIDE_M
+    if not near.any():
+        return Polygon()
+    return shapely.make_valid(moved).intersection(shapely.box(along[near][0], bottom, along[near][-1], top))
 
 
 def _seen(vertices: np.ndarray, faces: np.ndarray, plane: Plane, tolerance_m: float) -> tuple[BaseGeometry, np.ndarray]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from converters.errors import SceneRejected
@@ -194,3 +196,45 @@ def test_furniture_outside_is_left_out(released):
     assert any("outside the scan; it is left out" in w for w in raw.warnings)
     with pytest.raises(SceneRejected, match="--strict"):
         read_interactive_gibson(released, strict=True)
+
+
+@pytest.mark.data
+def test_original_objects_in_a_released_building(released, original, sample_data, tmp_path, hull_cache):
+    """Files of the release itself: URDFs of four of its small objects, with their collision meshes, as furniture."""
+    masses = {"2eZY2JqYPQE": 0.28980, "lGzQi2Pk5uC": 0.06756, "nPBvPYCdYgU": 0.69224, "RcqC01G24pR": 0.15587}
+    source = sample_data / "interactive_gibson_objects"
+    for path in source.iterdir():
+        shutil.copy(path, released / path.name)
+    taken = np.vstack([placed_vertices(original, a)[:, :2] for a in original.annotations])
+    low, high = original.scan.vertices[:, :2].min(axis=0), original.scan.vertices[:, :2].max(axis=0)
+    spots = [
+        np.array((x, y)) for x in np.arange(low[0] + 0.5, high[0] - 0.4, 0.5) for y in (low[1] + 0.5, high[1] - 0.5)
+    ]
+    free = [s for s in spots if np.linalg.norm(taken - s, axis=1).min() > 0.5][:4]
+    assert len(free) == 4 and original.floor_height_m is not None
+    placed = {}
+    for k, (name, spot) in enumerate(zip(masses, free, strict=True), start=5):
+        (released / f"object_{name}.urdf").rename(released / f"alignment_centered_{k}_02747177.urdf")
+        mesh = trimesh.load(released / f"model_{name}.obj", force="mesh")
+        assert isinstance(mesh, trimesh.Trimesh)
+        position = np.array([*spot, original.floor_height_m - mesh.bounds[0, 2]])
+        (released / f"pos_{k}_02747177.txt").write_text(" ".join(map(str, position)))
+        placed[f"{k}_02747177"] = (masses[name], position)
+    assert detect_format(released) == "interactive-gibson"
+    raw = read_interactive_gibson(released)
+    assert {k: raw.cads[k].mass_kg for k in placed} == {k: pytest.approx(m, abs=1e-5) for k, (m, _) in placed.items()}
+    converted = convert(released, tmp_path / "room", SMALL, cache=hull_cache)
+    assert {g.name for g in converted.gates if not g.passed} == set()
+    manifest = load_manifest(tmp_path / "room")
+    assert [o.category for o in manifest.objects] == ["table"] + ["basket"] * 5
+    assert set(placed) <= set(manifest.collision["from_source"])
+    assert sum("names the texture" in w for w in manifest.warnings) == 4
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "room" / "scene.xml"))
+    for item, row in zip(manifest.objects, manifest.alignment, strict=True):
+        if item.cad_id not in placed:
+            continue
+        mass, _ = placed[item.cad_id]
+        assert item.mass_kg == pytest.approx(mass, abs=1e-4) and item.friction == 1.0
+        assert row["settle_shift_m"] < 0.02 and abs(row["settle_drop_m"]) < 0.02
+        # The URDF's placeholder is 1 kg m2; nothing of this mass within 0.2 m of its middle has more than this.
+        assert model.body(item.name).inertia.max() < mass * 0.2**2

@@ -80,6 +80,58 @@ def test_chairs_that_touch_are_told_apart(places):
     assert sum(len(p.points) for p in found) > 1000 and len({id(p.points) for p in found}) == len(found)
 
 
+def table(length: float, depth: float, x: float, y: float, high: float = 0.74) -> trimesh.Trimesh:
+    """A top on four legs."""
+    parts = [box((length, depth, 0.04), (0, 0, high - 0.02))]
+    legs = [(i * (length / 2 - 0.05), j * (depth / 2 - 0.05)) for i in (-1, 1) for j in (-1, 1)]
+    parts += [box((0.06, 0.06, high - 0.04), (i, j, high / 2 - 0.02)) for i, j in legs]
+    mesh = trimesh.util.concatenate(parts)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh.apply_translation((x, y, 0))
+
+
+FLOOR = box((3.4, 3.0, 0.001), (0.8, 0.8, 0)), 2
+TABLES = {
+    "an L": [(1.6, 0.8, 0, 0), (0.8, 1.2, 0.4, 1.0)],
+    "a T": [(1.6, 0.8, 0, 0), (0.8, 1.4, 0, 1.1)],
+    "side by side, moved along": [(1.6, 0.8, 0, 0), (1.6, 0.8, 0.5, 0.8)],
+    "end to end, one narrower": [(1.6, 0.9, 0, 0), (1.2, 0.6, 1.4, 0.15)],
+    "end to end": [(1.6, 0.8, 0, 0), (1.6, 0.8, 1.6, 0)],
+    "three in a row": [(1.4, 0.8, 0, 0), (1.4, 0.8, 1.4, 0), (1.4, 0.8, 2.8, 0)],
+    "side by side": [(1.8, 0.8, 0, 0), (1.8, 0.8, 0, 0.8)],
+    "one lower": [(1.4, 0.8, 0, 0), (1.0, 0.6, 1.2, 0, 0.45)],
+}
+
+
+@pytest.mark.parametrize(("name", "yaw", "floor"), [*((n, 0.4, True) for n in TABLES), ("an L", 0.0, False)])
+def test_tables_that_touch_are_told_apart(name, yaw, floor):
+    turn = trimesh.transformations.rotation_matrix(yaw, (0, 0, 1))
+    tables = [table(*sizes).apply_transform(turn) for sizes in TABLES[name]]
+    ground = [(FLOOR[0].copy().apply_transform(turn), FLOOR[1])] if floor else []
+    found = propose_instances(scan_of(*((t, 7) for t in tables), *ground))
+    assert [p.category for p in found] == ["table"] * len(tables)
+    for one in tables:
+        truth = bounds(np.asarray(one.vertices))
+        assert max(box_iou(truth, bounds(p.points)) for p in found) > 0.95
+
+
+@pytest.mark.parametrize("yaw", [0.4])
+def test_one_table_or_desk_is_not_parted(yaw):
+    """A long one, a round one, one with a tray on it, a corner desk, a desk with a shelf; an L half hidden."""
+    round_top = trimesh.creation.cylinder(0.7, 0.04).apply_translation((6, 0, 0.72)), 7
+    tray = table(1.2, 0.8, 12, 0), box((0.4, 0.3, 0.1), (12, 0, 0.79))
+    corner = box((1.6, 0.7, 0.05), (18, 0, 0.72)), box((0.7, 1.0, 0.05), (17.55, 0.85, 0.72))
+    shelf = box((1.2, 0.6, 0.05), (24, 0, 0.72)), box((1.2, 0.25, 0.3), (24, 0.17, 1.0))
+    parts = [(table(2.4, 0.9, 0, 0), 7), round_top, *((m, 7) for m in tray), *((m, 14) for m in (*corner, *shelf))]
+    # A top of 1.6 x 1.4 m, a corner of which something hides: no floor is seen there, only around.
+    hidden = box((1.6, 0.7, 0.05), (30, -0.35, 0.72)), box((0.9, 0.7, 0.05), (29.65, 0.35, 0.72))
+    around = [box((4, 0.5, 0.001), (30, y, 0)) for y in (-1.2, 1.2)] + [box((0.8, 2, 0.001), (31.4, 0, 0))]
+    parts += [(m, 7) for m in hidden] + [(m, 2) for m in around]
+    turn = trimesh.transformations.rotation_matrix(yaw, (0, 0, 1))
+    found = propose_instances(scan_of(*((m.apply_transform(turn), label) for m, label in parts)))
+    assert sorted(p.category for p in found) == ["desk"] * 2 + ["table"] * 4
+
+
 def test_one_thing_is_not_parted():
     """An L of a sofa, a long table on a leg at one end, a door, a swivel chair on its star of legs."""
     corner = (box((2.2, 0.9, 0.8), (0, 0, 0.4)), 6), (box((0.9, 1.0, 0.8), (0.65, 0.95, 0.4)), 6)

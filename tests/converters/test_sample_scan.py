@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.cracks import fill, measure
 from converters.gates import check_folder
+from converters.join import border_edges
 from converters.pipeline import ConvertConfig, convert
 from converters.proposals import bounds, box_iou, propose_instances
 from converters.propose import annotated_vertices
@@ -49,12 +50,19 @@ def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_
 
 
 def test_the_patches_of_the_real_room_join_it(sample_data, hull_cache):
-    """Before the borders were zipped 28.0 m of 102 m of border ran within 10 cm of other border, 12.3 m within 2 cm."""
-    narrow, wide = measure(fill(sample_data / "scan2cad_scene0470_00", hull_cache))
+    """Before the borders were joined 9 m of the floor's border and 25 m of the walls' were open.
+
+    What is open now is the rim of two wall patches at the top of the scan.
+    """
+    filled = fill(sample_data / "scan2cad_scene0470_00", hull_cache)
+    narrow, wide = measure(filled)
     assert len(narrow) >= 5 and sum(b.border_m for b in narrow.values()) > 80
-    assert narrow[0].border_m > 35 and narrow[0].open_m < 2.5  # the floor; it was 9.0 m
-    assert sum(b.crack_m for b in narrow.values()) < 1.0
-    assert sum(b.crack_m for b in wide.values()) < 3.0
+    assert narrow[0].border_m > 35 and narrow[0].open_m == 0.0  # the floor
+    assert sum(b.open_m for b in narrow.values()) < 0.5
+    assert [b.crack_m for b in (*narrow.values(), *wide.values())] == [0.0] * (2 * len(narrow))
+    edges, owner = border_edges(filled.faces)
+    ends = filled.vertices[edges[filled.patch_plane[owner] >= 0]]
+    assert ends[..., 2].min() > 1.0  # the scan's walls end between 1.0 and 1.3 m
 
 
 @pytest.mark.parametrize("voxel_m", [0.03, 0.05, 0.08])
