@@ -115,9 +115,10 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
     from topological_nav.ros.simulator import Simulator
 
     with launch.some_master(ros, arguments.port), _ended(ros):
-        simulator = Simulator(arguments.scene, config)
-        pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.recorded)
-        tally = SimulatorNode(ros, simulator, pace, _tell).run(lambda: bool(stops))
+        with contextlib.redirect_stdout(sys.stderr):  # Warp tells of its kernels there
+            simulator = Simulator(arguments.scene, config)
+            pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.recorded)
+            tally = SimulatorNode(ros, simulator, pace, _tell).run(lambda: bool(stops))
         print(json.dumps(tally.row()), flush=True)
 
 

@@ -5,13 +5,14 @@ import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.toys import write_room
-from topological_nav.ros import messages, topics
+from topological_nav.ros import debian, messages, topics
 from topological_nav.ros.__main__ import main
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 from topological_nav.settings import overridden
@@ -54,9 +55,7 @@ def episode(tmp_path_factory):
     return SimpleNamespace(tally=json.loads(ran.stdout.splitlines()[0]), read=read, kinds=kinds, said=ran.stdout)
 
 
-pytestmark = pytest.mark.slow
-
-
+@pytest.mark.slow
 def test_all_topics_are_in_the_bag_with_as_many_messages_as_steps(episode):
     assert episode.kinds == topics.TOPICS
     counts = {topic: len(rows) for topic, rows in episode.read.items()}
@@ -69,6 +68,7 @@ def test_all_topics_are_in_the_bag_with_as_many_messages_as_steps(episode):
     assert f"{sum(counts.values())} messages" in episode.said
 
 
+@pytest.mark.slow
 def test_the_robot_went_where_the_commands_said(episode):
     tally = episode.tally
     assert tally["done"] and tally["structure_s"] == 0 and tally["movable_s"] == 0
@@ -84,6 +84,7 @@ def test_the_robot_went_where_the_commands_said(episode):
     assert messages.quat_yaw(imu.orientation) == pytest.approx(yaw, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_every_command_follows_from_the_heading_of_its_picture(episode):
     headings = [messages.quat_yaw(m.orientation) for _, m in episode.read[topics.HEADING]]
     commands = [messages.twist_command(m) for _, m in episode.read[topics.COMMAND]][: len(headings)]
@@ -92,12 +93,12 @@ def test_every_command_follows_from_the_heading_of_its_picture(episode):
     assert len(turned) > 5 and sum(v == 0.5 for v, _ in commands) == 20
 
 
+@pytest.mark.slow
 def test_pictures_scans_and_clock_hold_what_was_sensed(episode):
     read = episode.read
     pictures = [messages.image_array(m) for _, m in read[topics.IMAGE]]
     assert pictures[0].shape == (48, 64, 3) and pictures[0].std() > 5
     assert np.abs(pictures[-1].astype(float) - pictures[0]).mean() > 2
-    # ROS 1 and rosbags differ in how they write the names of CameraInfo's matrices.
     _, info = read[topics.INFO][0]
     assert messages.info_lens(info).fov_deg == pytest.approx(120.0)
     # At the end the robot looks along x: the beam ahead meets the wall at x = 3, or is out of range.
@@ -132,6 +133,13 @@ def test_mistakes_are_one_line(words, told, capsys, monkeypatch):
     assert main(words) == 2
     error = capsys.readouterr().err
     assert error.startswith("topological_nav.ros: ") and told in error and error.count("\n") == 1
+
+
+def test_ci_installs_the_packages_that_are_asked_for():
+    script = Path(__file__).parents[3] / ".ci" / "run"
+    if not script.is_file():
+        pytest.skip("no .ci/run here (an installed copy)")
+    assert " ".join(debian.PACKAGES.split()) in " ".join(script.read_text().replace("\\\n", " ").split())
 
 
 def test_settings_of_simulator_and_driver_have_different_names():

@@ -92,9 +92,10 @@ class Robot:
 
     def sense(self):
         x, y, yaw = self.pose
+        truth_w = np.array([-y, x, yaw + math.pi / 2])
         return Sensed(
             0.1 * self.steps, np.full((6, 8, 3), self.steps % 256, np.uint8), np.ones(4, np.float32), self.pose.copy(),
-            np.zeros(3), np.zeros(3), yaw + math.pi / 2, x > 0.5, False, 0.0, np.array([-y, x, yaw + math.pi / 2]),
+            np.zeros(3), np.zeros(3), yaw + math.pi / 2, bool(x > 0.5), False, 0.0, truth_w,
         )  # fmt: skip
 
 
