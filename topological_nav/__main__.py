@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from scenes_mjcf.schema import SceneError
 from topological_nav.adapt_config import AdaptConfig
-from topological_nav.config import DataConfig, MapConfig, passage_config, room_config
+from topological_nav.config import PITCHES, DataConfig, MapConfig, passage_config, room_config
 from topological_nav.errors import SettingsError, TopologicalError
 from topological_nav.settings import overridden, settings_help
 from train.errors import TrainError
@@ -189,8 +189,10 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig) -> None:
         results = adapt_features(*places, config, lambda line: print(line, flush=True), lambda: bool(stops))
         if results is None:
             raise Stopped(stops[0])
-    images = [rooms.images[:, 1, 0] for rooms in (load_rooms(arguments.target), target_rooms(arguments.target, config))]
-    save(features_figure(*images, read_metrics(out / "metrics.jsonl"), results), out / "adaptation.png")
+    rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
+    level = PITCHES.index("level")
+    figure = features_figure(rendered[:, level, 0], seen[:, level, 0], read_metrics(out / "metrics.jsonl"), results)
+    save(figure, out / "adaptation.png")
     for name in ("source", "before", "statistics", "after"):
         mean = results[name]["mean"]
         print(

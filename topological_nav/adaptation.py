@@ -8,6 +8,7 @@ source's extractor stays as it is. No label and no position of a target image is
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import time
 from collections.abc import Callable
@@ -120,16 +121,14 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
 
     def critic_loss(weights, source, target):
         logits: Any = [critic.apply({"params": weights}, x) for x in (source, target)]
-        losses = [
-            optax.sigmoid_binary_cross_entropy(x, jnp.float32(y)).mean() for x, y in zip(logits, (1, 0), strict=True)
-        ]
-        right = jnp.stack([(logits[0] > 0).mean(), (logits[1] <= 0).mean()]).mean()
-        return (losses[0] + losses[1]) / 2, right
+        # log(1 + e^-x) for the source, log(1 + e^x) for the target.
+        loss = (nn.softplus(-logits[0]).mean() + nn.softplus(logits[1]).mean()) / 2
+        return loss, ((logits[0] > 0).mean() + (logits[1] <= 0).mean()) / 2
 
     def extractor_loss(params, stats, weights, x):
         target, new = embed_training(network, {"params": params, "batch_stats": stats}, x)
-        logits = critic.apply({"params": weights}, target)
-        return optax.sigmoid_binary_cross_entropy(logits, jnp.float32(1)).mean(), (new, target)  # type: ignore[arg-type]
+        logits: Any = critic.apply({"params": weights}, target)
+        return nn.softplus(-logits).mean(), new
 
     def update(state: Adapting, images, source, step):
         rows, key = step
@@ -140,7 +139,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
         change, critic_opt = critic_tx.update(slope, state.critic_opt_state, state.critic)
         weights: Any = optax.apply_updates(state.critic, change)
         grad = jax.value_and_grad(extractor_loss, has_aux=True)
-        (loss, (stats, _)), slope = grad(state.params, state.batch_stats, weights, x)
+        (loss, stats), slope = grad(state.params, state.batch_stats, weights, x)
         change, opt = tx.update(slope, state.opt_state, state.params)
         new = Adapting(optax.apply_updates(state.params, change), stats, opt, weights, critic_opt)
         return new, {"loss": loss, "critic_loss": told, "critic_accuracy": right}
@@ -192,8 +191,8 @@ def adapt_features(
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)
     headers = [read_header(folder)[0] for folder in (source, target)]
-    claim(out, {"task": "features", "run": trained.about["digest"], "source": headers[0], "target": headers[1],
-                **to_dict(config)})  # fmt: skip
+    data = {name: digest_of(header) for name, header in zip(("source", "target"), headers, strict=True)}
+    claim(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data})
     write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
     size = near.images.shape[3:]
     learned = near.images[~near.test].reshape(-1, *size)
@@ -223,6 +222,11 @@ def adapt_features(
         results[name] = localisation_between(*nodes, network, far)
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
     return results
+
+
+def digest_of(header: dict[str, Any]) -> str:
+    """Twelve digits that tell datasets apart, of their dataset.json."""
+    return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:

@@ -22,7 +22,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from topological_nav.adapt_config import AdaptConfig
-from topological_nav.adaptation import PASSAGES_STREAM, Asked, Tell, resumable_epochs, target_rooms
+from topological_nav.adaptation import PASSAGES_STREAM, Asked, Tell, digest_of, resumable_epochs, target_rooms
 from topological_nav.build import Built
 from topological_nav.config import PITCHES, DataConfig
 from topological_nav.data import headings, load_passages, read_header
@@ -78,7 +78,8 @@ def passage_configurations(
         raise RunError(f"{run}: was trained for '{trained.about['task']}', expected a run of 'train passages'")
     learned, tested = _labelled(target, config)
     header, _ = read_header(target)
-    claim(out, {"task": "transfer", "run": trained.about["digest"], "target": header, **to_dict(config)})
+    about = {"run": trained.about["digest"][:12], "target": digest_of(header)}
+    claim(out, {"task": "transfer", **to_dict(config), **about})
     write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
     network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
     shape = (trained.about["data"]["height"], trained.about["data"]["width"])
