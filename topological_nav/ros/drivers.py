@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -66,6 +66,38 @@ class HeadingDriver:
         if time_s - self._since >= config.drive_s - 1e-6:
             return Command(0.0, 0.0, done=True)
         return Command(config.linear_mps, turn)
+
+
+class Pilot(Protocol):
+    """The navigator, with its memory: what `topological_nav.navigator.Pilot` is for a batch of one."""
+
+    def step(
+        self, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Images [1, H, W, 3], headings [1] and time to linear [1] and angular [1] velocity, and events.
+
+        Of the events, `arrived` and `timed_out` [1] bool are looked at.
+        """
+        ...
+
+
+class PilotDriver:
+    """The navigator as a driver: it is done where it arrived, or ran out of time."""
+
+    def __init__(self, pilot: Pilot, lens: Lens):
+        """Takes what it needs.
+
+        Args:
+            pilot: of one episode, its goal known to it.
+            lens: that its networks learned through.
+        """
+        self._pilot, self.lens = pilot, lens
+
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+        """See `Driver.step`."""
+        linear, angular, events = self._pilot.step(image[None], np.array([heading_rad]), np.array([time_s]))
+        done = bool(events.arrived[0]) or bool(events.timed_out[0])
+        return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))
 
 
 def checked(command: Command) -> Command:
