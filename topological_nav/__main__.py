@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from scenes_mjcf.schema import SceneError
-from topological_nav.adapt_config import AdaptConfig
-from topological_nav.config import PITCHES, DataConfig, MapConfig, passage_config, room_config
-from topological_nav.errors import SettingsError, TopologicalError
+from topological_nav import adapt_commands
+from topological_nav.config import DataConfig, MapConfig, passage_config, room_config
+from topological_nav.errors import TopologicalError
 from topological_nav.settings import overridden, settings_help
 from train.errors import TrainError
 
@@ -62,19 +62,7 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
     plan.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"map (default {RUNS}/maps/SCENE.npz)")
     plan.add_argument("--route", nargs=2, type=int, metavar=("FROM", "TO"), help="draw the way between two nodes")
-    adapt = command("adapt", "Takes networks and maps to another domain.", AdaptConfig())
-    adapt.add_argument(
-        "what",
-        choices=list(ADAPTS),
-        help="features: the embedding, adversarially; passages: the detector in configurations A to D; map: of images "
-        "collected in the target domain",
-    )
-    adapt.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
-    adapt.add_argument("--data", type=Path, default=DATASET, metavar="DIR", help=f"source (default {DATASET})")
-    adapt.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
-    adapt.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
-    adapt.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
-    adapt.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {RUNS}/adapted/WHAT, a map SCENE.npz")
+    adapt_commands.add_to(command, DATASET, RUNS)
     return made
 
 
@@ -169,79 +157,9 @@ def _map(arguments: argparse.Namespace) -> None:
 
 
 def _adapt(arguments: argparse.Namespace) -> None:
-    config = overridden(AdaptConfig(), arguments.settings)
-    if (arguments.what == "map") != bool(arguments.scene):
-        raise SettingsError("adapt map takes a scene folder, adapt features and adapt passages none")
-    arguments.target = arguments.target or arguments.data
-    ADAPTS[arguments.what](arguments, config)
-
-
-def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig) -> None:
-    from topological_nav.adaptation import adapt_features, target_rooms
-    from topological_nav.data import load_rooms
-    from topological_nav.figures import save
-    from topological_nav.transfer_figures import features_figure
-    from train.run_folder import read_metrics
-
-    out = arguments.out or RUNS / "adapted" / "features"
     with _stops() as stops:
-        places = arguments.localiser, arguments.data, arguments.target, out
-        results = adapt_features(*places, config, lambda line: print(line, flush=True), lambda: bool(stops))
-        if results is None:
+        if not adapt_commands.run(arguments, lambda: bool(stops)):
             raise Stopped(stops[0])
-    rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
-    level = PITCHES.index("level")
-    figure = features_figure(rendered[:, level, 0], seen[:, level, 0], read_metrics(out / "metrics.jsonl"), results)
-    save(figure, out / "adaptation.png")
-    for name in ("source", "before", "statistics", "after"):
-        mean = results[name]["mean"]
-        print(
-            f"{name:<11}nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
-            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
-        )
-    print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
-
-
-def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig) -> None:
-    from topological_nav.data import load_passages
-    from topological_nav.domains import as_seen, preset
-    from topological_nav.figures import save
-    from topological_nav.transfer import CONFIGURATIONS, passage_configurations
-    from topological_nav.transfer_figures import passages_figure
-    from train.run_folder import read_metrics
-
-    out = arguments.out or RUNS / "adapted" / "passages"
-    with _stops() as stops:
-        places = arguments.detector, arguments.target, out
-        results = passage_configurations(*places, config, lambda line: print(line, flush=True), lambda: bool(stops))
-        if results is None:
-            raise Stopped(stops[0])
-    images = load_passages(arguments.target).images
-    seen = as_seen(images, preset(config.domain))
-    save(passages_figure(images, seen, read_metrics(out / "metrics.jsonl"), results), out / "configurations.png")
-    for name, (from_source, tunes) in CONFIGURATIONS.items():
-        row, start = results[name], "the source's weights" if from_source else "fresh weights"
-        how = f"{start}{', fine-tuned' if tunes else ''}"
-        print(f"{name}  {how:<33}accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
-    print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
-
-
-def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig) -> None:
-    from topological_nav.figures import map_figure, save
-    from topological_nav.graph import save_map
-    from topological_nav.transfer import collected_map
-
-    scene = Path(arguments.scene)
-    out = arguments.out or RUNS / "adapted" / f"{scene.resolve().name}.npz"
-    built = collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config)
-    save_map(built.map, out)
-    save(map_figure(built), out.with_suffix(".png"))
-    for name, value in built.scores.items():
-        print(f"{name}: {value}")
-    print(f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges; drawn in {out.with_suffix('.png')}")
-
-
-ADAPTS = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}
 
 
 @contextmanager
