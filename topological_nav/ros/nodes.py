@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 COMMAND_HOLDS_S = 0.5
 """A velocity command is driven for this long; then the robot stops, as mobile bases do."""
-_PATIENCE_S = 60.0
+_PATIENCE_S = 180.0
 """Of waiting for other nodes, by the wall's clock."""
 Asked = Callable[[], bool]
 """Whether a stop was asked for."""
@@ -98,7 +98,7 @@ class SimulatorNode:
         """Simulates until the navigator is done, the limit is reached or a stop is asked for.
 
         Raises:
-            RosError: in lockstep, no command came for a minute.
+            RosError: in lockstep, no command came for three minutes.
         """
         pace, tally = self._pace, Tally()
         if pace.lockstep or pace.recorded:
