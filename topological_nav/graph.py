@@ -93,6 +93,27 @@ class TopologicalMap:
         angles = tuple(self.graph.edges[a, b]["angle_rad"] for a, b in zip(nodes, nodes[1:], strict=False))
         return Route(tuple(nodes), angles, float(cost))
 
+    @functools.cached_property
+    def weight(self) -> np.ndarray:
+        """[E] -log p of the edges."""
+        return np.array([edge_weight(p) for p in self.p.tolist()])
+
+    def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
+        """The first edge of the cheapest way between two different nodes; -1 where there is none.
+
+        Args:
+            start: node.
+            goal: node.
+            penalty: [E] added to the edges' weights.
+        """
+        weight = self.weight if penalty is None else self.weight + penalty
+        size = len(self.xy_w)
+        back = csr_array((weight, (self.edges[:, 1], self.edges[:, 0])), shape=(size, size))
+        left = np.asarray(dijkstra(back, indices=goal))
+        out = np.flatnonzero(self.edges[:, 0] == start)
+        total = weight[out] + left[self.edges[out, 1]]
+        return int(out[total.argmin()]) if len(out) and np.isfinite(total.min()) else -1
+
     def localise(self, embeddings: np.ndarray) -> np.ndarray:
         """[Q] i32: the node nearest to each embedding [Q, D], over all images of all nodes."""
         return nearest_node(embeddings, self.embeddings)[0]
@@ -103,6 +124,33 @@ class TopologicalMap:
         graph = nx.DiGraph(kept)
         graph.add_nodes_from(self.graph)
         return sorted((sorted(part) for part in nx.strongly_connected_components(graph)), key=lambda p: (-len(p), p))
+
+    def thinned(self, share: float, seed: int) -> TopologicalMap:
+        """The map with fewer nodes: a sparse one that may fall apart.
+
+        Args:
+            share: of each room's nodes that stay, drawn at random; at least one a room.
+            seed: of the draw.
+        """
+        rng = np.random.default_rng([seed, 11])
+        kept = []
+        for room in np.unique(self.room):
+            mine = np.flatnonzero(self.room == room)
+            kept.append(rng.choice(mine, max(1, round(share * len(mine))), replace=False))
+        rows = np.sort(np.concatenate(kept))
+        number = np.full(len(self.xy_w), -1, np.int32)
+        number[rows] = np.arange(len(rows))
+        edges = (number[self.edges] >= 0).all(1)
+        return dataclasses.replace(
+            self,
+            xy_w=self.xy_w[rows],
+            room=self.room[rows],
+            embeddings=self.embeddings[rows],
+            edges=number[self.edges[edges]],
+            p=self.p[edges],
+            angle_rad=self.angle_rad[edges],
+            about={**self.about, "thinned": share, "thinned_seed": seed},
+        )
 
 
 def edge_weight(p: float) -> float:
