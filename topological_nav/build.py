@@ -11,13 +11,13 @@ import numpy as np
 
 from interactive_nav.rendering.base import Lens
 from interactive_nav.robots import RobotSpec, get_robot
-from interactive_nav.scene import load_scene
+from interactive_nav.scene import Scene, load_scene
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data import headings
 from topological_nav.errors import MapError, SpaceError
 from topological_nav.graph import TopologicalMap, assemble, place_nodes
 from topological_nav.rendering import SceneRenderer, camera_pose
-from topological_nav.rooms import find_rooms, recorded_rooms
+from topological_nav.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
 from topological_nav.space import FreeSpace, free_space
 from topological_nav.training import Trained, load_trained
@@ -98,6 +98,22 @@ def build_map(
     made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
     free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
     return Built(made, space, free, _scores(made, free, config, lacking))
+
+
+def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, data: DataConfig) -> TopologicalMap:
+    """The map that perfect networks would make: ways that are free on the plan have p = 1, others 0.
+
+    It has no embeddings: only `sight.TrueSight` can localise on it.
+    """
+    margin_m, points = data.passage_margin_m, data.passage_points
+    xy, _ = place_nodes(space, rooms, config, margin_m, points)
+
+    def probability(edges: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return space.segment_free(xy[edges[:, 0]], xy[edges[:, 1]], points, margin_m).astype(float)
+
+    about = {"settings": to_dict(config), "made": "from the plan"}
+    nothing = np.zeros((len(xy), data.headings, 0))
+    return assemble(scene.name, scene.digest, xy, rooms.of(xy), nothing, config.edge_m, probability, about)
 
 
 def _camera_of(localiser: Trained, detector: Trained) -> DataConfig:
