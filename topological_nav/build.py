@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from interactive_nav.rendering.base import Lens
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
 from topological_nav.config import DataConfig, MapConfig
-from topological_nav.data import headings
+from topological_nav.data import headings, lens_of
 from topological_nav.errors import MapError, SpaceError
 from topological_nav.graph import TopologicalMap, assemble, place_nodes
 from topological_nav.rendering import SceneRenderer, camera_pose
@@ -60,7 +59,7 @@ def build_map(
         SceneError, SpaceError: the scene cannot be used.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
-    data = _camera_of(localiser, detector)
+    data = camera_of(localiser, detector)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)
     known = recorded_rooms(scene.digest)
@@ -71,9 +70,7 @@ def build_map(
     if not len(xy):
         raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)
-    renderer = SceneRenderer(
-        scene, Lens(data.width, data.height, data.fov_deg or robot.camera.fov_deg), data.supersample, data.engine
-    )
+    renderer = renderer_of(scene, data)
     told = _Told(progress, len(xy) * len(around))
     images = _draw(renderer, robot, np.repeat(xy, len(around), 0), np.tile(around, len(xy)), told, "nodes")
     embeddings = localiser.embed(images).reshape(len(xy), len(around), -1)
@@ -116,7 +113,17 @@ def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, da
     return assemble(scene.name, scene.digest, xy, rooms.of(xy), nothing, config.edge_m, probability, about)
 
 
-def _camera_of(localiser: Trained, detector: Trained) -> DataConfig:
+def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
+    """What draws a scene as a dataset's images were drawn."""
+    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
+
+
+def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
+    """The settings of the camera that both networks learned from.
+
+    Raises:
+        MapError: they learned from different cameras, or the second judges no passages.
+    """
     if detector.about["task"] != "passages":
         raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
     first, second = ({**n.about["data"], "fov_deg": n.about["fov_deg"]} for n in (localiser, detector))

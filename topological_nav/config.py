@@ -225,7 +225,7 @@ class EvaluationConfig(NavigatorConfig):
     thinned: float = 0.4
     """Share of each room's nodes that the sparse map of the ablation keeps."""
     batch: int | None = None
-    """Episodes played at a time; auto: all of a scene on an accelerator, 16 on a CPU."""
+    """Episodes played at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
 

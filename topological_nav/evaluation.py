@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import label as components
 
@@ -20,9 +21,9 @@ from interactive_nav.metrics import path_efficiency
 from interactive_nav.scene import Scene
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import SpaceError
-from topological_nav.navigator import Navigator, State
+from topological_nav.navigator import Events, Navigator, State
 from topological_nav.rooms import Rooms
-from topological_nav.simulation import Camera, Simulator
+from topological_nav.simulation import Camera, Seen, Simulator
 from topological_nav.space import FreeSpace
 from train.planners import Planner, plan_path
 
@@ -40,6 +41,8 @@ SHRINK = 4
 class Journeys:
     """Fixed episodes of one scene."""
 
+    number: np.ndarray
+    """[n] i32, theirs in the scene."""
     start_xy_w: np.ndarray
     """[n, 2] m."""
     yaw_rad: np.ndarray
@@ -131,7 +134,7 @@ def draw_journeys(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
             yaws.append(yaw)
     a, b = np.array(pairs).T
     shortest = np.array([_shortest(space, places[i], places[j]) for i, j in pairs])
-    return Journeys(places[a], np.array(yaws), places[b], room[a], room[b], shortest)
+    return Journeys(np.arange(count), places[a], np.array(yaws), places[b], room[a], room[b], shortest)
 
 
 def _cells(space: FreeSpace, xy: np.ndarray) -> np.ndarray:
@@ -179,8 +182,25 @@ class Marks:
 class NavigatorPlayer:
     """The navigator, seeing through a camera."""
 
-    def __init__(self, navigator: Navigator, simulator: Simulator, camera: Camera, config: EvaluationConfig):
+    def __init__(
+        self,
+        navigator: Navigator,
+        simulator: Simulator,
+        camera: Camera,
+        config: EvaluationConfig,
+        watch: Callable[[float, Seen, State, Events], None] = lambda *_: None,
+    ):
+        """Takes its parts.
+
+        Args:
+            navigator: of the scene.
+            simulator: of the scene.
+            camera: what the navigator's sight understands.
+            config: of the evaluation.
+            watch: told time, poses, new state and events of every step.
+        """
         self._navigator, self._simulator, self._camera, self._config = navigator, simulator, camera, config
+        self._watch = watch
         self.state: State | None = None
 
     def begin(self, journeys: Journeys) -> None:
@@ -208,6 +228,7 @@ class NavigatorPlayer:
         if len(looks):
             images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
         self.state, linear, angular, events = self._navigator.step(mind, images, seen.yaw_rad, time_s)
+        self._watch(time_s, seen, self.state, events)
         marks = Marks(
             events.run_started,
             events.run_ended,
@@ -239,7 +260,7 @@ class ActionPlayer:
 
     def begin(self, journeys: Journeys) -> None:
         """See `Contender`."""
-        self._episode, self._act = np.arange(len(journeys)), self._make_act()
+        self._episode, self._act = journeys.number, self._make_act()
 
     def keep(self, rows: np.ndarray) -> None:
         """See `Contender`."""
@@ -264,11 +285,14 @@ def expert(simulator: Simulator, config: EvaluationConfig) -> ActionPlayer:
 
 def learned(simulator: Simulator, policy: Any, config: EvaluationConfig) -> ActionPlayer:
     """A policy of `train`, told the goal's position as in its own observations."""
-    keys = jax.random.split(jax.random.PRNGKey(config.seed), 10**5)
-    chosen = jax.jit(lambda obs, keys, step: jax.vmap(policy)(obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step)))
+
+    @jax.jit
+    def chosen(obs: Any, episode: jax.Array, step: jax.Array) -> jax.Array:
+        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(config.seed), i), step))
+        return jax.vmap(policy)(obs, keys(episode))
 
     def act(state: Any, episode: np.ndarray, _: np.ndarray, step: int) -> Any:
-        return chosen(state.obs, keys[episode], step)
+        return chosen(state.obs, jnp.asarray(episode), jnp.asarray(step))
 
     return ActionPlayer(simulator, lambda: act, config)
 
@@ -291,7 +315,7 @@ def play(
     over = np.zeros(n, bool)
     in_run, touched = np.zeros(n, bool), np.zeros(n, bool)
     contender.begin(journeys)
-    state = simulator.start(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, config.seed)
+    state = simulator.start(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, journeys.number, config.seed)
     every, step, dt = max(1, round(TRACK_S / simulator.dt_s)), 0, simulator.dt_s
     seen = simulator.seen(state)
     while not over.all():
@@ -365,6 +389,9 @@ def columns(journeys: Journeys, played: Played, config: EvaluationConfig) -> dic
         "broken": played.broken,
         "start_room": journeys.start_room,
         "goal_room": journeys.goal_room,
-        **{f"{end}_{axis}_w": getattr(journeys, f"{end}_xy_w")[:, i] for end in ("start", "goal") for i, axis in enumerate("xy")},
+        "start_x_w": journeys.start_xy_w[:, 0],
+        "start_y_w": journeys.start_xy_w[:, 1],
         "start_yaw_rad": journeys.yaw_rad,
-    }  # fmt: skip
+        "goal_x_w": journeys.goal_xy_w[:, 0],
+        "goal_y_w": journeys.goal_xy_w[:, 1],
+    }

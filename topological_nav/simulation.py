@@ -7,6 +7,7 @@ the scene at rest as well: what a robot has pushed away is still seen where it s
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -97,10 +98,12 @@ class Simulator:
         """Control period."""
         return self.env.dt
 
-    def start(self, start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, seed: int = 0) -> Any:
-        """States of B episodes, with observations."""
+    def start(
+        self, start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, number: np.ndarray, seed: int
+    ) -> Any:
+        """States of B episodes, with observations; noise of an episode depends on its number [B] and the seed."""
         objects = len(self.env.world.small_objects)
-        keys = jax.random.split(jax.random.PRNGKey(seed), len(start_xy_w))
+        keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.asarray(number))
         return self._reset(episode_starts(start_xy_w, yaw_rad, goal_xy_w, objects), keys)
 
     def drive(self, state: Any, linear: np.ndarray, angular: np.ndarray) -> Any:
