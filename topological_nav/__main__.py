@@ -244,8 +244,9 @@ def _evaluate(arguments: argparse.Namespace) -> None:
             if stops and done < total:
                 raise Stopped(stops[0])
 
-        rows = hold(contest, progress)
-    for venue in venues_of(contest):
+        venues = venues_of(contest)
+        rows = hold(contest, venues, progress)
+    for venue in venues:
         panels = {}
         for name in contest.contenders:
             mine = where(rows, scene=venue.scene.name, contender=name).to_pylist()

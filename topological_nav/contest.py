@@ -243,20 +243,29 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulat
     return Simulator(env), policy
 
 
-def hold(contest: Contest, tell: Tell = lambda *_: None) -> pa.Table:
+def venues_of(contest: Contest) -> list[Venue]:
+    """The scenes, with the networks where somebody looks through them.
+
+    Raises:
+        TopologicalError, SceneError: something cannot be used.
+    """
+    navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
+    networks = load_networks(contest.localiser, contest.detector) if navigates else None
+    return [Venue(folder, contest, networks) for folder in contest.scenes]
+
+
+def hold(contest: Contest, venues: Sequence[Venue], tell: Tell = lambda *_: None) -> pa.Table:
     """Plays what is missing, and returns all rows.
 
     Args:
         contest: who plays what.
+        venues: of `venues_of`.
         tell: told who plays where, episodes over and episodes in all, after every control step; may raise to stop,
             which loses the batch that is being played.
 
     Raises:
         TopologicalError, SceneError, TrainError: something cannot be used.
     """
-    navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
-    networks = load_networks(contest.localiser, contest.detector) if navigates else None
-    venues = [Venue(folder, contest, networks) for folder in contest.scenes]
     # Everything that can be refused is refused before the first episode.
     plan = [(venue, name, _stem(venue, name)) for venue in venues for name in contest.contenders]
     missing = [_missing(contest.out, stem, len(venue.journeys)) for venue, _, stem in plan]
@@ -271,11 +280,10 @@ def hold(contest: Contest, tell: Tell = lambda *_: None) -> pa.Table:
         for first in range(0, len(numbers), size):
             rows = numbers[first : first + size]
             told = functools.partial(_tell, tell, f"{venue.scene.name} {name}", done, total)
-            _play(venue, name, stem, contender, simulator, rows, told)
+            _play(venue, contest.out, name, stem, contender, simulator, rows, told)
             done += len(rows)
             tell(f"{venue.scene.name} {name}", done, total)
-    files = [path for venue, _, stem in plan for path in _files(contest.out, stem)]
-    return read_rows(files)
+    return pa.concat_tables([_rows(contest.out, stem, len(venue.journeys)) for venue, _, stem in plan])
 
 
 def _tell(tell: Tell, what: str, before: int, total: int, over: int, _: float) -> None:
@@ -293,13 +301,19 @@ def _files(out: Path, stem: str) -> list[Path]:
 
 def _missing(out: Path, stem: str, count: int) -> np.ndarray:
     """Numbers of the episodes that no file has."""
-    files = _files(out, stem)
-    there = read_rows(files)["episode"].to_numpy() if files else np.zeros(0, int)
+    there = _rows(out, stem, count)["episode"].to_numpy() if _files(out, stem) else np.zeros(0, int)
     return np.setdiff1d(np.arange(count), there)
+
+
+def _rows(out: Path, stem: str, count: int) -> pa.Table:
+    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for."""
+    rows = read_rows(_files(out, stem)).sort_by("episode")
+    return rows.filter(pa.array(rows["episode"].to_numpy() < count))
 
 
 def _play(
     venue: Venue,
+    out: Path,
     name: str,
     stem: str,
     contender: Contender,
@@ -307,7 +321,7 @@ def _play(
     rows: np.ndarray,
     tell: Callable[[int, float], None],
 ) -> None:
-    config, out = venue.contest.config, venue.contest.out
+    config = venue.contest.config
     journeys = venue.journeys.take(rows)
     began = time.perf_counter()
     played = play(contender, simulator, journeys, config, tell)
@@ -345,10 +359,3 @@ def tracks_of(contest: Contest, venue: Venue, contender: str) -> dict[int, np.nd
         with np.load(path) as stored:
             found |= {int(number): stored[number] for number in stored.files}
     return found
-
-
-def venues_of(contest: Contest) -> Sequence[Venue]:
-    """The scenes, for figures."""
-    navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
-    networks = load_networks(contest.localiser, contest.detector) if navigates else None
-    return [Venue(folder, contest, networks) for folder in contest.scenes]

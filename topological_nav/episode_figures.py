@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import textwrap
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -103,7 +105,7 @@ def episode_figure(
         passable: edges with at least this probability are drawn.
     """
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
-    figure, axis = plt.subplots(figsize=(8.0, 0.9 + 7.6 * extent[1] / extent[0]), layout="constrained")
+    figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
     floor_plan(axis, space)
     map_lines(axis, made, passable)
     axis.plot(*track_w.T, color="tab:blue", linewidth=1.2, zorder=3)
@@ -116,7 +118,7 @@ def episode_figure(
     axis.plot(*goal_w, "*", color="tab:green", markersize=14, zorder=5, label="goal")
     axis.plot(*made.xy_w[goal_node], "s", mfc="none", mec="tab:green", markersize=11, zorder=5, label="goal's node")
     axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    axis.set_title(title, fontsize=9)
+    axis.set_title(textwrap.fill(title, 90), fontsize=9)
     return figure
 
 
@@ -194,7 +196,10 @@ def write_video(frames: Iterable[np.ndarray], path: Path, rate: float) -> int:
                     writer = imageio_ffmpeg.write_frames(
                         str(named), size, fps=rate, codec="libx264", quality=7, macro_block_size=2  # type: ignore[arg-type]
                     )  # fmt: skip
-                    writer.send(None)
+                    with warnings.catch_warnings():
+                        # imageio-ffmpeg forks; its child becomes ffmpeg at once and never enters JAX.
+                        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+                        writer.send(None)
                 writer.send(np.ascontiguousarray(frame))
                 count += 1
         finally:

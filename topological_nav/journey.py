@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from topological_nav.contest import Contest, Venue, load_networks
+from topological_nav.contest import Contest, venues_of
 from topological_nav.episode_figures import episode_figure, plan_picture, video_frame, write_video
 from topological_nav.errors import SettingsError
 from topological_nav.evaluation import Journeys, NavigatorPlayer, Played, play
@@ -88,8 +88,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     Raises:
         SettingsError: the scene has no such episode.
     """
-    networks = None if contest.truth else load_networks(contest.localiser, contest.detector)
-    venue = Venue(contest.scenes[0], contest, networks)
+    (venue,) = venues_of(contest)
     if not 0 <= number < len(venue.journeys):
         raise SettingsError(
             f"episode is {number}, expected 0 to {len(venue.journeys) - 1}; episodes=N makes more of the scene"
