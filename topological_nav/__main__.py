@@ -163,14 +163,22 @@ def _train(arguments: argparse.Namespace) -> None:
 
 def _map(arguments: argparse.Namespace) -> None:
     config = overridden(MapConfig(), arguments.settings)
-    from topological_nav.build import build_map
+    from topological_nav.build import build_map, forget
     from topological_nav.figures import map_figure, save
     from topological_nav.graph import save_map
 
     out = arguments.out or RUNS / "maps" / f"{Path(arguments.scene).resolve().name}.npz"
-    with _bar() as tell:
-        built = build_map(Path(arguments.scene), arguments.localiser, arguments.detector, config, tell)
+    parts = out.with_name(f"{out.name}.parts")
+    with _stops() as stops, _bar() as tell:
+
+        def progress(what: str, done: int, total: int) -> None:
+            tell(what, done, total)
+            if stops:
+                raise Stopped(stops[0])
+
+        built = build_map(Path(arguments.scene), arguments.localiser, arguments.detector, config, progress, parts)
     save_map(built.map, out)
+    forget(parts)
     route = None
     if arguments.route:
         route = built.map.plan(*arguments.route)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
+import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from topological_nav.settings import overlaid
 from topological_nav.space import FreeSpace, free_space
 from topological_nav.training import Trained, load_trained
 from train.config_io import to_dict
+from train.files import whole_file
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""
@@ -42,7 +47,12 @@ class Built:
 
 
 def build_map(
-    scene_folder: Path, localiser_run: Path, detector_run: Path, config: MapConfig, progress: Progress = lambda *_: None
+    scene_folder: Path,
+    localiser_run: Path,
+    detector_run: Path,
+    config: MapConfig,
+    progress: Progress = lambda *_: None,
+    parts: Path | None = None,
 ) -> Built:
     """Builds a scene's map.
 
@@ -51,7 +61,8 @@ def build_map(
         localiser_run: run folder of a network whose embedding localises.
         detector_run: run folder of a passage detector.
         config: of the map.
-        progress: told what is drawn, images done and images in all.
+        progress: told what is drawn, images done and images in all; may raise to stop.
+        parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
 
     Raises:
         RunError: a run is not finished.
@@ -70,9 +81,9 @@ def build_map(
     if not len(xy):
         raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)
-    renderer = renderer_of(scene, data)
-    told = _Told(progress, len(xy) * len(around))
-    images = _draw(renderer, robot, np.repeat(xy, len(around), 0), np.tile(around, len(xy)), told, "nodes")
+    pictures = _Pictures(scene, data, robot, progress, parts)
+    pictures.total = len(xy) * len(around)
+    images = pictures.draw(np.repeat(xy, len(around), 0), np.tile(around, len(xy)), "nodes")
     embeddings = localiser.embed(images).reshape(len(xy), len(around), -1)
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -80,8 +91,8 @@ def build_map(
             turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
             looked = images.reshape(len(xy), len(around), *images.shape[1:])[edges[:, 0], turn]
         else:
-            told.total += len(edges)
-            looked = _draw(renderer, robot, xy[edges[:, 0]], angle, told, "edges")
+            pictures.total += len(edges)
+            looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
         return 1.0 / (1.0 + np.exp(-detector.logits(looked)[:, 0]))
 
     about = {
@@ -136,27 +147,49 @@ def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
     return overlaid(DataConfig(), first, "network.json")
 
 
-class _Told:
-    """Counts images for a progress callback."""
+class _Pictures:
+    """Level images of a scene, a chunk at a time, each kept in a file until the map is made."""
 
-    def __init__(self, progress: Progress, total: int):
-        self._progress, self._done, self.total = progress, 0, total
+    def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None):
+        self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
+        self._done, self.total = 0, 0
+        self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()
 
-    def add(self, what: str, count: int) -> None:
-        self._done += count
-        self._progress(what, self._done, self.total)
+    @functools.cached_property
+    def _renderer(self) -> SceneRenderer:
+        return renderer_of(self._scene, self._data)
+
+    def draw(self, xy: np.ndarray, heading: np.ndarray, what: str) -> np.ndarray:
+        """[N, H, W, 3] u8: images from places [N, 2] along headings [N]."""
+        drawn = []
+        for first in range(0, len(xy), CHUNK):
+            rows = slice(first, first + CHUNK)
+            drawn.append(self._chunk(xy[rows], heading[rows]))
+            self._done += len(drawn[-1])
+            self._progress(what, self._done, self.total)
+        return np.concatenate(drawn)
+
+    def _chunk(self, xy: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        kept = None
+        if self._parts is not None:
+            poses = np.concatenate([xy, heading[:, None]], 1).astype(float)
+            kept = self._parts / f"{hashlib.sha256(self._of + poses.tobytes()).hexdigest()[:16]}.npy"
+            if kept.is_file():
+                with contextlib.suppress(ValueError, EOFError):  # a damaged one is drawn again
+                    return np.load(kept)
+        images = self._renderer.draw(camera_pose(self._robot, xy, heading, np.zeros(len(xy))))
+        if kept is not None:
+            with whole_file(kept) as partial, open(partial, "wb") as file:
+                np.save(file, images)
+        return images
 
 
-def _draw(
-    renderer: SceneRenderer, robot: RobotSpec, xy: np.ndarray, heading: np.ndarray, told: _Told, what: str
-) -> np.ndarray:
-    """[N, H, W, 3] u8: level images from places [N, 2] along headings [N]."""
-    parts = []
-    for first in range(0, len(xy), CHUNK):
-        rows = slice(first, first + CHUNK)
-        parts.append(renderer.draw(camera_pose(robot, xy[rows], heading[rows], np.zeros(len(xy[rows])))))
-        told.add(what, len(parts[-1]))
-    return np.concatenate(parts)
+def forget(parts: Path) -> None:
+    """Removes the images that `build_map` kept, once the map is written."""
+    for path in parts.glob("*.npy"):
+        path.unlink()
+    with contextlib.suppress(OSError):
+        parts.rmdir()
 
 
 def _scores(made: TopologicalMap, free: np.ndarray, config: MapConfig, lacking: list[str]) -> dict[str, Any]:

@@ -343,7 +343,7 @@ def play(
         numbers["goal_m"][at[rows]], numbers["path_m"][at[rows]] = goal_m[rows], before.path_m[rows]
         numbers["duration_s"][at[rows]] = time
         # A run that the end of its episode cuts short counts, as the whole run that it is scored as.
-        cut = rows[in_run[rows] & ~ended[rows]]
+        cut = rows[in_run[rows] & ~ended[rows] & ~marks.run_started[rows]]
         counts["runs"][at[cut]] += 1
         counts["contact_runs"][at[cut[touched[cut]]]] += 1
         for row in rows:
