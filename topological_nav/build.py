@@ -19,7 +19,7 @@ from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data import headings, lens_of
 from topological_nav.errors import MapError, SpaceError
 from topological_nav.graph import TopologicalMap, assemble, place_nodes
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import BATCH, SceneRenderer, camera_pose
 from topological_nav.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
 from topological_nav.space import FreeSpace, free_space
@@ -124,9 +124,9 @@ def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, da
     return assemble(scene.name, scene.digest, xy, rooms.of(xy), nothing, config.edge_m, probability, about)
 
 
-def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
-    """What draws a scene as a dataset's images were drawn."""
-    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
+def renderer_of(scene: Scene, data: DataConfig, batch: int = BATCH) -> SceneRenderer:
+    """What draws a scene as a dataset's images were drawn, so many a call."""
+    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, batch)
 
 
 def camera_of(localiser: Trained, detector: Trained) -> DataConfig:

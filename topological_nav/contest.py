@@ -56,6 +56,8 @@ from train.run_folder import RunFolder, versions
 CONTENDERS = ("dense", "sparse", "expert", "ppo")
 """The navigator on its map, and on the same thinned out; an expert with the plan; a learned policy told the goal."""
 CPU_BATCH = 8
+CPU_IMAGES, DEVICE_IMAGES = 6, 192
+"""Images drawn a call; fewer are padded, which costs a CPU as much."""
 PASSAGE_POLICY = "passage"
 Tell = Callable[[str, int, int], None]
 
@@ -153,7 +155,8 @@ class Venue:
         """What the navigator's sight understands."""
         if self.networks is None:
             return pose_camera
-        return scene_camera(renderer_of(self.scene, self.networks.camera), self.robot)
+        batch = CPU_IMAGES if jax.default_backend() == "cpu" else DEVICE_IMAGES
+        return scene_camera(renderer_of(self.scene, self.networks.camera, batch), self.robot)
 
     def map_of(self, contender: str) -> TopologicalMap:
         """The map that a navigator goes by."""
@@ -191,7 +194,8 @@ class Venue:
         if contender == "ppo":
             assert self.contest.ppo is not None
             path, meta = checkpoint.find(RunFolder(self.contest.ppo).checkpoints, "best")
-            return {**asked, "robot": meta.robot, "checkpoint": [str(self.contest.ppo), path.name, meta.env_steps]}
+            weights = hashlib.sha256((path / "learner.msgpack").read_bytes()).hexdigest()
+            return {**asked, "robot": meta.robot, "checkpoint": [meta.env_steps, weights]}
         if contender == "expert":
             return asked
         made = self.map

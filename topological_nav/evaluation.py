@@ -211,12 +211,12 @@ class NavigatorPlayer:
         images = self._camera(np.repeat(journeys.goal_xy_w, count, 0), np.tile(around, n))
         images = images.reshape(n, count, *images.shape[1:])
         self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
-        self._blank = np.zeros_like(images[0, 0])
+        self._images = images[:, 0].copy()
 
     def keep(self, rows: np.ndarray) -> None:
         """See `Contender`."""
         assert self.state is not None
-        self.state = self.state.take(rows)
+        self.state, self._images = self.state.take(rows), self._images[rows]
 
     def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
         """See `Contender`."""
@@ -224,10 +224,9 @@ class NavigatorPlayer:
         seen = self._simulator.seen(state)
         mind = self._navigator.stop(self.state, over)
         looks = np.flatnonzero(self._navigator.looks(mind, seen.yaw_rad, time_s))
-        images = np.broadcast_to(self._blank, (len(over), *self._blank.shape)).copy()
-        if len(looks):
-            images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
-        self.state, linear, angular, events = self._navigator.step(mind, images, seen.yaw_rad, time_s)
+        if len(looks):  # the others keep an old image, which nobody looks at
+            self._images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
+        self.state, linear, angular, events = self._navigator.step(mind, self._images, seen.yaw_rad, time_s)
         self._watch(time_s, seen, self.state, events)
         marks = Marks(
             events.run_started,
