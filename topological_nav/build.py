@@ -22,6 +22,7 @@ from topological_nav.graph import TopologicalMap, assemble, place_nodes
 from topological_nav.rendering import BATCH, SceneRenderer, camera_pose
 from topological_nav.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
+from topological_nav.sight import NetworkSight, Sight
 from topological_nav.space import FreeSpace, free_space
 from topological_nav.training import Trained, load_trained
 from train.config_io import to_dict
@@ -105,7 +106,46 @@ def build_map(
     }
     made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
     free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
-    return Built(made, space, free, _scores(made, free, config, lacking))
+    scores = _scores(made, free, config, lacking)
+    if config.check:
+        places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
+        pictures.total += len(places) * len(around)
+        images = pictures.draw(np.repeat(places, len(around), 0), np.tile(around, len(places)), "check")
+        looked = images.reshape(len(places), len(around), *images.shape[1:])
+        for match in ("aligned", "nearest"):
+            sight = NetworkSight(made, localiser, detector, match)
+            scores |= localisation_check(sight, made, looked, around, places)
+    return Built(made, space, free, scores)
+
+
+def localisation_check(
+    sight: Sight, made: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
+) -> dict[str, str]:
+    """How well a map localises, in words, by all images of a place and by its first alone.
+
+    Args:
+        sight: of the map.
+        made: the map.
+        images: [P, K, ...] of P places.
+        heading_rad: [K] along which they were taken.
+        xy_w: [P, 2] m, where.
+    """
+    count, around = images.shape[:2]
+    each = sight.distances(images.reshape(-1, *images.shape[2:]), np.tile(heading_rad, count))
+    each = each.reshape(count, around, -1)
+    away = np.linalg.norm(xy_w[:, None] - made.xy_w, axis=-1)
+    said = {}
+    for what, evidence in (
+        (f"{around} images", each.sum(1) if sight.summed else each.min(1)),
+        ("1 image", each[:, 0]),
+    ):
+        found = evidence.argmin(-1)
+        error = away[np.arange(count), found]
+        said[f"localised by {what}, {'aligned' if sight.summed else 'nearest'}"] = (
+            f"nearest node {(found == away.argmin(-1)).mean():.3f}, within 1.5 m {(error < 1.5).mean():.3f}, "
+            f"median error {np.median(error):.2f} m (least possible {np.median(away.min(-1)):.2f} m)"
+        )
+    return said
 
 
 def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, data: DataConfig) -> TopologicalMap:

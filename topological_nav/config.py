@@ -156,10 +156,13 @@ class MapConfig:
     """Add nodes until every free place that one can drive to is joined by free edges."""
     passable: float = 0.5
     """Edges with at least this probability count as open where connectedness is told."""
+    check: int = 0
+    """Free places, drawn by chance, at which to try how well the finished map localises."""
 
     def __post_init__(self) -> None:
         require(self, "clearance_m", 0.0, 10.0)
         require(self, "min_per_room", 1, 1000)
+        require(self, "check", 0, 10**6)
         require(self, "spacing_m edge_m", 0.1, 100.0)
         require(self, "passable", 0.0, 1.0)
 

@@ -41,8 +41,10 @@ def test_every_command_draws(made):
 def test_the_nearest_image_of_a_node_may_judge_its_edges(made, tmp_path, capsys):
     out = tmp_path / "nearest.npz"
     runs = ["--localiser", str(made.rooms), "--detector", str(made.passages)]
-    assert main(["map", str(made.scene), *runs, "-o", str(out), "edge_image=nearest"]) == 0
-    assert "edges judged as on the plan" in capsys.readouterr().out
+    assert main(["map", str(made.scene), *runs, "-o", str(out), "edge_image=nearest", "check=3"]) == 0
+    told = capsys.readouterr().out
+    assert "edges judged as on the plan" in told
+    assert told.count("localised by 18 images") == 2 and told.count("localised by 1 image,") == 2
     first, second = load_map(made.map), load_map(out)
     assert (first.edges == second.edges).all() and (first.xy_w == second.xy_w).all()
     assert np.abs(first.p - second.p).max() > 0.01

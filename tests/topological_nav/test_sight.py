@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.topological_nav.test_graph import hand_map
+from topological_nav.build import localisation_check
 from topological_nav.errors import MapError
 from topological_nav.sight import OUT_OF_SIGHT_M, NetworkSight, PassagePolicy, TrueSight
 from topological_nav.space import FreeSpace
@@ -67,6 +68,29 @@ def test_a_map_of_other_networks_is_refused(made):
         NetworkSight(made, Fake("three"), Fake("two"))  # type: ignore[arg-type]
     with pytest.raises(MapError, match="made with detector two, this one is three"):
         NetworkSight(made, Fake("one"), Fake("three"))  # type: ignore[arg-type]
+
+
+def test_how_well_a_map_localises_by_hand():
+    made = hand_map({}, ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0)))
+
+    class Told:
+        """Images are the distances themselves."""
+
+        summed = True
+
+        def distances(self, images, heading_rad):
+            return images
+
+    places = np.array([[0.0, 0.1], [2.0, 1.8]])  # nearest nodes 0 and 2, 0.1 and 0.2 m away
+    images = np.array([[[1, 0, 2, 3], [1, 4, 2, 3]], [[9, 9, 1, 9], [9, 9, 1, 9]]], float)
+    # The first place: sums 2, 4, 4, 6: node 0; its first image alone: node 1, 2.00 m away. The second: node 2.
+    said = localisation_check(Told(), made, images, np.zeros(2), places)  # type: ignore[arg-type]
+    assert said == {
+        "localised by 2 images, aligned": "nearest node 1.000, within 1.5 m 1.000, median error 0.15 m "
+        "(least possible 0.15 m)",
+        "localised by 1 image, aligned": "nearest node 0.500, within 1.5 m 0.500, median error 1.10 m "
+        "(least possible 0.15 m)",
+    }
 
 
 def test_the_truth_sees_nodes_and_ways():
