@@ -9,6 +9,7 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+import interactive_nav
 from interactive_nav.scene import load_scene
 from tests.topological_nav.test_sight import two_rooms_space
 from tests.toys import write_room
@@ -17,10 +18,11 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.contest import Contest, Venue, hold, venues_of
 from topological_nav.errors import RunError, SettingsError, SpaceError
-from topological_nav.evaluation import Journeys, Marks, count_of, draw_journeys, play
+from topological_nav.evaluation import Journeys, Marks, count_of, draw_journeys, learned, play
 from topological_nav.plans import RECORDED
 from topological_nav.rooms import find_rooms
-from topological_nav.simulation import Seen
+from topological_nav.simulation import Seen, Simulator
+from train.policies import make_follower
 from train.rows import read_rows
 
 APARTMENT = "scenes_mjcf/apartment_0"
@@ -299,3 +301,17 @@ def test_in_a_real_home_true_sight_finds_most_goals(tmp_path):
     assert np.mean(rows["spl"].to_numpy()) >= 0.6
     assert np.mean(rows["within"].to_numpy()) >= 0.85
     assert load_scene(APARTMENT).split == rows["split"].to_pylist()[0]
+
+
+def test_a_policy_told_the_goal_plays_the_same_episodes(first, toy):
+    """By the yardstick that follows waypoints, in an environment with small objects, which stay away."""
+    contest, (venue,), _ = first
+    env = interactive_nav.make("ttbot", [toy], control_mode="twist", backend="native", num_objects=1)
+    simulator = Simulator(env)
+    journeys = venue.journeys
+    found = play(learned(simulator, make_follower(env), contest.config), simulator, journeys, contest.config)
+    assert found.success.all() and (found.goal_m < 1.5).all() and not found.localisations.any()
+    # Runs follow each other: an episode lasts whole runs.
+    assert found.duration_s == pytest.approx(5.0 * found.runs)
+    start = simulator.start(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, journeys.number, 0)
+    assert np.abs(np.asarray(start.info["nav"].object_pos_w)[:, 0, 0]).min() > 100.0  # parked
