@@ -189,7 +189,8 @@ class NavigatorConfig:
     run_s: float = 5.0
     """Length of a run."""
     glance: bool = True
-    """Localise by the image ahead after every run, and plan anew where it shows the next node or the goal's."""
+    """After every run, tell by the image ahead whether the robot is still at its node or at one joined to it, and plan
+    anew from there."""
     limit_s: float = 1800.0
     """Time after which an episode has failed."""
     kp: float = 2.0

@@ -140,8 +140,14 @@ class Venue:
 
     @functools.cached_property
     def simulator(self) -> Simulator:
-        """Of the navigator and the expert."""
+        """Of the navigator."""
         return Simulator(make_env(self.scene, self.contest.robot, self.contest.config.backend))
+
+    @functools.cached_property
+    def expert_simulator(self) -> Simulator:
+        """Of the expert, which plans for half of the robot's width: doorways are narrower than its diagonal."""
+        radius_m = self.robot.body_width_m / 2
+        return Simulator(make_env(self.scene, self.contest.robot, self.contest.config.backend, radius_m))
 
     @functools.cached_property
     def map(self) -> TopologicalMap:
@@ -180,7 +186,7 @@ class Venue:
         """Who plays, and in what."""
         config = self.contest.config
         if name == "expert":
-            return expert(self.simulator, config), self.simulator
+            return expert(self.expert_simulator, config), self.expert_simulator
         if name == "ppo":
             assert self.contest.ppo is not None
             simulator, policy = _learned(self.contest.ppo, self.scene, config)

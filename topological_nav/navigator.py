@@ -7,7 +7,8 @@
     SWING     the same at headings left and right of it, wider and wider
        |      none agrees: the edge costs more from now on; another one: FACE, else
     LEAN      turn to the most open of the headings asked, and drive all the same
-    DRIVE     the local policy, in runs of 5 s; after twelve, or at a glance of the next node: LOCALISE, or FACE
+    DRIVE     the local policy, in runs of 5 s; after twelve: LOCALISE. After each a glance: where the image ahead
+              shows a neighbour of the last node rather than that node, plan anew from there: FACE
 
 `Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
 sees a position, and looks at images only through `sight.Sight`. `Pilot` keeps the state for those who drive one robot.
@@ -76,7 +77,7 @@ class State:
     clock_s: np.ndarray
     """Time of the step before."""
     run: np.ndarray
-    """i32 runs done since the last localisation."""
+    """i32 runs done since the robot last looked about."""
     run_end_s: np.ndarray
     acts: np.ndarray
     """i32 control steps of this run."""
@@ -107,7 +108,7 @@ class Events:
     localised: np.ndarray
     """Turned about, and `State.node` is new."""
     glanced: np.ndarray
-    """Saw the next node or the goal's after a run, and `State.node` is new."""
+    """Saw a neighbour of the last node after a run, and `State.node` is new."""
     lost: np.ndarray
     """The map has no way from there."""
     blocked: np.ndarray
@@ -139,6 +140,8 @@ class Navigator:
         self.map, self.sight, self.policy, self.config = made, sight, policy, config
         self._tolerance = np.deg2rad(config.tolerance_deg)
         self._period = int(getattr(policy, "period", 1))
+        self._near = np.eye(len(made.xy_w), dtype=bool)
+        self._near[made.edges[:, 0], made.edges[:, 1]] = True
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[B] i32: the nodes nearest to goals, by the images [B, K, ...] taken there along headings [K]."""
@@ -309,7 +312,7 @@ class Navigator:
             s.phase[i], s.target_rad[i] = LEAN, s.best_rad[i]
 
     def _begin_drive(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
-        s.phase[rows], s.run[rows] = DRIVE, 0
+        s.phase[rows] = DRIVE
         self._begin_run(s, rows, time)
 
     def _begin_run(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
@@ -323,20 +326,20 @@ class Navigator:
         if len(ended):
             s.run_ended[ended] = True
             s.run[ended] += 1
-            if self.config.glance:
+            tired = s.run[ended] >= self.config.runs
+            self._begin_localise(s, ended[tired])
+            ended = ended[~tired]
+            if self.config.glance and len(ended):
                 away = self.sight.distances(images[ended], heading[ended])
-                found = away.argmin(-1).astype(np.int32)
-                following = np.where(s.edge[ended] >= 0, self.map.edges[s.edge[ended], 1], -1)
-                new = (found == following) | (found == s.goal[ended])
+                found = np.where(self._near[s.node[ended]], away, np.inf).argmin(-1).astype(np.int32)
+                new = found != s.node[ended]
                 s.node[ended[new]] = found[new]
                 s.glanced[ended[new]] = True
                 # A glance is no proof of having arrived: that takes a look about.
-                home = ended[new & (found == s.goal[ended])]
-                self._begin_localise(s, home)
+                self._begin_localise(s, ended[new & (found == s.goal[ended])])
                 self._plan(s, ended[new & (found != s.goal[ended])], heading)
                 ended = ended[~new]
-            self._begin_localise(s, ended[s.run[ended] >= self.config.runs])
-            self._begin_run(s, ended[s.run[ended] < self.config.runs], time)
+            self._begin_run(s, ended, time)
         acting = np.flatnonzero((s.phase == DRIVE) & (s.acts % self._period == 0))
         if len(acting):
             # Padded to a power of two by the first row: what is compiled for few sizes serves all.
@@ -349,7 +352,7 @@ class Navigator:
         s.acts[s.phase == DRIVE] += 1
 
     def _begin_localise(self, s: _Work, rows: np.ndarray) -> None:
-        s.phase[rows], s.looks[rows], s.edge[rows] = LOCALISE, 0, -1
+        s.phase[rows], s.looks[rows], s.edge[rows], s.run[rows] = LOCALISE, 0, -1, 0
         s.target_rad[rows] = np.nan
         s.evidence[rows] = self._no_evidence(len(rows))
         s.linear[rows] = s.angular[rows] = 0.0

@@ -46,13 +46,14 @@ class Seen:
     """[B] bool: the physics gave up on it, or lost contacts."""
 
 
-def make_env(scene: Scene, robot: str, backend: str) -> InteractiveNav:
+def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = None) -> InteractiveNav:
     """The environment that evaluation steps, on past what it itself would call the end of an episode.
 
     Args:
         scene: the only one.
         robot: its name; it must know control mode `twist`.
         backend: of physics.
+        radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
     """
     config = NavConfig(
         backend=backend,
@@ -62,7 +63,10 @@ def make_env(scene: Scene, robot: str, backend: str) -> InteractiveNav:
         episode_steps=10**8,
         num_waypoints=1,
     )
-    return InteractiveNav(get_robot(robot, CONTROL), (scene,), config)
+    spec = get_robot(robot, CONTROL)
+    if radius_m is not None:
+        spec = dataclasses.replace(spec, footprint_radius_m=radius_m)
+    return InteractiveNav(spec, (scene,), config)
 
 
 def episode_starts(start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, objects: int) -> EpisodeStart:

@@ -129,7 +129,7 @@ def test_twelve_runs_of_five_seconds_each_with_a_fresh_hidden_state():
     assert robot.state.looks[0] == 0 and robot.state.evidence[0].tolist() == [0.0] * 4
 
 
-def test_a_glance_at_the_next_node_plans_from_there():
+def test_a_glance_at_a_neighbour_plans_from_there():
     robot = Robot(square({(0, 1): 0.9, (1, 2): 0.9}), goal=2)
     robot.localise(0)
     robot.step(0, p=0.9)
@@ -137,6 +137,12 @@ def test_a_glance_at_the_next_node_plans_from_there():
         assert robot.step(1, p=0.9) == DRIVE  # within a run nobody looks where it is
     assert robot.step(1, p=0.9) == FACE and robot.events[-1].glanced[0] and robot.events[-1].run_ended[0]
     assert robot.state.node[0] == 1 and robot.state.target_rad[0] == pytest.approx(math.pi / 2)
+    # It goes on counting: after twelve runs in all it looks about, wherever it is.
+    assert robot.step(1, p=0.9) == DRIVE and robot.state.run[0] == 1
+    ended = 1
+    while robot.step(1, p=0.9) == DRIVE:
+        ended += int(robot.events[-1].run_ended[0])
+    assert ended == 11 and robot.state.phase[0] == LOCALISE and robot.state.run[0] == 0
 
 
 def test_a_glance_at_the_goal_is_checked_by_looking_about():
@@ -150,13 +156,20 @@ def test_a_glance_at_the_goal_is_checked_by_looking_about():
     assert robot.state.phase[0] == ARRIVED
 
 
-def test_a_glance_at_another_node_changes_nothing():
-    robot = Robot(square({(0, 1): 0.9, (1, 2): 0.9}), goal=2)
+def test_a_glance_chooses_among_the_node_and_its_neighbours():
+    # A chain of four: 0 - 1 - 2 - 3, 2 m apart.
+    made = hand_map({}, ((0.0, 0.0), (2.0, 0.0), (4.0, 0.0), (6.0, 0.0)))
+    made = dataclasses.replace(made, embeddings=np.zeros((4, 6, 2), np.float32))
+    robot = Robot(Navigator(made, Told(), Counting(), NavigatorConfig(images=6)), goal=3)
     robot.localise(0)
     robot.step(0, p=0.9)
     for _ in range(50):
-        robot.step(3, p=0.9)
+        robot.step(0, p=0.9)
     assert robot.state.phase[0] == DRIVE and robot.state.run[0] == 1 and robot.state.node[0] == 0
+    assert not robot.events[-1].glanced[0]
+    for _ in range(50):
+        robot.step(3, p=0.9)  # looks like node 3, which cannot be: of 0 and 1, 1 is more like it
+    assert robot.events[-1].glanced[0] and robot.state.node[0] == 1 and robot.state.phase[0] == FACE
 
 
 def swings(robot, node, p):
