@@ -1,4 +1,4 @@
-"""`python -m topological_nav data|train|map|adapt`: words on the command line in, datasets, networks and maps out.
+"""`python -m topological_nav data|train|map|navigate|evaluate|adapt`: words in, files and pictures out.
 
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
 """
@@ -18,8 +18,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from scenes_mjcf.schema import SceneError
 from topological_nav import adapt_commands
-from topological_nav.config import DataConfig, MapConfig, passage_config, room_config
-from topological_nav.errors import TopologicalError
+from topological_nav.config import DataConfig, EvaluationConfig, MapConfig, passage_config, room_config
+from topological_nav.errors import SettingsError, TopologicalError
 from topological_nav.settings import overridden, settings_help
 from train.errors import TrainError
 
@@ -62,6 +62,35 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
     plan.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"map (default {RUNS}/maps/SCENE.npz)")
     plan.add_argument("--route", nargs=2, type=int, metavar=("FROM", "TO"), help="draw the way between two nodes")
+    one = command("navigate", "Drives one episode of a scene and draws it.", EvaluationConfig())
+    one.add_argument("scene", metavar="SCENE", help="scene folder")
+    one.add_argument("--episode", type=int, default=0, metavar="N", help="of the scene's (default 0)")
+    one.add_argument("--sparse", action="store_true", help="on the map thinned out")
+    one.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"picture (default {RUNS}/navigate/SCENE-N.png)")
+    one.add_argument("--video", type=Path, metavar="PATH", help="film it as well (.mp4), ten times as fast")
+    several = command("evaluate", "Plays fixed episodes of scenes and scores them.", EvaluationConfig())
+    several.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
+    several.add_argument(
+        "--contenders",
+        metavar="NAMES",
+        help="comma-separated choice from dense, sparse (the navigator on its map, and on the map thinned out), "
+        "expert, ppo (default: all that can be played)",
+    )
+    several.add_argument("--ppo", type=Path, metavar="RUN", help="run folder of `python -m train`: told the goal")
+    several.add_argument("-o", "--out", type=Path, default=RUNS / "evaluation", metavar="DIR", help="rows and figures")
+    for sub in (one, several):
+        sub.add_argument("--maps", type=Path, default=RUNS / "maps", metavar="DIR", help="of SCENE.npz")
+        sub.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
+        sub.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
+        sub.add_argument(
+            "--policy",
+            default="passage",
+            metavar="RUN",
+            help="local policy; passage (default): straight on while the detector agrees, else turn",
+        )
+        sub.add_argument(
+            "--truth", action="store_true", help="maps from the plan, and the truth instead of both networks"
+        )
     adapt_commands.add_to(command, DATASET, RUNS)
     return made
 
@@ -73,7 +102,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
     try:
-        {"data": _data, "train": _train, "map": _map, "adapt": _adapt}[arguments.command](arguments)
+        run = {
+            "data": _data,
+            "train": _train,
+            "map": _map,
+            "navigate": _navigate,
+            "evaluate": _evaluate,
+            "adapt": _adapt,
+        }
+        run[arguments.command](arguments)
     except (TopologicalError, SceneError, TrainError) as error:
         print(f"topological_nav: {error}", file=sys.stderr)
         return 2
@@ -134,14 +171,22 @@ def _train(arguments: argparse.Namespace) -> None:
 
 def _map(arguments: argparse.Namespace) -> None:
     config = overridden(MapConfig(), arguments.settings)
-    from topological_nav.build import build_map
+    from topological_nav.build import build_map, forget
     from topological_nav.figures import map_figure, save
     from topological_nav.graph import save_map
 
     out = arguments.out or RUNS / "maps" / f"{Path(arguments.scene).resolve().name}.npz"
-    with _bar() as tell:
-        built = build_map(Path(arguments.scene), arguments.localiser, arguments.detector, config, tell)
+    parts = out.with_name(f"{out.name}.parts")
+    with _stops() as stops, _bar() as tell:
+
+        def progress(what: str, done: int, total: int) -> None:
+            tell(what, done, total)
+            if stops:
+                raise Stopped(stops[0])
+
+        built = build_map(Path(arguments.scene), arguments.localiser, arguments.detector, config, progress, parts)
     save_map(built.map, out)
+    forget(parts)
     route = None
     if arguments.route:
         route = built.map.plan(*arguments.route)
@@ -154,6 +199,85 @@ def _map(arguments: argparse.Namespace) -> None:
         f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges, {out.stat().st_size / 1024:.0f} KiB; "
         f"drawn in {picture}"
     )
+
+
+def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
+    from topological_nav.contest import Contest
+
+    return Contest(
+        scenes=tuple(Path(scene) for scene in scenes),
+        contenders=tuple(contenders),
+        out=out,
+        config=overridden(EvaluationConfig(), arguments.settings),
+        truth=arguments.truth,
+        maps=arguments.maps,
+        localiser=arguments.localiser,
+        detector=arguments.detector,
+        policy=arguments.policy,
+        ppo=getattr(arguments, "ppo", None),
+    )
+
+
+def _navigate(arguments: argparse.Namespace) -> None:
+    from topological_nav.figures import save
+    from topological_nav.journey import drive_episode, film
+
+    contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
+    if arguments.video and arguments.video.suffix != ".mp4":
+        raise SettingsError(f"--video {arguments.video}: expected a name that ends in .mp4")
+    name = Path(arguments.scene).resolve().name
+    out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
+    with _stops() as stops, _bar() as tell:
+
+        def progress(time_s: float) -> None:
+            tell(f"{name}, simulated s", int(time_s), int(contest.config.limit_s))
+            if stops:
+                raise Stopped(stops[0])
+
+        driven = drive_episode(contest, arguments.episode, bool(arguments.video), progress)
+    for line in driven.told:
+        print(line)
+    save(driven.figure(), out)
+    print(f"{out}: {driven.outcome}")
+    if arguments.video:
+        print(f"{arguments.video}: {film(driven, arguments.video)} frames")
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from topological_nav.contest import hold, tracks_of, venues_of
+    from topological_nav.episode_figures import journeys_figure
+    from topological_nav.figures import save
+    from topological_nav.scores import console_table, differences, markdown, summary, where
+    from train.files import write_text
+
+    names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
+    names = arguments.contenders.split(",") if arguments.contenders else names
+    contest = _contest(arguments, arguments.scenes, names, arguments.out)
+    with _stops() as stops, _bar() as tell:
+
+        def progress(what: str, done: int, total: int) -> None:
+            tell(what, done, total)
+            if stops and done < total:
+                raise Stopped(stops[0])
+
+        venues = venues_of(contest)
+        rows = hold(contest, venues, progress)
+    for venue in venues:
+        panels = {}
+        for name in contest.contenders:
+            mine = where(rows, scene=venue.scene.name, contender=name).to_pylist()
+            made = venue.map_of(name) if name in ("dense", "sparse") else None
+            panels[name] = (made, tracks_of(contest, venue, name), {row["episode"]: row for row in mine})
+        save(
+            journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable),
+            contest.out / f"{venue.scene.name}.png",
+        )
+    lines, compared = summary(rows), differences(rows)
+    write_text(contest.out / "summary.md", markdown(lines, compared))
+    Console(width=None if sys.stdout.isatty() else 160).print(console_table(lines))
+    for difference in compared:
+        print(f"{difference.compared}, {difference.score}: {difference}")
+    print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")
 
 
 def _adapt(arguments: argparse.Namespace) -> None:

@@ -156,9 +156,86 @@ class MapConfig:
     """Add nodes until every free place that one can drive to is joined by free edges."""
     passable: float = 0.5
     """Edges with at least this probability count as open where connectedness is told."""
+    check: int = 0
+    """Free places, drawn by chance, at which to try how well the finished map localises."""
 
     def __post_init__(self) -> None:
         require(self, "clearance_m", 0.0, 10.0)
         require(self, "min_per_room", 1, 1000)
+        require(self, "check", 0, 10**6)
         require(self, "spacing_m edge_m", 0.1, 100.0)
         require(self, "passable", 0.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class NavigatorConfig:
+    """How the navigator localises, turns and drives. Defaults: the report's where it gives a value."""
+
+    images: int = 18
+    """Images that one localisation looks at, evenly about; a divisor of the map's images a node."""
+    match: Literal["aligned", "nearest"] = "aligned"
+    """An image is compared with the nodes' images of its own heading, and all are summed (aligned); or with all of
+    them, and the nearest of all decides (nearest)."""
+    passable: float = 0.5
+    """The passage detector agrees from this probability on."""
+    swing_deg: float = 15.0
+    """Step of the swing left and right."""
+    swings: int = 4
+    """Steps to each side before an edge counts as blocked."""
+    tolerance_deg: float = 3.0
+    """A heading is reached when it is off by less."""
+    runs: int = 12
+    """Runs of the local policy between two localisations."""
+    run_s: float = 5.0
+    """Length of a run."""
+    glance: bool = True
+    """After every run, tell by the image ahead whether the robot is still at its node or at one joined to it, and plan
+    anew from there."""
+    limit_s: float = 1800.0
+    """Time after which an episode has failed."""
+    kp: float = 2.0
+    """Proportional gain of turning, 1/s."""
+    ki: float = 0.2
+    """Integral gain, 1/s^2."""
+    kd: float = 0.05
+    """Derivative gain."""
+    max_turn_rad_s: float = 1.0
+    """Fastest turn on the spot."""
+
+    def __post_init__(self) -> None:
+        require(self, "images swings runs", 1, 1000)
+        require(self, "passable", 0.0, 1.0)
+        require(self, "swing_deg", 1.0, 180.0)
+        require(self, "tolerance_deg", 0.1, 45.0)
+        require(self, "run_s limit_s", 0.1, 1e6)
+        require(self, "kp ki kd", 0.0, 100.0)
+        require(self, "max_turn_rad_s", 0.01, 10.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig(NavigatorConfig):
+    """Episodes, and how they are scored."""
+
+    seed: int = 0
+    """Of the episodes."""
+    episodes: int | None = None
+    """A scene; auto: one for every 2 square metres of floor, 25 to 60."""
+    min_goal_m: float = 2.5
+    """Start and goal are in different rooms and farther apart than this."""
+    success_m: float = 1.5
+    """A run that ends nearer to the goal than this has reached it."""
+    clearance_m: float = 0.35
+    """Least distance of starts and goals from obstacles; TTbot's corners reach 0.33 m."""
+    thinned: float = 0.4
+    """Share of each room's nodes that the sparse map of the ablation keeps."""
+    batch: int | None = None
+    """Episodes played at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
+    backend: Literal["auto", "warp", "jax", "native"] = "auto"
+    """Physics: as in `interactive_nav`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "episodes batch", 1, 10**6)
+        require(self, "min_goal_m success_m clearance_m", 0.0, 1000.0)
+        require(self, "thinned", 0.01, 1.0)

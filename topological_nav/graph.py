@@ -30,6 +30,10 @@ from train.files import whole_file
 
 FORMAT = 1
 """Of map files; raised whenever older ones would be read wrongly."""
+ROOMY_M = 0.5
+"""Nodes added to join parts of a map keep to the middle of what is narrower than twice this."""
+TIGHT_COST = 4.0
+"""A metre of the way between parts costs up to so many metres more, the nearer to obstacles."""
 LEAST_P = 1e-6
 """Probabilities stay this far from 0, so that weights are finite, and from 1, so that every edge costs something."""
 
@@ -93,6 +97,27 @@ class TopologicalMap:
         angles = tuple(self.graph.edges[a, b]["angle_rad"] for a, b in zip(nodes, nodes[1:], strict=False))
         return Route(tuple(nodes), angles, float(cost))
 
+    @functools.cached_property
+    def weight(self) -> np.ndarray:
+        """[E] -log p of the edges."""
+        return np.array([edge_weight(p) for p in self.p.tolist()])
+
+    def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
+        """The first edge of the cheapest way between two different nodes; -1 where there is none.
+
+        Args:
+            start: node.
+            goal: node.
+            penalty: [E] added to the edges' weights.
+        """
+        weight = self.weight if penalty is None else self.weight + penalty
+        size = len(self.xy_w)
+        back = csr_array((weight, (self.edges[:, 1], self.edges[:, 0])), shape=(size, size))
+        left = np.asarray(dijkstra(back, indices=goal))
+        out = np.flatnonzero(self.edges[:, 0] == start)
+        total = weight[out] + left[self.edges[out, 1]]
+        return int(out[total.argmin()]) if len(out) and np.isfinite(total.min()) else -1
+
     def localise(self, embeddings: np.ndarray) -> np.ndarray:
         """[Q] i32: the node nearest to each embedding [Q, D], over all images of all nodes."""
         return nearest_node(embeddings, self.embeddings)[0]
@@ -103,6 +128,33 @@ class TopologicalMap:
         graph = nx.DiGraph(kept)
         graph.add_nodes_from(self.graph)
         return sorted((sorted(part) for part in nx.strongly_connected_components(graph)), key=lambda p: (-len(p), p))
+
+    def thinned(self, share: float, seed: int) -> TopologicalMap:
+        """The map with fewer nodes: a sparse one that may fall apart.
+
+        Args:
+            share: of each room's nodes that stay, drawn at random; at least one a room.
+            seed: of the draw.
+        """
+        rng = np.random.default_rng([seed, 11])
+        kept = []
+        for room in np.unique(self.room):
+            mine = np.flatnonzero(self.room == room)
+            kept.append(rng.choice(mine, max(1, round(share * len(mine))), replace=False))
+        rows = np.sort(np.concatenate(kept))
+        number = np.full(len(self.xy_w), -1, np.int32)
+        number[rows] = np.arange(len(rows))
+        edges = (number[self.edges] >= 0).all(1)
+        return dataclasses.replace(
+            self,
+            xy_w=self.xy_w[rows],
+            room=self.room[rows],
+            embeddings=self.embeddings[rows],
+            edges=number[self.edges[edges]],
+            p=self.p[edges],
+            angle_rad=self.angle_rad[edges],
+            about={**self.about, "thinned": share, "thinned_seed": seed},
+        )
 
 
 def edge_weight(p: float) -> float:
@@ -129,8 +181,8 @@ def place_nodes(
 
     In every room one place after the other becomes a node, each time the one that has most places within `spacing_m`
     that no node has yet. A room that needs fewer than `min_per_room`
-    is covered again with less spacing. Then, where `connect` is set, nodes are added along the shortest free way
-    between parts of the map that no free edge joins.
+    is covered again with less spacing. Then, where `connect` is set, nodes are added along the free way
+    between parts of the map that no free edge joins which is shortest where room to the sides counts as well.
 
     Args:
         space: of the scene.
@@ -194,7 +246,8 @@ def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, po
     """Nodes added until free edges join all that a free way joins; and the number of parts left."""
     cells = space.centres(margin_m)
     index = {key: i for i, key in enumerate(map(tuple, _cells(space, cells)))}
-    lattice = _lattice(index, space.resolution_m)
+    room_m = space.at(cells)
+    lattice = _lattice(index, space.resolution_m * (1.0 + TIGHT_COST * np.clip(1.0 - room_m / ROOMY_M, 0.0, 1.0)))
     while True:
         graph = nx.Graph()
         graph.add_nodes_from(range(len(xy)))
@@ -223,13 +276,21 @@ def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, po
 
 
 def _stations(space: FreeSpace, way: np.ndarray, edge_m: float, margin_m: float, points: int) -> np.ndarray:
-    """Places on a way [n, 2], ends left out, each in free reach of the one before: as far along as they can be."""
-    chosen, at = [], 0
+    """Places on a way [n, 2], ends left out, each in free reach of the one before.
+
+    Of those in reach, the one with the most room in the farther half; the end as soon as it is in reach.
+    """
+    chosen, at, room_m = [], 0, np.minimum(space.at(way), ROOMY_M)
     while at < len(way) - 1:
         ahead = way[at + 1 :]
         reach = np.linalg.norm(ahead - way[at], axis=1) < edge_m
         seen = reach & space.segment_free(np.broadcast_to(way[at], ahead.shape), ahead, points, margin_m)
-        at += 1 + int(np.flatnonzero(seen)[-1])
+        last = at + 1 + int(np.flatnonzero(seen)[-1])
+        if last < len(way) - 1:
+            steps = at + 1 + np.flatnonzero(seen)
+            steps = steps[steps - at > (last - at) // 2][::-1]  # of equals the farthest
+            last = int(steps[room_m[steps].argmax()])
+        at = last
         chosen.append(way[at])
     return np.array(chosen[:-1]).reshape(-1, 2)
 
@@ -238,11 +299,17 @@ def _cells(space: FreeSpace, xy: np.ndarray) -> np.ndarray:
     return np.floor((xy - space.origin_w) / space.resolution_m).astype(int)
 
 
-def _lattice(index: dict[tuple[int, int], int], step: float) -> csr_array:
-    """Cells that share a side, so that the straight way between their centres is as free as they are."""
+def _lattice(index: dict[tuple[int, int], int], cost: np.ndarray) -> csr_array:
+    """Cells that share a side, so that the straight way between their centres is as free as they are.
+
+    Args:
+        index: (column, row) -> number of a cell.
+        cost: [cells] of a step within each; a step between two costs their mean.
+    """
     pairs = [(i, index.get(side, -1)) for (x, y), i in index.items() for side in ((x + 1, y), (x, y + 1))]
     first, second = np.array([pair for pair in pairs if pair[1] >= 0], int).reshape(-1, 2).T
-    entries = (np.full(2 * len(first), step), (np.r_[first, second], np.r_[second, first]))
+    between = 0.5 * (cost[first] + cost[second])
+    entries = (np.r_[between, between], (np.r_[first, second], np.r_[second, first]))
     return csr_array(entries, shape=(len(index), len(index)))
 
 

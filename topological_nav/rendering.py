@@ -21,7 +21,7 @@ from interactive_nav.scene import Scene
 from topological_nav.errors import TopologicalError
 
 BATCH = 18
-"""Images a call: the headings of one position and pitch."""
+"""Images a call unless asked otherwise: the headings of one position and pitch."""
 _SHOWN = 2
 """Geom group of all that is drawn."""
 
@@ -57,7 +57,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 class SceneRenderer:
     """Draws one scene, its furniture at rest and no robot in it."""
 
-    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp"):
+    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", batch: int = BATCH):
         """Loads the scene's meshes; the first picture may compile.
 
         Args:
@@ -65,8 +65,9 @@ class SceneRenderer:
             lens: of the images returned.
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
+            batch: images a call of the engine; fewer are padded.
         """
-        self._lens, self._by = lens, supersample
+        self._lens, self._by, self._batch = lens, supersample, batch
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
         self._model = _visual_model(scene, self._large)
         self._data = mujoco.MjData(self._model)
@@ -80,11 +81,11 @@ class SceneRenderer:
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
         count = len(pos)
         out = np.empty((count, self._lens.height, self._lens.width, 3), np.uint8)
-        for first in range(0, count, BATCH):
-            # Padded by its first camera: Warp draws batches of one size only.
-            rows = np.minimum(np.arange(first, first + BATCH), count - 1)
+        for first in range(0, count, self._batch):
+            # Padded by the last camera: Warp draws batches of one size only.
+            rows = np.minimum(np.arange(first, first + self._batch), count - 1)
             drawn = self._draw(pos[rows], axes[rows])[: count - first]
-            out[first : first + BATCH] = shrink(drawn, self._by)
+            out[first : first + self._batch] = shrink(drawn, self._by)
         return out
 
     def _warp_painter(self):
@@ -94,9 +95,9 @@ class SceneRenderer:
             raise TopologicalError(
                 f"engine 'warp' does not start here ({error}); pip install 'interactive-nav[warp]', or engine=gl"
             ) from error
-        painter = WarpColour(self._model, self._large, BATCH, [_SHOWN])
-        xpos = np.tile(self._data.geom_xpos, (BATCH, 1, 1))
-        xmat = np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (BATCH, 1, 1, 1))
+        painter = WarpColour(self._model, self._large, self._batch, [_SHOWN])
+        xpos = np.tile(self._data.geom_xpos, (self._batch, 1, 1))
+        xmat = np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (self._batch, 1, 1, 1))
         return lambda pos, axes: np.asarray(painter.draw(xpos, xmat, CameraPose(pos, axes)))
 
     def _gl_painter(self):

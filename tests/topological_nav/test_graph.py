@@ -165,7 +165,8 @@ def test_parts_that_a_way_joins_are_joined(plan):
     assert len(xy) == 2 and parts(space, xy) == 2  # one node a room: the partition stands between them
     xy, lacking = graph.place_nodes(space, rooms, MapConfig(min_per_room=1, spacing_m=100.0), 0.225, 50)
     assert parts(space, xy) == 1 and lacking == [] and len(xy) > 2
-    assert (space.at(xy) >= 0.225).all()
+    # Where there is room, they keep off the walls: the gap is 1 m wide, and a shortest way would graze its edge.
+    assert (space.at(xy[2:]) >= 0.4).all()
 
 
 def test_rooms_that_no_way_joins_are_told(plan):

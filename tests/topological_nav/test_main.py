@@ -1,14 +1,17 @@
 """The commands: what they write, draw and refuse."""
 
+import signal
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from interactive_nav.scene import load_scene
-from topological_nav import rooms
+from topological_nav import build, rooms
 from topological_nav.__main__ import main
 from topological_nav.graph import load_map
 from topological_nav.localise import nearest_node
+from topological_nav.rendering import SceneRenderer
 
 
 def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
@@ -38,14 +41,44 @@ def test_every_command_draws(made):
 def test_the_nearest_image_of_a_node_may_judge_its_edges(made, tmp_path, capsys):
     out = tmp_path / "nearest.npz"
     runs = ["--localiser", str(made.rooms), "--detector", str(made.passages)]
-    assert main(["map", str(made.scene), *runs, "-o", str(out), "edge_image=nearest"]) == 0
-    assert "edges judged as on the plan" in capsys.readouterr().out
+    assert main(["map", str(made.scene), *runs, "-o", str(out), "edge_image=nearest", "check=3"]) == 0
+    told = capsys.readouterr().out
+    assert "edges judged as on the plan" in told
+    assert told.count("localised by 18 images") == 2 and told.count("localised by 1 image,") == 2
     first, second = load_map(made.map), load_map(out)
     assert (first.edges == second.edges).all() and (first.xy_w == second.xy_w).all()
     assert np.abs(first.p - second.p).max() > 0.01
     # Where an edge runs along one of the 18 headings, both looked at the same image.
     along = np.abs((first.angle_rad / np.deg2rad(20) + 0.5) % 1 - 0.5) < 1e-4
     assert first.p[along] == pytest.approx(second.p[along], abs=1e-4)
+
+
+def test_a_map_that_was_stopped_goes_on(made, tmp_path, monkeypatch):
+    runs = ["--localiser", str(made.rooms), "--detector", str(made.passages)]
+    out, drawn = tmp_path / "map.npz", []
+    draw = SceneRenderer.draw
+    monkeypatch.setattr(build, "CHUNK", 54)
+    monkeypatch.setattr(SceneRenderer, "draw", lambda self, pose: drawn.append(len(pose.pos_w)) or draw(self, pose))
+
+    def interrupted(self, pose):
+        if len(drawn) == 3:
+            signal.raise_signal(signal.SIGINT)
+        drawn.append(len(pose.pos_w))
+        return draw(self, pose)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SceneRenderer, "draw", interrupted)
+        assert main(["map", str(made.scene), *runs, "-o", str(out)]) == 128 + signal.SIGINT
+    parts = tmp_path / "map.npz.parts"
+    assert not out.exists() and len(list(parts.iterdir())) == 4 and drawn == [54] * 4
+    next(iter(sorted(parts.iterdir()))).write_bytes(b"damaged")
+    drawn.clear()
+    assert main(["map", str(made.scene), *runs, "-o", str(out)]) == 0
+    one, two = load_map(made.map), load_map(out)
+    images = 18 * len(two.xy_w) + len(two.edges)
+    assert sum(drawn) == images - 3 * 54 and not parts.exists()
+    for name in ("xy_w", "embeddings", "edges", "p"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
 @pytest.mark.parametrize(

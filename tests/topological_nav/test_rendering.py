@@ -64,3 +64,10 @@ def test_walls_have_their_colours_and_batches_of_any_size_their_order(painted):
     green = middle[:, 1] > 2 * middle[:, 0]
     assert (red == (np.arange(n) % 2 == 0)).all() and (green == ~red).all()
     assert (images[0] == images[2]).all() and (images[-1] == images[0]).all()
+
+
+def test_images_do_not_depend_on_how_many_are_drawn_at_once(painted):
+    scene, lens, robot = load_scene(painted), Lens(16, 12, 60.0), get_robot("ttbot")
+    pose = camera_pose(robot, np.array([-1.5, 0.0]), np.linspace(0.0, 6.0, 8), np.zeros(8))
+    few = SceneRenderer(scene, lens, batch=3).draw(pose)
+    assert (few == SceneRenderer(scene, lens).draw(pose)).all() and few.std() > 10

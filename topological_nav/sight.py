@@ -1,0 +1,145 @@
+"""What a navigator makes of images: how far each node of its map is from where they were taken, and what lies ahead.
+
+The navigator itself never looks into an image. `NetworkSight` asks trained networks; `TrueSight` stands in for perfect
+ones in tests and measurements: its "images" are poses.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from topological_nav.errors import MapError
+from topological_nav.graph import TopologicalMap
+from topological_nav.space import FreeSpace
+from topological_nav.training import Trained
+
+OUT_OF_SIGHT_M = 100.0
+"""Added to the distance of a node behind a wall, for `TrueSight`."""
+LINE_POINTS = 50
+"""Looked up on a line of sight."""
+
+
+class Sight(Protocol):
+    """Judges images, in batches; an image is one row of an array, of any shape that the judge understands."""
+
+    summed: bool
+    """Whether distances of several images are summed; else the least counts."""
+
+    def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """Images [n, ...] taken along headings [n] to [n, N]: how far each node is."""
+        ...
+
+    def passage(self, images: np.ndarray) -> np.ndarray:
+        """[n] probability that the way ahead is navigable."""
+        ...
+
+
+class NetworkSight:
+    """A map, the network that embeds and the one that judges passages."""
+
+    def __init__(self, made: TopologicalMap, localiser: Trained, detector: Trained, match: str = "aligned"):
+        """Checks that the map is of these networks.
+
+        Args:
+            made: the map.
+            localiser: its embedding localises.
+            detector: judges passages.
+            match: aligned or nearest, see `config.NavigatorConfig.match`.
+
+        Raises:
+            MapError: the map was made with other networks, whose embeddings mean something else.
+        """
+        for name, network in (("localiser", localiser), ("detector", detector)):
+            used, own = made.about.get(name, ""), network.about["digest"]
+            if used != own:
+                raise MapError(
+                    f"the map of '{made.scene}' was made with {name} {used[:12] or 'unknown'}, this one is {own[:12]}; "
+                    "build the map again with it, or name the runs it was made with"
+                )
+        self._nodes = made.embeddings.astype(float)
+        self._localiser, self._detector, self.summed = localiser, detector, match == "aligned"
+
+    def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """[n, N] Euclidean distances of embeddings: to the node's image of that heading, or to its nearest."""
+        asked = self._localiser.embed(images).astype(float)
+        nodes, around = self._nodes, self._nodes.shape[1]
+        if self.summed:
+            turn = np.rint(np.asarray(heading_rad) / (2 * np.pi) * around).astype(int) % around
+            out = np.empty((len(asked), len(nodes)))
+            for k in np.unique(turn):
+                rows = turn == k
+                out[rows] = _apart(asked[rows], nodes[:, k])
+            return out
+        return _apart(asked, nodes.reshape(-1, nodes.shape[-1])).reshape(len(asked), -1, around).min(-1)
+
+    def passage(self, images: np.ndarray) -> np.ndarray:
+        """[n] the detector's probability."""
+        return 1.0 / (1.0 + np.exp(-self._detector.logits(images)[:, 0]))
+
+
+class TrueSight:
+    """The truth in the place of networks: images are poses [n, 3], x and y (m) and yaw (rad), world frame."""
+
+    summed = True
+
+    def __init__(self, made: TopologicalMap, space: FreeSpace, ahead_m: float = 1.0, margin_m: float = 0.225):
+        """Takes the plan.
+
+        Args:
+            made: the map; of it only where its nodes stand.
+            space: free space of its scene.
+            ahead_m: how far the way must be free.
+            margin_m: clearance that it needs.
+        """
+        self._xy, self._space, self._ahead_m, self._margin_m = made.xy_w.astype(float), space, ahead_m, margin_m
+
+    def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """[n, N] m to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
+        del heading_rad
+        here = np.broadcast_to(images[:, None, :2], (len(images), len(self._xy), 2))
+        seen = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
+        return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~seen
+
+    def passage(self, images: np.ndarray) -> np.ndarray:
+        """[n] 1 where the way ahead is free, else 0."""
+        xy, yaw = images[:, :2], images[:, 2]
+        end = xy + self._ahead_m * np.stack([np.cos(yaw), np.sin(yaw)], -1)
+        return self._space.segment_free(xy, end, LINE_POINTS, self._margin_m).astype(float)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[n, m] Euclidean distances of rows [n, D] and [m, D], in double precision as in `localise.nearest_node`."""
+    squares = (a**2).sum(-1)[:, None] + (b**2).sum(-1) - 2.0 * a @ b.T
+    return np.sqrt(np.maximum(squares, 0.0))
+
+
+class PassagePolicy:
+    """The baseline that drives by the passage detector alone: straight on while it agrees, else it swings about.
+
+    It turns left by `SWEEP_RAD`, then right by twice as much, and so on wider, until the detector agrees.
+    """
+
+    period = 3
+    """Control steps between two looks; in between the last command holds."""
+    CRUISE_M_S = 0.4
+    TURN_RAD_S = 0.5
+    SWEEP = 4
+    """Looks (of 0.15 rad) that the first turn to the left lasts."""
+
+    def __init__(self, sight: Sight, passable: float = 0.5):
+        self._sight, self._passable = sight, passable
+
+    def start(self, batch: int) -> Any:
+        """[batch] i32 looks since the way was last free."""
+        return np.zeros(batch, np.int32)
+
+    def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """See `driving.LocalPolicy`."""
+        free = self._sight.passage(images) >= self._passable
+        # Turns end after 1, 3, 5, ... times SWEEP looks: sides change after SWEEP * k^2.
+        side = np.where(np.floor(np.sqrt(state / self.SWEEP)).astype(int) % 2 == 0, 1.0, -1.0)
+        linear = np.where(free, self.CRUISE_M_S, 0.0)
+        angular = np.where(free, 0.0, side * self.TURN_RAD_S)
+        return np.where(free, 0, state + 1).astype(np.int32), linear, angular

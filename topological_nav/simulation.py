@@ -1,0 +1,143 @@
+"""Velocity commands in, poses, images and contacts out: TTbot in a scene, many at a time, at 10 Hz.
+
+Physics is `interactive_nav`'s environment with furniture where it stands at rest and nothing strewn about. Images show
+the scene at rest as well: what a robot has pushed away is still seen where it stood.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.config import NavConfig
+from interactive_nav.env import InteractiveNav
+from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav.scene import Scene
+from interactive_nav.types import EpisodeStart
+from topological_nav.rendering import SceneRenderer, camera_pose
+
+Camera = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Places [n, 2] (m) and headings [n] (rad) to what is seen there [n, ...]."""
+CONTROL = "twist"
+"""Control mode whose action is a base velocity."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """Where a batch of robots is."""
+
+    xy_w: np.ndarray
+    """[B, 2] m."""
+    yaw_rad: np.ndarray
+    """[B]."""
+    path_m: np.ndarray
+    """[B] driven so far."""
+    movable: np.ndarray
+    """[B] bool: touched something movable in the last control step."""
+    wall: np.ndarray
+    """[B] bool: touched a wall in it."""
+    broken: np.ndarray
+    """[B] bool: the physics gave up on it, or lost contacts."""
+
+
+def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = None) -> InteractiveNav:
+    """The environment that evaluation steps, on past what it itself would call the end of an episode.
+
+    Args:
+        scene: the only one.
+        robot: its name; it must know control mode `twist`.
+        backend: of physics.
+        radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
+    """
+    config = NavConfig(
+        backend=backend,
+        control_mode=CONTROL,
+        num_objects=0,
+        observations=("localisation",),
+        episode_steps=10**8,
+        num_waypoints=1,
+    )
+    spec = get_robot(robot, CONTROL)
+    if radius_m is not None:
+        spec = dataclasses.replace(spec, footprint_radius_m=radius_m)
+    return InteractiveNav(spec, (scene,), config)
+
+
+def episode_starts(start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, objects: int) -> EpisodeStart:
+    """Starts of B episodes in an environment's first scene, small objects left out."""
+    batch = len(start_xy_w)
+    return EpisodeStart(
+        scene_index=jnp.zeros(batch, jnp.int32),
+        start_xy_w=jnp.asarray(start_xy_w, jnp.float32),
+        start_yaw_rad=jnp.asarray(yaw_rad, jnp.float32),
+        goal_xy_w=jnp.asarray(goal_xy_w, jnp.float32),
+        small_xy_w=jnp.zeros((batch, objects, 2)),
+        small_yaw_rad=jnp.zeros((batch, objects)),
+        small_placed=jnp.zeros((batch, objects), bool),
+    )
+
+
+class Simulator:
+    """A batch of robots in one environment; the state travels, so that it can be thinned out."""
+
+    def __init__(self, env: Any):
+        """Compiles on the first call, and anew for every size of a batch.
+
+        Args:
+            env: of `make_env`, or any `InteractiveNav`.
+        """
+        self.env = env
+        self._reset = jax.jit(jax.vmap(env.reset_to))
+        self._advance = jax.jit(jax.vmap(env.advance))
+        self._step = jax.jit(jax.vmap(env.step))
+
+    @property
+    def dt_s(self) -> float:
+        """Control period."""
+        return self.env.dt
+
+    def start(
+        self, start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, number: np.ndarray, seed: int
+    ) -> Any:
+        """States of B episodes, with observations; noise of an episode depends on its number [B] and the seed."""
+        objects = len(self.env.world.small_objects)
+        keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.asarray(number))
+        return self._reset(episode_starts(start_xy_w, yaw_rad, goal_xy_w, objects), keys)
+
+    def drive(self, state: Any, linear: np.ndarray, angular: np.ndarray) -> Any:
+        """One control step under base velocities [B] m/s and [B] rad/s."""
+        robot: RobotSpec = self.env.robot
+        return self._advance(state, jnp.asarray(robot.drive(linear, angular, np), jnp.float32))
+
+    def act(self, state: Any, action: Any) -> Any:
+        """One control step under the environment's own actions [B, A], observed."""
+        return self._step(state, action)
+
+    def seen(self, state: Any) -> Seen:
+        """Where the robots are."""
+        nav = state.info["nav"]
+        touching = np.asarray(nav.touching)
+        return Seen(
+            np.asarray(nav.robot_pos_w)[:, :2].astype(float),
+            np.asarray(nav.yaw_rad).astype(float),
+            np.asarray(nav.robot_path_m).astype(float),
+            touching[:, 0],
+            touching[:, 1],
+            (np.asarray(state.metrics["nonfinite"]) > 0) | (np.asarray(nav.overflow_steps) > 0),
+        )
+
+
+def scene_camera(renderer: SceneRenderer, robot: RobotSpec) -> Camera:
+    """Level images of a robot's camera."""
+    return lambda xy, yaw: renderer.draw(camera_pose(robot, xy, yaw, np.zeros(len(xy))))
+
+
+def pose_camera(xy_w: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
+    """The camera of `sight.TrueSight`: [n, 3] poses."""
+    return np.concatenate([np.asarray(xy_w, float), np.asarray(yaw_rad, float)[:, None]], -1)
