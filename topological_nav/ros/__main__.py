@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from scenes_mjcf.schema import SceneError
+from topological_nav.config import NavigatorConfig
 from topological_nav.errors import TopologicalError
 from topological_nav.ros import debian, launch
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
@@ -24,6 +25,9 @@ from topological_nav.settings import overridden, settings_help
 from train.errors import TrainError
 from train.signals import stop_signals
 
+DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
+"""Driver -> its settings."""
+RUNS = Path("runs/topological")
 _DELIVERY_S = 1.0
 """Between the last message and the end of a node: rospy sends in threads of their own."""
 
@@ -43,9 +47,12 @@ def parser() -> argparse.ArgumentParser:
         )
 
     sim, heading = ("the simulator", SimulatorConfig()), ("driver heading", HeadingConfig())
-    everything = command("all", "One episode: master where none is, simulator, navigator, recorder.", sim, heading)
+    topological = ("driver topological", NavigatorConfig())
+    everything = command(
+        "all", "One episode: master where none is, simulator, navigator, recorder.", sim, heading, topological
+    )
     alone = command("sim", "The simulator's node, and a master where none is.", sim)
-    navigator = command("navigator", "The navigator's node, for a robot or a simulator.", heading)
+    navigator = command("navigator", "The navigator's node, for a robot or a simulator.", heading, topological)
     for sub in (everything, alone):
         sub.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
         sub.add_argument("--port", type=int, metavar="N", help="a master of its own on this port; 0: a free one")
@@ -55,9 +62,10 @@ def parser() -> argparse.ArgumentParser:
     alone.add_argument("--recorded", action="store_true", help="begin when every topic has a listener")
     everything.add_argument("--bag", type=Path, metavar="PATH", help="record all topics there")
     for sub in (everything, navigator):
-        sub.add_argument("--driver", choices=("heading",), default="heading", help="what decides on velocities")
+        sub.add_argument("--driver", choices=list(DRIVERS), default="heading", help="what decides on velocities")
         sub.add_argument("--heading-from", choices=("imu", "odom"), default="imu", help="topic of the heading")
         sub.add_argument("--heading-offset", type=float, default=0.0, metavar="RAD", help="of that frame in the map's")
+        _add_journey(sub)
     record = command("record", "Writes all topics into a bag until it is stopped.")
     record.add_argument("bag", type=Path)
     alone_master = command("master", "A master on loopback; prints its address.")
@@ -82,14 +90,45 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 128 + stops[0] if stops and arguments.command not in ("record", "master") else 0
 
 
+def _add_journey(sub: argparse.ArgumentParser) -> None:
+    group = sub.add_argument_group("driver topological")
+    group.add_argument("--map", type=Path, metavar="PATH", help="of `python -m topological_nav map`")
+    group.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
+    group.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
+    group.add_argument("--policy", default="passage", metavar="RUN", help="drives along edges (default: passage)")
+    group.add_argument("--goal", type=Path, action="append", default=[], metavar="PICTURE", help="taken at the goal")
+    group.add_argument("--goal-heading", type=float, default=0.0, metavar="RAD", help="along which the first was")
+
+
+def _journey(arguments: argparse.Namespace) -> Any:
+    from topological_nav.ros.pilot import Journey
+
+    if arguments.map is None:
+        raise TopologicalError("--driver topological needs a map: --map PATH")
+    return Journey(
+        arguments.map,
+        arguments.localiser,
+        arguments.detector,
+        tuple(arguments.goal),
+        arguments.goal_heading,
+        arguments.policy,
+    )
+
+
 def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
     ros = debian.load()
-    mine = {f.name for f in dataclasses.fields(HeadingConfig)}
+    steers = DRIVERS[arguments.driver]
+    mine = {f.name for f in dataclasses.fields(steers)}
     steering = [word for word in arguments.settings if word.partition("=")[0] in mine]
     simulating = [word for word in arguments.settings if word not in steering]
     # Mistakes are told here, before anything starts.
     overridden(SimulatorConfig(), simulating)
-    overridden(HeadingConfig(), steering)
+    overridden(steers(), steering)
+    journey: list[str] = []
+    if arguments.driver == "topological":
+        from topological_nav.ros.pilot import goal_words
+
+        journey = list(goal_words(_journey(arguments)))
     pace = ["--factor", str(arguments.factor), "--limit", str(arguments.limit)]
     pace += ["--lockstep"] * arguments.lockstep + ["--recorded"] * bool(arguments.bag)
     heading = ["--heading-from", arguments.heading_from, "--heading-offset", str(arguments.heading_offset)]
@@ -97,7 +136,7 @@ def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
         print(f"master: {uri}", file=sys.stderr, flush=True)
         recorder = nodes.start(["record", str(arguments.bag)]) if arguments.bag else None
         simulator = nodes.start(["sim", str(arguments.scene), *pace, *simulating])
-        nodes.start(["navigator", "--driver", arguments.driver, *heading, *steering])
+        nodes.start(["navigator", "--driver", arguments.driver, *heading, *journey, *steering])
         if not nodes.wait(simulator, lambda: bool(stops)):
             return
         assert simulator.stdout is not None
@@ -123,14 +162,20 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
 
 
 def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
-    config = overridden(HeadingConfig(), arguments.settings)
+    config = overridden(DRIVERS[arguments.driver](), arguments.settings)
+    journey = _journey(arguments) if arguments.driver == "topological" else None
     ros = debian.load()
     from topological_nav.ros import drivers
     from topological_nav.ros.nodes import NavigatorNode
 
     launch.need_master(ros)
     with _ended(ros):
-        driver = drivers.HeadingDriver(config)
+        if journey is None:
+            driver: drivers.Driver = drivers.HeadingDriver(config)
+        else:
+            from topological_nav.ros.pilot import topological_driver
+
+            driver = topological_driver(journey, config)
         node = NavigatorNode(ros, driver, arguments.heading_from, arguments.heading_offset, _tell)
         done = node.run(lambda: bool(stops))
         _tell(f"navigator: {'done' if done else 'stopped'}")

@@ -14,7 +14,7 @@ import pytest
 from tests.toys import write_room
 from topological_nav.ros import debian, messages, topics
 from topological_nav.ros.__main__ import main
-from topological_nav.ros.config import HeadingConfig, SimulatorConfig
+from topological_nav.ros.config import SimulatorConfig
 from topological_nav.settings import overridden
 
 PROGRAM = [sys.executable, "-m", "topological_nav.ros"]
@@ -142,7 +142,5 @@ def test_ci_installs_the_packages_that_are_asked_for():
     assert " ".join(debian.PACKAGES.split()) in " ".join(script.read_text().replace("\\\n", " ").split())
 
 
-def test_settings_of_simulator_and_driver_have_different_names():
-    fields = [set(vars(config)) for config in (SimulatorConfig(), HeadingConfig())]
-    assert not fields[0] & fields[1]
+def test_a_start_is_read_from_the_command_line():
     assert overridden(SimulatorConfig(), ["start=[1,2,0.5]"]).start == (1.0, 2.0, 0.5)
