@@ -1,4 +1,4 @@
-"""`python -m topological_nav data|train|map|navigate|evaluate`: words on the command line in, files and pictures out.
+"""`python -m topological_nav data|train|map|navigate|evaluate|adapt`: words in, files and pictures out.
 
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
 """
@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from scenes_mjcf.schema import SceneError
+from topological_nav import adapt_commands
 from topological_nav.config import DataConfig, EvaluationConfig, MapConfig, passage_config, room_config
 from topological_nav.errors import SettingsError, TopologicalError
 from topological_nav.settings import overridden, settings_help
@@ -90,6 +91,7 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument(
             "--truth", action="store_true", help="maps from the plan, and the truth instead of both networks"
         )
+    adapt_commands.add_to(command, DATASET, RUNS)
     return made
 
 
@@ -100,9 +102,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
     try:
-        {"data": _data, "train": _train, "map": _map, "navigate": _navigate, "evaluate": _evaluate}[arguments.command](
-            arguments
-        )
+        run = {
+            "data": _data,
+            "train": _train,
+            "map": _map,
+            "navigate": _navigate,
+            "evaluate": _evaluate,
+            "adapt": _adapt,
+        }
+        run[arguments.command](arguments)
     except (TopologicalError, SceneError, TrainError) as error:
         print(f"topological_nav: {error}", file=sys.stderr)
         return 2
@@ -270,6 +278,12 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     for difference in compared:
         print(f"{difference.compared}, {difference.score}: {difference}")
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")
+
+
+def _adapt(arguments: argparse.Namespace) -> None:
+    with _stops() as stops:
+        if not adapt_commands.run(arguments, lambda: bool(stops)):
+            raise Stopped(stops[0])
 
 
 @contextmanager

@@ -140,7 +140,7 @@ def train(
     """
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
-    _claim(out, {"task": task, "dataset": header, **to_dict(config)})
+    claim(out, {"task": task, "dataset": header, **to_dict(config)})
     write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
     shape = (data.height, data.width)
     network = Network(task, config.network, config.width, config.hidden, work.outputs)
@@ -151,7 +151,7 @@ def train(
         phases.insert(0, ("pairs", config.selfsup_epochs))
     elif config.init != "scratch":
         learner = _started_from(learner, Path(config.init))
-    saved = _read_checkpoint(out)
+    saved = read_checkpoint(out / CHECKPOINT)
     _cut_metrics(out / METRICS, saved)
     for phase, epochs in phases:
         if phase == "pairs":
@@ -164,7 +164,7 @@ def train(
             epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment)
         first = 0
         if saved and saved["phase"] == phase:
-            first, current = saved["epoch"], _restored(current, saved["learner"], out)
+            first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
         elif saved and phase == "pairs":
             continue  # a checkpoint of the later phase holds this one's outcome
         current, done = _run(
@@ -188,14 +188,19 @@ def train(
         "fov_deg": header["fov_deg"],
         "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
     }
-    weights = flax.serialization.to_bytes(jax.device_get(variables))
-    about["digest"] = hashlib.sha256(weights).hexdigest()
+    results = _scores(save_trained(out, Trained(network, variables, about)), work)
+    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+    return results
+
+
+def save_trained(out: Path, trained: Trained) -> Trained:
+    """Writes a network as `load_trained` reads it; returns it with the digest of its weights in `about`."""
+    weights = flax.serialization.to_bytes(jax.device_get(trained.variables))
+    about = {**trained.about, "digest": hashlib.sha256(weights).hexdigest()}
     with whole_file(out / WEIGHTS) as partial:
         partial.write_bytes(weights)
     write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
-    results = _scores(Trained(network, variables, about), work)
-    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-    return results
+    return dataclasses.replace(trained, about=about)
 
 
 def load_trained(run: Path) -> Trained:
@@ -341,7 +346,8 @@ def localisation(trained: Trained, rooms: RoomImages) -> dict[str, Any]:
     return rows
 
 
-def _claim(out: Path, settings: dict[str, Any]) -> None:
+def claim(out: Path, settings: dict[str, Any]) -> None:
+    """Writes a new run's settings, or checks that the run there has the same; raises RunError."""
     path = out / CONFIG
     if path.is_file():
         there = yaml.safe_load(path.read_text())
@@ -357,8 +363,8 @@ def _claim(out: Path, settings: dict[str, Any]) -> None:
     write_text(path, yaml.safe_dump(settings, sort_keys=False))
 
 
-def _read_checkpoint(out: Path) -> dict[str, Any] | None:
-    path = out / CHECKPOINT
+def read_checkpoint(path: Path) -> dict[str, Any] | None:
+    """A checkpoint as plain mappings; None: there is none. Raises RunError."""
     if not path.is_file():
         return None
     try:
@@ -367,11 +373,12 @@ def _read_checkpoint(out: Path) -> dict[str, Any] | None:
         raise RunError(f"{path}: not readable ({error}); delete it to begin again") from None
 
 
-def _restored(template: Learner, state: Any, out: Path) -> Learner:
+def restored(template: Learner, state: Any, path: Path) -> Learner:
+    """A checkpoint's learner, typed as the template; raises RunError where it does not fit."""
     try:
         learner = flax.serialization.from_state_dict(template, state)
     except (ValueError, KeyError) as error:
-        raise RunError(f"{out / CHECKPOINT}: does not fit the network ({error}); delete it to begin again") from None
+        raise RunError(f"{path}: does not fit the network ({error}); delete it to begin again") from None
     return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
 
 

@@ -1,0 +1,62 @@
+"""The heading driver against a robot that does at once what it is told."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from interactive_nav.rendering.base import Lens
+from topological_nav.errors import TopologicalError
+from topological_nav.ros.config import HeadingConfig
+from topological_nav.ros.drivers import Command, HeadingDriver, PilotDriver, checked
+
+PICTURE = np.zeros((2, 2, 3), np.uint8)
+
+
+def test_it_turns_the_short_way_then_drives_for_its_time():
+    driver = HeadingDriver(HeadingConfig(heading_rad=math.pi, linear_mps=0.5, drive_s=2.0, max_angular_radps=1.0))
+    heading, x, y, commands = -math.pi / 2, 0.0, 0.0, []
+    for step in range(100):
+        command = driver.step(PICTURE, heading, 0.1 * step)
+        commands.append(command)
+        if command.done:
+            break
+        heading = math.remainder(heading + 0.1 * command.angular_radps, math.tau)
+        x += 0.1 * command.linear_mps * math.cos(heading)
+        y += 0.1 * command.linear_mps * math.sin(heading)
+    # A quarter turn to the right at 1 rad/s, slower at its end.
+    assert commands[0] == Command(0.0, -1.0)
+    assert commands[-1] == Command(0.0, 0.0, done=True)
+    moving = [c for c in commands if c.linear_mps]
+    assert len(moving) == 20 and {c.linear_mps for c in moving} == {0.5}
+    assert abs(math.remainder(heading - math.pi, math.tau)) < 0.01
+    assert x == pytest.approx(-1.0, abs=0.01) and abs(y) < 0.05
+
+
+class Three:
+    """A pilot that is done at its third step."""
+
+    def __init__(self, how):
+        self.how, self.asked = how, []
+
+    def step(self, images, heading_rad, time_s):
+        self.asked.append((images.shape, heading_rad.tolist(), time_s.tolist()))
+        over = np.array([len(self.asked) == 3])
+        events = {"arrived": np.array([False]), "timed_out": np.array([False]), self.how: over}
+        return np.array([0.3]), np.array([-0.2]), SimpleNamespace(**events)
+
+
+@pytest.mark.parametrize("how", ["arrived", "timed_out"])
+def test_the_navigators_pilot_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
+    pilot, lens = Three(how), Lens(4, 3, 90.0)
+    driver = PilotDriver(pilot, lens)
+    commands = [driver.step(np.zeros((3, 4, 3), np.uint8), 0.5, 1.0 + 0.1 * k) for k in range(3)]
+    assert commands == [Command(0.3, -0.2), Command(0.3, -0.2), Command(0.0, 0.0, done=True)]
+    assert pilot.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)] and driver.lens is lens
+
+
+def test_velocities_that_are_not_finite_are_refused():
+    assert checked(Command(0.1, 0.2)) == Command(0.1, 0.2)
+    with pytest.raises(TopologicalError, match="commands nan m/s"):
+        checked(Command(math.nan, 0.0))

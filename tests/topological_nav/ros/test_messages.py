@@ -1,0 +1,186 @@
+"""Messages by value: what is in them, and what comes back; the message types are those of `rosbags`, not ROS's own."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from interactive_nav.rendering.base import Lens
+from topological_nav.ros import messages
+from topological_nav.ros.topics import Headings, time_parts
+
+
+def tree(fields):
+    """Nested dicts as objects with attributes."""
+    return SimpleNamespace(**{k: tree(v) if isinstance(v, dict) else v for k, v in fields.items()})
+
+
+def test_an_image_comes_back_and_its_bytes_run_left_to_right_top_to_bottom():
+    rgb = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    fields = messages.image_fields(rgb)
+    assert (fields["height"], fields["width"], fields["step"], fields["encoding"]) == (2, 3, 9, "rgb8")
+    assert fields["data"][:6] == bytes([0, 1, 2, 3, 4, 5]) and len(fields["data"]) == 18
+    assert (messages.image_array(tree(fields)) == rgb).all()
+
+
+def test_other_encodings_and_padded_rows_are_read():
+    # One row of two pixels, blue first, with an alpha byte, and two bytes of padding.
+    data = bytes([1, 2, 3, 255, 4, 5, 6, 255, 0, 0])
+    message = SimpleNamespace(height=1, width=2, step=10, encoding="bgra8", data=data)
+    assert messages.image_array(message).tolist() == [[[3, 2, 1], [6, 5, 4]]]
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"encoding": "mono8"}, "image encoding is 'mono8', expected one of rgb8, bgr8, rgba8, bgra8"),
+        ({"data": b"abc"}, "image of 2 x 1 (rgb8) has 3 bytes in rows of 6, expected 6 in rows of 6"),
+        ({"step": 5, "data": b"abcde"}, "has 5 bytes in rows of 5"),
+    ],
+)
+def test_images_that_cannot_be_read_are_told(changed, told):
+    message = SimpleNamespace(**{"height": 1, "width": 2, "step": 6, "encoding": "rgb8", "data": bytes(6), **changed})
+    with pytest.raises(messages.MessageError) as error:
+        messages.image_array(message)
+    assert told in str(error.value)
+
+
+def test_a_camera_of_90_degrees_has_a_focal_length_of_half_its_height():
+    fields = messages.camera_info_fields(Lens(640, 480, 90.0))
+    assert fields["K"] == pytest.approx([240, 0, 319.5, 0, 240, 239.5, 0, 0, 1])
+    assert fields["P"] == pytest.approx([240, 0, 319.5, 0, 0, 240, 239.5, 0, 0, 0, 1, 0])
+    lens = messages.info_lens(tree(fields))
+    assert (lens.width, lens.height) == (640, 480) and lens.fov_deg == pytest.approx(90.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value", "told"),
+    [
+        ("K", 4, 0.0, "no focal length"),
+        ("K", 0, 300.0, "focal lengths 300.0 and 240.0, expected square pixels"),
+        ("D", 0, -0.2, "subscribe to a rectified image"),
+    ],
+)
+def test_cameras_that_are_no_pinholes_are_refused(name, at, value, told):
+    fields = messages.camera_info_fields(Lens(640, 480, 90.0))
+    fields[name][at] = value
+    with pytest.raises(messages.MessageError, match=told):
+        messages.info_lens(tree(fields))
+
+
+def test_a_narrower_lens_sees_the_middle():
+    # 90 degrees over 8 rows: a pixel is 0.25 high at depth 1. Half of that tangent is 4 rows, and 4 x 4 of them.
+    rgb = np.zeros((8, 8, 3), np.uint8)
+    rgb[2:6, 2:4], rgb[2:6, 4:6] = 200, 100
+    narrow = Lens(2, 2, math.degrees(2 * math.atan(0.5)))
+    assert messages.seen_through(rgb, 90.0, narrow)[..., 0].tolist() == [[200, 100], [200, 100]]
+    # The same lens leaves it as it is; coarser pixels are means.
+    assert (messages.seen_through(rgb, 90.0, Lens(8, 8, 90.0)) == rgb).all()
+    assert messages.seen_through(rgb, 90.0, Lens(2, 2, 90.0))[..., 0].tolist() == [[50, 25], [50, 25]]
+
+
+def test_a_wider_lens_than_the_cameras_is_refused():
+    with pytest.raises(messages.MessageError, match="spans 60.0 degrees in height, the networks learned from 64 x 48"):
+        messages.seen_through(np.zeros((48, 64, 3), np.uint8), 60.0, Lens(64, 48, 90.0))
+    with pytest.raises(messages.MessageError, match="use a wider lens"):
+        messages.seen_through(np.zeros((48, 48, 3), np.uint8), 90.0, Lens(64, 48, 90.0))
+
+
+def test_a_scan_begins_at_the_right_and_infinity_means_nothing_met():
+    # Four beams over 240 degrees: -120, -60, 0 and 60; the third meets a wall 2.8 m ahead.
+    fields = messages.scan_fields(np.array([1.0, 0.5, 0.5, 0.25], np.float32), 240.0, 0.05, 5.6, 0.1)
+    assert np.degrees([fields["angle_min"], fields["angle_max"], fields["angle_increment"]]) == pytest.approx(
+        [-120, 60, 60]
+    )
+    assert fields["ranges"] == pytest.approx([math.inf, 2.8, 2.8, 1.4])
+    points = messages.scan_points(tree(fields))
+    expected = [[1.4, -2.8 * math.sqrt(0.75)], [2.8, 0], [0.7, 1.4 * math.sqrt(0.75)]]
+    assert points == pytest.approx(np.array(expected), abs=1e-6)
+
+
+@given(st.floats(-math.pi, math.pi))
+def test_headings_survive_the_quaternion(yaw):
+    quat = messages.yaw_quat(yaw)
+    assert math.hypot(quat["z"], quat["w"]) == pytest.approx(1)
+    assert math.remainder(messages.quat_yaw(tree(quat)) - yaw, math.tau) == pytest.approx(0, abs=1e-9)
+
+
+def test_yaw_of_a_tilted_robot_and_of_a_quaternion_that_is_not_of_length_one():
+    # Yaw 90 degrees after a roll of 30: q = qz(90) qx(30).
+    s, c = math.sin(math.radians(15)), math.cos(math.radians(15))
+    half = math.sqrt(0.5)
+    quat = SimpleNamespace(x=2 * half * s, y=2 * half * s, z=2 * half * c, w=2 * half * c)
+    assert messages.quat_yaw(quat) == pytest.approx(math.pi / 2)
+    with pytest.raises(messages.MessageError, match="tells no heading"):
+        messages.quat_yaw(SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0))
+
+
+def test_odometry_has_its_pose_in_the_start_frame_and_its_speed_in_the_robots():
+    fields = messages.odometry_fields(np.array([1.0, 2.0, math.pi]), np.array([0.5, 0.1, 0.0]), np.array([0, 0, -0.2]))
+    pose, twist = fields["pose"]["pose"], fields["twist"]["twist"]
+    assert pose["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
+    assert messages.quat_yaw(tree(pose["orientation"])) == pytest.approx(math.pi)
+    assert twist == {"linear": {"x": 0.5, "y": 0.1, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.2}}
+
+
+def test_the_imu_marks_accelerations_as_unknown():
+    fields = messages.imu_fields(0.3, np.array([0.0, 0.0, 0.7]))
+    assert messages.quat_yaw(tree(fields["orientation"])) == pytest.approx(0.3)
+    assert fields["angular_velocity"]["z"] == 0.7 and fields["linear_acceleration_covariance"][0] == -1
+
+
+def test_velocity_commands_come_back_and_must_be_finite():
+    blank = tree({"linear": {"x": 9.0, "y": 0.0}, "angular": {"x": 0.0, "z": 9.0}})
+    message = messages.set_fields(blank, messages.twist_fields(0.4, -0.25))
+    assert messages.twist_command(message) == (0.4, -0.25)
+    message.angular.z = math.nan
+    with pytest.raises(messages.MessageError, match="expected finite numbers"):
+        messages.twist_command(message)
+
+
+def test_a_field_that_a_message_lacks_is_no_new_field():
+    with pytest.raises(AttributeError):
+        messages.set_fields(SimpleNamespace(width=1), {"widht": 2})
+
+
+def test_the_optical_frame_looks_along_x_with_its_x_to_the_right():
+    x, y, z, w = messages.OPTICAL_QUAT
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    # Columns: its x, y and z axes in the frame that looks along x, y left, z up.
+    assert rotation.T.tolist() == [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+
+
+def test_times_are_whole_microseconds():
+    assert time_parts(1.3) == (1, 300_000_000)
+    assert time_parts(0.1 + 0.2) == (0, 300_000_000)
+    assert time_parts(2.9999999) == (3, 0)
+
+
+def test_headings_turn_the_short_way_between_two_tellings():
+    told = Headings()
+    with pytest.raises(ValueError, match="no heading"):
+        told.at(1.0)
+    told.add(1.0, math.radians(170))
+    told.add(2.0, math.radians(-170))
+    assert math.degrees(told.at(1.25)) == pytest.approx(175)
+    assert math.degrees(told.at(1.75)) == pytest.approx(-175)
+    assert math.degrees(told.at(0.0)) == pytest.approx(170) and math.degrees(told.at(9.0)) == pytest.approx(-170)
+    assert told.newest_s == 2.0
+    told.add(0.5, 0.25)  # a clock set back
+    assert told.at(2.0) == 0.25 and told.newest_s == 0.5
+
+
+def test_only_so_many_headings_are_kept():
+    told = Headings(kept=3)
+    for i in range(10):
+        told.add(float(i), 0.1 * i)
+    assert told.at(0.0) == pytest.approx(0.7)

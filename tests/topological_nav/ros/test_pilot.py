@@ -1,0 +1,68 @@
+"""The navigator as a driver, made of the toy scene's networks and map."""
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from topological_nav.config import NavigatorConfig
+from topological_nav.data import load_rooms
+from topological_nav.errors import SettingsError
+from topological_nav.graph import load_map
+from topological_nav.ros.__main__ import DRIVERS, main
+from topological_nav.ros.config import SimulatorConfig
+from topological_nav.ros.pilot import Journey, goal_words, topological_driver
+from topological_nav.training import load_trained
+
+
+@pytest.fixture(scope="module")
+def goal(made, tmp_path_factory):
+    """A picture of the right room, along the world's x axis, twice as large as the networks' images."""
+    rooms = load_rooms(made.data)
+    row = int(np.argmax(rooms.xy_w[:, 0]))
+    path = tmp_path_factory.mktemp("goal") / "goal.png"
+    Image.fromarray(rooms.images[row, 1, 0].repeat(2, 0).repeat(2, 1)).save(path)
+    return path, rooms.images[row, 1, 0]
+
+
+def test_the_goal_is_the_node_that_looks_like_its_picture(made, goal):
+    journey = Journey(made.map, made.rooms, made.passages, (goal[0],))
+    driver = topological_driver(journey, NavigatorConfig(match="aligned"))
+    read, trained = load_map(made.map), load_trained(made.rooms)
+    away = np.linalg.norm(read.embeddings[:, 0] - trained.embed(goal[1][None])[0], axis=-1)
+    assert driver._pilot.state.goal.tolist() == [int(away.argmin())]  # type: ignore[attr-defined]
+    assert driver.lens is not None and (driver.lens.width, driver.lens.height) == goal[1].shape[1::-1]
+    # It begins with a look about: on the spot, to the nearest of the map's headings, and then 20 degrees on.
+    first = driver.step(goal[1], math.radians(5), 0.0)
+    assert (first.linear_mps, first.done) == (0.0, False) and first.angular_radps < 0
+    assert driver.step(goal[1], 0.0, 0.1).angular_radps > 0
+
+
+def test_out_of_time_it_is_done(made, goal):
+    driver = topological_driver(Journey(made.map, made.rooms, made.passages, (goal[0],)), NavigatorConfig(limit_s=1.0))
+    assert not driver.step(goal[1], 0.5, 10.0).done
+    assert driver.step(goal[1], 0.5, 11.0).done
+
+
+def test_words_for_the_navigators_process_say_all_of_it(made, goal):
+    journey = Journey(made.map, made.rooms, made.passages, (goal[0], goal[0]), 0.5)
+    from topological_nav.ros.__main__ import _journey, parser
+
+    assert _journey(parser().parse_args(["navigator", "--driver", "topological", *goal_words(journey)])) == journey
+
+
+def test_what_is_missing_is_told(made, tmp_path, capsys):
+    with pytest.raises(SettingsError, match="no goal; name a picture"):
+        topological_driver(Journey(made.map, made.rooms, made.passages, ()), NavigatorConfig())
+    (tmp_path / "goal.png").write_text("no")
+    with pytest.raises(SettingsError, match="is no picture that can be read"):
+        journey = Journey(made.map, made.rooms, made.passages, (tmp_path / "goal.png",))
+        topological_driver(journey, NavigatorConfig())
+    assert main(["navigator", "--driver", "topological"]) == 2
+    assert "needs a map: --map PATH" in capsys.readouterr().err
+
+
+def test_no_drivers_settings_are_the_simulators():
+    for config in DRIVERS.values():
+        assert not set(vars(config())) & set(vars(SimulatorConfig()))

@@ -1,0 +1,161 @@
+"""Rendered images in, images as another camera would have taken them out: what stands for the real world.
+
+In the order of a real camera: lens (narrower, distorted, darker corners), motion blur, exposure and white balance in
+linear light, sensor noise, the camera's own tone curve. Pure functions of images and a seed; where images come from
+(rendered anew through another lens or engine, or a scanned room) is a dataset's business, see `config.DataConfig`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from topological_nav.errors import SettingsError
+from topological_nav.settings import require
+
+_GAMMA = 2.2
+"""Between grey levels and light, for rendered images."""
+_CHUNK = 256
+
+
+@dataclasses.dataclass(frozen=True)
+class DomainConfig:
+    """A camera that is not the renderer's; the defaults change nothing."""
+
+    seed: int = 0
+    """Of noise and of what differs from image to image."""
+    zoom: float = 1.0
+    """Focal length over the renderer's: 1.3 sees the middle 77 % of the picture's height."""
+    barrel: float = 0.0
+    """Radial distortion: what is shown at radius r (1 in the corners) comes from r (1 + barrel r^2) / (1 + barrel): the
+    middle bulges, as in wide lenses."""
+    vignette: float = 0.0
+    """Share of light that the corners lose."""
+    blur_px: float = 0.0
+    """Longest way of a point during the exposure, along the rows: a robot that turns. Images differ, from 0 to this."""
+    exposure_ev: float = 0.0
+    """Stops brighter (+) or darker (-)."""
+    exposure_spread_ev: float = 0.0
+    """Standard deviation of the exposure from image to image."""
+    warmth: float = 0.0
+    """White balance: red gains, and blue loses, this share of light."""
+    contrast: float = 1.0
+    """Of the tone curve about middle grey, in grey levels."""
+    shot_noise: float = 0.0
+    """Standard deviation of light at full scale, as a share of it; it goes with the root of the light."""
+    read_noise: float = 0.0
+    """Standard deviation of light in the dark, as a share of full scale."""
+
+    def __post_init__(self) -> None:
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "zoom", 1.0, 10.0)
+        require(self, "barrel", 0.0, 2.0)
+        require(self, "vignette", 0.0, 1.0)
+        require(self, "blur_px", 0.0, 1000.0)
+        require(self, "exposure_ev", -10.0, 10.0)
+        require(self, "exposure_spread_ev shot_noise read_noise", 0.0, 10.0)
+        require(self, "warmth", -0.9, 0.9)
+        require(self, "contrast", 0.1, 10.0)
+
+
+PRESETS: dict[str, DomainConfig] = {
+    "clean": DomainConfig(),
+    "lens": DomainConfig(zoom=1.25, barrel=0.3, vignette=0.4),
+    "light": DomainConfig(exposure_ev=-0.8, exposure_spread_ev=0.3, warmth=0.2, contrast=1.25),
+    "noise": DomainConfig(shot_noise=0.05, read_noise=0.015),
+    "blur": DomainConfig(blur_px=5.0),
+    "camera": DomainConfig(
+        zoom=1.25, barrel=0.3, vignette=0.4, blur_px=3.0, exposure_ev=-0.8, exposure_spread_ev=0.3, warmth=0.2,
+        contrast=1.25, shot_noise=0.05, read_noise=0.015,
+    ),
+}  # fmt: skip
+"""Named cameras; `camera` is all of them at once. Sizes in pixels are meant for images of 64 x 48."""
+
+
+def preset(name: str) -> DomainConfig:
+    """A named camera.
+
+    Raises:
+        SettingsError: there is none of that name.
+    """
+    if name not in PRESETS:
+        raise SettingsError(f"domain is '{name}', expected one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.ndarray:
+    """Images as the camera would have taken them.
+
+    Args:
+        images: [..., H, W, 3] u8.
+        config: the camera.
+        stream: of chance: different sets of images differ in noise.
+
+    Returns:
+        The same shape, u8. An image depends on the seed, the stream, its place in the set and itself alone.
+    """
+    if config == dataclasses.replace(DomainConfig(), seed=config.seed):
+        return images
+    flat = images.reshape(-1, *images.shape[-3:])
+    out = np.empty_like(flat)
+    for first in range(0, len(flat), _CHUNK):
+        rng = np.random.default_rng([config.seed, stream, first])
+        out[first : first + _CHUNK] = _taken(flat[first : first + _CHUNK], config, rng)
+    return out.reshape(images.shape)
+
+
+def _taken(images: np.ndarray, config: DomainConfig, rng: np.random.Generator) -> np.ndarray:
+    count, height, width, _ = images.shape
+    light = (images.astype(np.float32) / 255.0) ** _GAMMA
+    if config.zoom != 1.0 or config.barrel:
+        light = _through_lens(light, config.zoom, config.barrel)
+    if config.vignette:
+        light = light * (1.0 - config.vignette * _radius(height, width) ** 2)[..., None]
+    ways = rng.uniform(0.0, config.blur_px, count)
+    if config.blur_px:
+        light = np.stack([smeared(one, way) for one, way in zip(light, ways, strict=True)])
+    stops = config.exposure_ev + config.exposure_spread_ev * rng.standard_normal(count)
+    balance = np.array([1.0 + config.warmth, 1.0, 1.0 - config.warmth])
+    light = light * (2.0**stops)[:, None, None, None] * balance
+    if config.shot_noise or config.read_noise:
+        spread = np.sqrt(config.shot_noise**2 * np.clip(light, 0.0, 1.0) + config.read_noise**2)
+        light = light + spread * rng.standard_normal(light.shape)
+    grey = np.clip(light, 0.0, 1.0) ** (1.0 / _GAMMA)
+    grey = (grey - 0.5) * config.contrast + 0.5
+    return np.rint(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
+
+
+def smeared(light: np.ndarray, way_px: float) -> np.ndarray:
+    """An image [H, W, 3] whose points moved evenly by this many pixels along the rows while it was taken.
+
+    The mean over a window of 1 + `way_px` pixels, the outermost ones counted in part; borders are repeated.
+    """
+    half = way_px / 2
+    whole = math.floor(half)
+    weights = np.ones(2 * whole + 3)
+    weights[[0, -1]] = half - whole
+    weights /= weights.sum()
+    reach = whole + 1
+    padded = np.pad(light, ((0, 0), (reach, reach), (0, 0)), mode="edge")
+    width = light.shape[1]
+    return sum(w * padded[:, k : k + width] for k, w in enumerate(weights))  # type: ignore[return-value]
+
+
+def _through_lens(light: np.ndarray, zoom: float, barrel: float) -> np.ndarray:
+    """Images [N, H, W, 3] resampled, bilinearly, so that nothing outside them is asked for."""
+    height, width = light.shape[1:3]
+    factor = (1.0 + barrel * _radius(height, width) ** 2) / (1.0 + barrel) / zoom
+    y, x = np.meshgrid(np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2, indexing="ij")
+    at = np.stack([y * factor + (height - 1) / 2, x * factor + (width - 1) / 2])
+    channels = np.moveaxis(light, -1, 1).reshape(-1, height, width)
+    seen = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in channels])
+    return np.moveaxis(seen.reshape(-1, 3, height, width), 1, -1)
+
+
+def _radius(height: int, width: int) -> np.ndarray:
+    """[H, W] distance from the middle; 1 in the corners' pixels."""
+    y, x = np.meshgrid(np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2, indexing="ij")
+    return np.hypot(x, y) / max(np.hypot((height - 1) / 2, (width - 1) / 2), 1e-9)

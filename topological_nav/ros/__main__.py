@@ -1,0 +1,222 @@
+"""`python -m topological_nav.ros all|sim|navigator|record|master`: the simulator and the navigator as ROS nodes.
+
+Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import re
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from scenes_mjcf.schema import SceneError
+from topological_nav.config import NavigatorConfig
+from topological_nav.errors import TopologicalError
+from topological_nav.ros import debian, launch
+from topological_nav.ros.config import HeadingConfig, SimulatorConfig
+from topological_nav.settings import overridden, settings_help
+from train.errors import TrainError
+from train.signals import stop_signals
+
+DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
+"""Driver -> its settings."""
+RUNS = Path("runs/topological")
+_DELIVERY_S = 1.0
+"""Between the last message and the end of a node: rospy sends in threads of their own."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m topological_nav.ros",
+        description="The simulator and the navigator as ROS 1 nodes. Words key=value change settings.",
+    )
+    commands = made.add_subparsers(dest="command", required=True)
+
+    def command(name: str, text: str, *configs: Any) -> argparse.ArgumentParser:
+        told = "".join(f"settings of {what} (key=default):\n{settings_help(c)}\n" for what, c in configs)
+        return commands.add_parser(
+            name, help=text, description=text, epilog=told, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+
+    sim, heading = ("the simulator", SimulatorConfig()), ("driver heading", HeadingConfig())
+    topological = ("driver topological", NavigatorConfig())
+    everything = command(
+        "all", "One episode: master where none is, simulator, navigator, recorder.", sim, heading, topological
+    )
+    alone = command("sim", "The simulator's node, and a master where none is.", sim)
+    navigator = command("navigator", "The navigator's node, for a robot or a simulator.", heading, topological)
+    for sub in (everything, alone):
+        sub.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
+        sub.add_argument("--port", type=int, metavar="N", help="a master of its own on this port; 0: a free one")
+        sub.add_argument("--lockstep", action="store_true", help="each picture waits for its velocity command")
+        sub.add_argument("--factor", type=float, default=1.0, help="simulated seconds a second; 0: no waiting")
+        sub.add_argument("--limit", type=float, default=1800.0, metavar="S", help="simulated seconds of an episode")
+    alone.add_argument("--recorded", action="store_true", help="begin when every topic has a listener")
+    everything.add_argument("--bag", type=Path, metavar="PATH", help="record all topics there")
+    for sub in (everything, navigator):
+        sub.add_argument("--driver", choices=list(DRIVERS), default="heading", help="what decides on velocities")
+        sub.add_argument("--heading-from", choices=("imu", "odom"), default="imu", help="topic of the heading")
+        sub.add_argument("--heading-offset", type=float, default=0.0, metavar="RAD", help="of that frame in the map's")
+        _add_journey(sub)
+    record = command("record", "Writes all topics into a bag until it is stopped.")
+    record.add_argument("bag", type=Path)
+    alone_master = command("master", "A master on loopback; prints its address.")
+    alone_master.add_argument("--port", type=int, default=11311, metavar="N", help="0: a free one")
+    command("check", "Says whether ROS can be used here.")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a command."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    settings = [word for word in words if re.match(r"\w+=", word)]
+    arguments = parser().parse_args([word for word in words if word not in settings])
+    arguments.settings = settings
+    run = {"all": _all, "sim": _sim, "navigator": _navigator, "record": _record, "master": _master, "check": _check}
+    with stop_signals() as stops:
+        try:
+            run[arguments.command](arguments, stops)
+        except (TopologicalError, SceneError, TrainError) as error:
+            print(f"topological_nav.ros: {error}", file=sys.stderr)
+            return 2
+        return 128 + stops[0] if stops and arguments.command not in ("record", "master") else 0
+
+
+def _add_journey(sub: argparse.ArgumentParser) -> None:
+    group = sub.add_argument_group("driver topological")
+    group.add_argument("--map", type=Path, metavar="PATH", help="of `python -m topological_nav map`")
+    group.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
+    group.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
+    group.add_argument("--policy", default="passage", metavar="RUN", help="drives along edges (default: passage)")
+    group.add_argument("--goal", type=Path, action="append", default=[], metavar="PICTURE", help="taken at the goal")
+    group.add_argument("--goal-heading", type=float, default=0.0, metavar="RAD", help="along which the first was")
+
+
+def _journey(arguments: argparse.Namespace) -> Any:
+    from topological_nav.ros.pilot import Journey
+
+    if arguments.map is None:
+        raise TopologicalError("--driver topological needs a map: --map PATH")
+    return Journey(
+        arguments.map,
+        arguments.localiser,
+        arguments.detector,
+        tuple(arguments.goal),
+        arguments.goal_heading,
+        arguments.policy,
+    )
+
+
+def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
+    ros = debian.load()
+    steers = DRIVERS[arguments.driver]
+    mine = {f.name for f in dataclasses.fields(steers)}
+    steering = [word for word in arguments.settings if word.partition("=")[0] in mine]
+    simulating = [word for word in arguments.settings if word not in steering]
+    # Mistakes are told here, before anything starts.
+    overridden(SimulatorConfig(), simulating)
+    overridden(steers(), steering)
+    journey: list[str] = []
+    if arguments.driver == "topological":
+        from topological_nav.ros.pilot import goal_words
+
+        journey = list(goal_words(_journey(arguments)))
+    pace = ["--factor", str(arguments.factor), "--limit", str(arguments.limit)]
+    pace += ["--lockstep"] * arguments.lockstep + ["--recorded"] * bool(arguments.bag)
+    heading = ["--heading-from", arguments.heading_from, "--heading-offset", str(arguments.heading_offset)]
+    with launch.some_master(ros, arguments.port) as uri, launch.Nodes() as nodes:
+        print(f"master: {uri}", file=sys.stderr, flush=True)
+        recorder = nodes.start(["record", str(arguments.bag)]) if arguments.bag else None
+        simulator = nodes.start(["sim", str(arguments.scene), *pace, *simulating])
+        nodes.start(["navigator", "--driver", arguments.driver, *heading, *journey, *steering])
+        if not nodes.wait(simulator, lambda: bool(stops)):
+            return
+        assert simulator.stdout is not None
+        print(simulator.stdout.read().strip(), flush=True)
+        if recorder is not None:
+            launch.end(recorder)
+            assert recorder.stdout is not None
+            print(recorder.stdout.read().strip(), flush=True)
+
+
+def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
+    config = overridden(SimulatorConfig(), arguments.settings)
+    ros = debian.load()
+    from topological_nav.ros.nodes import Pace, SimulatorNode
+    from topological_nav.ros.simulator import Simulator
+
+    with launch.some_master(ros, arguments.port), _ended(ros):
+        with contextlib.redirect_stdout(sys.stderr):  # Warp tells of its kernels there
+            simulator = Simulator(arguments.scene, config)
+            pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.recorded)
+            tally = SimulatorNode(ros, simulator, pace, _tell).run(lambda: bool(stops))
+        print(json.dumps(tally.row()), flush=True)
+
+
+def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
+    config = overridden(DRIVERS[arguments.driver](), arguments.settings)
+    journey = _journey(arguments) if arguments.driver == "topological" else None
+    ros = debian.load()
+    from topological_nav.ros import drivers
+    from topological_nav.ros.nodes import NavigatorNode
+
+    launch.need_master(ros)
+    with _ended(ros):
+        if journey is None:
+            driver: drivers.Driver = drivers.HeadingDriver(config)
+        else:
+            from topological_nav.ros.pilot import topological_driver
+
+            driver = topological_driver(journey, config)
+        node = NavigatorNode(ros, driver, arguments.heading_from, arguments.heading_offset, _tell)
+        done = node.run(lambda: bool(stops))
+        _tell(f"navigator: {'done' if done else 'stopped'}")
+
+
+def _record(arguments: argparse.Namespace, stops: list[int]) -> None:
+    ros = debian.load()
+    from topological_nav.ros.recorder import RecorderNode
+
+    launch.need_master(ros)
+    arguments.bag.parent.mkdir(parents=True, exist_ok=True)
+    with _ended(ros):
+        count = RecorderNode(ros, arguments.bag).run(lambda: bool(stops))
+        print(f"{arguments.bag}: {count:,} messages", flush=True)
+
+
+def _master(arguments: argparse.Namespace, stops: list[int]) -> None:
+    with launch.master(debian.load(), arguments.port) as uri:
+        print(uri, flush=True)
+        while not stops:
+            time.sleep(0.1)
+
+
+def _check(arguments: argparse.Namespace, stops: list[int]) -> None:
+    del arguments, stops
+    print(f"rospy: {debian.load().rospy.__file__}")
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _ended(ros: Any) -> Iterator[None]:
+    """Lets the last messages go out, then leaves the master."""
+    try:
+        yield
+        time.sleep(_DELIVERY_S)
+    finally:
+        ros.rospy.signal_shutdown("done")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,52 @@
+"""Where ROS comes in: Debian's Python packages, made visible to this interpreter.
+
+Debian keeps them in /usr/lib/python3/dist-packages, which a virtual environment does not look into. The folder goes to
+the end of `sys.path`, so that everything the environment has itself comes first, and only in the processes of
+`topological_nav.ros`. Where rospy can be imported anyway (a sourced ROS workspace), nothing is changed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+from topological_nav.errors import TopologicalError
+
+DIST_PACKAGES = Path("/usr/lib/python3/dist-packages")
+PACKAGES = (
+    "ros-core python3-rospy python3-rosbag python3-rosmaster python3-std-msgs python3-sensor-msgs "
+    "python3-geometry-msgs python3-nav-msgs python3-rosgraph-msgs python3-tf2-msgs"
+)
+"""Of Debian 12 and later."""
+_MODULES = (
+    *("rospy", "rosbag", "rosmaster.master", "rosgraph"),
+    *(f"{name}.msg" for name in ("std_msgs", "sensor_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "tf2_msgs")),
+)
+
+
+class RosError(TopologicalError):
+    """ROS is not there, or its master is not."""
+
+
+def load() -> types.SimpleNamespace:
+    """The modules of ROS by their first names, messages as `std_msgs.Bool` and so on.
+
+    Raises:
+        RosError: a package is missing.
+    """
+    if importlib.util.find_spec("rospy") is None and str(DIST_PACKAGES) not in sys.path:
+        sys.path.append(str(DIST_PACKAGES))
+    found: dict[str, Any] = {}
+    for name in _MODULES:
+        try:
+            module = importlib.import_module(name)
+        except ImportError as error:
+            raise RosError(
+                f"ROS is not installed here ({error}); on Debian 12: apt-get install --no-install-recommends {PACKAGES}"
+            ) from None
+        found[name.split(".")[0]] = module
+    return types.SimpleNamespace(**found)

@@ -1,0 +1,109 @@
+"""What the navigator's node drives by: a picture, a heading and a time in, a velocity out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from topological_nav.errors import TopologicalError
+from topological_nav.ros.config import HeadingConfig
+
+if TYPE_CHECKING:
+    from interactive_nav.rendering.base import Lens
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """What a driver wants until its next step."""
+
+    linear_mps: float
+    angular_radps: float
+    done: bool = False
+    """The episode is over: the robot stands, and no more is asked."""
+
+
+class Driver(Protocol):
+    """Drives one episode; called once for each picture that arrives."""
+
+    @property
+    def lens(self) -> Lens | None:
+        """That its pictures must be seen through; None: any."""
+        ...
+
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+        """The next command.
+
+        Args:
+            image: [H, W, 3] u8, level and straight ahead.
+            heading_rad: yaw of the robot in the map's frame.
+            time_s: when the picture was taken; never falls.
+        """
+        ...
+
+
+class HeadingDriver:
+    """Turns to a heading and drives along it; looks at no picture. For tests, and for trying out a robot's topics."""
+
+    lens: Lens | None = None
+
+    def __init__(self, config: HeadingConfig):
+        self._config = config
+        self._since: float | None = None
+
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+        """See `Driver.step`."""
+        del image
+        config = self._config
+        error = math.remainder(config.heading_rad - heading_rad, math.tau)
+        turn = min(max(config.gain * error, -config.max_angular_radps), config.max_angular_radps)
+        if self._since is None:
+            if abs(error) > config.tolerance_rad:
+                return Command(0.0, turn)
+            self._since = time_s
+        if time_s - self._since >= config.drive_s - 1e-6:
+            return Command(0.0, 0.0, done=True)
+        return Command(config.linear_mps, turn)
+
+
+class Pilot(Protocol):
+    """The navigator, with its memory: what `topological_nav.navigator.Pilot` is for a batch of one."""
+
+    def step(
+        self, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Images [1, H, W, 3], headings [1] and time to linear [1] and angular [1] velocity, and events.
+
+        Of the events, `arrived` and `timed_out` [1] bool are looked at.
+        """
+        ...
+
+
+class PilotDriver:
+    """The navigator as a driver: it is done where it arrived, or ran out of time."""
+
+    def __init__(self, pilot: Pilot, lens: Lens):
+        """Takes what it needs.
+
+        Args:
+            pilot: of one episode, its goal known to it.
+            lens: that its networks learned through.
+        """
+        self._pilot, self.lens = pilot, lens
+
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+        """See `Driver.step`."""
+        linear, angular, events = self._pilot.step(image[None], np.array([heading_rad]), np.array([time_s]))
+        done = bool(events.arrived[0]) or bool(events.timed_out[0])
+        return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))
+
+
+def checked(command: Command) -> Command:
+    """The command, or an error if it is not finite."""
+    if not (math.isfinite(command.linear_mps) and math.isfinite(command.angular_radps)):
+        raise TopologicalError(
+            f"the driver commands {command.linear_mps} m/s and {command.angular_radps} rad/s, expected finite numbers"
+        )
+    return command

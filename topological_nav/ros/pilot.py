@@ -1,0 +1,83 @@
+"""A map, networks and goal pictures in, the navigator as a driver out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from interactive_nav.robots import get_robot
+from topological_nav.build import camera_of
+from topological_nav.config import NavigatorConfig
+from topological_nav.data import lens_of
+from topological_nav.errors import SettingsError
+from topological_nav.graph import load_map
+from topological_nav.navigator import Navigator, Pilot
+from topological_nav.ros.drivers import PilotDriver
+from topological_nav.ros.messages import seen_through
+from topological_nav.sight import NetworkSight, PassagePolicy
+from topological_nav.training import load_trained
+
+PASSAGE_POLICY = "passage"
+
+
+@dataclasses.dataclass(frozen=True)
+class Journey:
+    """What the navigator goes by, and where to."""
+
+    map: Path
+    localiser: Path
+    """Run folder: embeds images."""
+    detector: Path
+    """Run folder: judges passages."""
+    goals: tuple[Path, ...]
+    """Pictures taken at the goal, along headings evenly about it; as wide as what the networks learned from."""
+    goal_heading_rad: float = 0.0
+    """Of the first, in the map's frame."""
+    policy: str = PASSAGE_POLICY
+    """What drives along edges: passage, straight on while the detector agrees; or a run folder."""
+
+
+def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver:
+    """The navigator, with its goal.
+
+    Raises:
+        MapError, RunError: map or networks cannot be used, or do not belong together.
+        SettingsError: no goal picture, or one that cannot be read.
+    """
+    networks = load_trained(journey.localiser), load_trained(journey.detector)
+    camera, made = camera_of(*networks), load_map(journey.map)
+    lens = lens_of(camera, get_robot(camera.robot))
+    sight = NetworkSight(made, *networks, config.match)
+    if journey.policy == PASSAGE_POLICY:
+        policy = PassagePolicy(sight, config.passable)
+    else:
+        from topological_nav import driving
+
+        policy = driving.load_policy(Path(journey.policy))  # type: ignore[attr-defined]
+    if not journey.goals:
+        raise SettingsError("the navigator has no goal; name a picture taken there: --goal PICTURE")
+    pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in journey.goals])
+    around = journey.goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
+    return PilotDriver(Pilot(Navigator(made, sight, policy, config), pictures[None], around), lens)
+
+
+def goal_words(journey: Journey) -> Sequence[str]:
+    """The command line's words for a journey: what the navigator's own process is started with."""
+    goals = [word for goal in journey.goals for word in ("--goal", str(goal))]
+    return [
+        *goals,
+        *("--goal-heading", str(journey.goal_heading_rad), "--map", str(journey.map), "--policy", journey.policy),
+        *("--localiser", str(journey.localiser), "--detector", str(journey.detector)),
+    ]
+
+
+def _picture(path: Path) -> np.ndarray:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise SettingsError(f"{path}: is no picture that can be read ({error})") from None

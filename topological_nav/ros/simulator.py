@@ -1,0 +1,157 @@
+"""A scene and velocity commands in, what a robot's sensors tell out; without ROS.
+
+TTbot on C MuJoCo (`native`), its lidar and odometry from `interactive_nav.sensors`, its pictures from
+`interactive_nav.rendering.camera`. The odometry's frame is the start's; the heading is the world's, as a compass has
+it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import interactive_nav
+from interactive_nav.rendering.base import Lens
+from interactive_nav.rendering.camera import Camera
+from interactive_nav.sensors import LIDAR_NEAR_M
+from topological_nav.errors import TopologicalError
+from topological_nav.rendering import shrink
+from topological_nav.ros.config import SimulatorConfig
+from topological_nav.space import free_space
+
+ROBOT = "ttbot"
+LIDAR_POS_M = (0.17, 0.0, 0.36)
+"""In the base's frame: TTbot's site `lidar`."""
+_FOREVER = 10**9
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensed:
+    """One moment, as sensors tell it; and the truth, for scoring."""
+
+    time_s: float
+    rgb: np.ndarray
+    """[H, W, 3] u8."""
+    scan: np.ndarray
+    """[lidar_rays] f32 in [0, 1], from the right on; 1: nothing within range."""
+    odometry: np.ndarray
+    """(3,) x, y (m), yaw (rad) in the frame of the start."""
+    linear_b: np.ndarray
+    """(3,) m/s, robot frame."""
+    angular_b: np.ndarray
+    """(3,) rad/s, robot frame."""
+    heading_rad: float
+    """Yaw in the world's frame."""
+    touches_movable: bool
+    touches_structure: bool
+    force_n: float
+    """Mean over the last control step of what the robot pushes with."""
+    truth_w: np.ndarray
+    """(3,) x, y (m), yaw (rad), world: no sensor tells it."""
+
+
+class Simulator:
+    """One robot in one scene."""
+
+    range_min_m, lidar_pos_m = LIDAR_NEAR_M, LIDAR_POS_M
+
+    def __init__(self, scene: Path, config: SimulatorConfig):
+        """Builds the world and places the robot; compiles.
+
+        Args:
+            scene: folder.
+            config: settings.
+
+        Raises:
+            SceneError: the scene cannot be used.
+            TopologicalError: the start is not free.
+        """
+        self.config = config
+        self._env = interactive_nav.make(
+            ROBOT,
+            [scene],
+            backend="native",
+            control_mode="twist",
+            num_objects=config.objects,
+            observations=("velocity", "localisation", "odometry", "lidar"),
+            episode_steps=_FOREVER,
+            lidar_pos_m=LIDAR_POS_M,
+            lidar_rays=config.lidar_rays,
+            lidar_fov_deg=config.lidar_fov_deg,
+            lidar_range_m=config.lidar_range_m,
+            lidar_noise=config.lidar_noise,
+            odometry_noise=config.odometry_noise,
+            image_fov_deg=config.fov_deg,
+            num_waypoints=1,
+        )
+        twist = self._env.robot.twist
+        assert twist is not None
+        self.max_linear_mps, self.max_angular_radps = twist.max_linear_m_s, twist.max_angular_rad_s
+        self.dt_s = self._env.dt
+        self.lens = Lens(config.width, config.height, config.fov_deg)
+        self._camera = Camera(self._env, config.engine)
+        self._step = jax.jit(self._env.step)
+        key = jax.random.PRNGKey(config.seed)
+        start = self._env.draw_start(key)
+        if config.start:
+            x, y, yaw = config.start
+            self._refuse_blocked(x, y)
+            start = start.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
+        self._state = jax.jit(self._env.reset_to)(start, jax.random.fold_in(key, 1))
+        self._force_before = 0.0
+
+    @property
+    def camera_pos_m(self) -> tuple[float, float, float]:
+        """Of the camera in the base's frame."""
+        return self._env.robot.camera.pos_m
+
+    def step(self, linear_mps: float, angular_radps: float) -> Sensed:
+        """Drives for one control step; commands beyond what the robot can do are cut.
+
+        Raises:
+            TopologicalError: the physics broke down.
+        """
+        self._force_before = float(self._state.info["nav"].force_sum_n)
+        action = self._env.robot.drive(jnp.float32(linear_mps), jnp.float32(angular_radps), jnp)
+        self._state = self._step(self._state, action)
+        if float(self._state.metrics["nonfinite"]) > 0:
+            raise TopologicalError("the physics broke down (non-finite state); start again, with another seed")
+        return self.sense()
+
+    def sense(self) -> Sensed:
+        """What the sensors tell now."""
+        nav, values = self._state.info["nav"], self._parts()
+        by = self.config.supersample
+        drawn = self._camera.frame(self._state, self.lens.width * by, self.lens.height * by, ("rgb",), "robot")["rgb"]
+        movable, structure = (bool(t) for t in np.asarray(nav.touching))
+        return Sensed(
+            time_s=int(nav.step_count) * self.dt_s,
+            rgb=shrink(drawn[None], by)[0],
+            scan=values["lidar"],
+            odometry=values["odometry"],
+            linear_b=values["velocity"][:3],
+            angular_b=values["velocity"][3:],
+            heading_rad=float(values["localisation"][2]),
+            touches_movable=movable,
+            touches_structure=structure,
+            force_n=float(nav.force_sum_n) - self._force_before,
+            truth_w=values["localisation"],
+        )
+
+    def _parts(self) -> dict[str, np.ndarray]:
+        sizes: dict[str, Any] = self._env.sensors.sizes
+        ends = np.cumsum(list(sizes.values()))
+        return dict(zip(sizes, np.split(np.asarray(self._state.obs), ends[:-1]), strict=True))
+
+    def _refuse_blocked(self, x: float, y: float) -> None:
+        robot = self._env.robot
+        clear = float(free_space(self._env.scenes[0], robot.height_m).at(np.array([x, y])))
+        if clear < robot.body_width_m / 2:
+            raise TopologicalError(
+                f"start ({x}, {y}) is {clear:.2f} m from obstacles, expected at least {robot.body_width_m / 2} m"
+            )

@@ -1,0 +1,97 @@
+"""Runs of transfer in, pictures out: both domains side by side, learning, scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+_SHOWN = 6
+"""Pairs of images."""
+_STAGES = {"before": "0.6", "statistics": "tab:orange", "after": "tab:blue"}
+
+
+def features_figure(
+    source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
+) -> Figure:
+    """Images of both domains, the game's course, and localisation before and after.
+
+    Args:
+        source: [n, H, W, 3] u8.
+        target: the same many of the other domain.
+        lines: of metrics.jsonl.
+        results: of results.json.
+    """
+    figure: Any = plt.figure(figsize=(11, 5.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    _pairs(above, source, target)
+    course, scores = below.subplots(1, 2)
+    epochs = [line["epoch"] for line in lines]
+    for name, label in (("loss", "extractor's loss"), ("critic_loss", "critic's loss")):
+        course.plot(epochs, [line[name] for line in lines], marker=".", label=label)
+    course.plot(epochs, [line["critic_accuracy"] for line in lines], marker=".", label="critic's accuracy")
+    course.axhline(0.5, color="0.7", linewidth=0.8, zorder=0)
+    course.set_xlabel("epoch")
+    course.set_ylim(bottom=0)
+    course.legend(fontsize=7)
+    course.grid(alpha=0.3)
+    kinds = (("node", "nearest node"), ("room", "right room"))
+    for k, (name, colour) in enumerate(_STAGES.items()):
+        values = [results[name]["mean"][kind] for kind, _ in kinds]
+        _bars(scores, np.arange(2) + 0.27 * (k - 1), values, 0.25, colour, name)
+    for x, (kind, _) in enumerate(kinds):
+        best = results["source"]["mean"][kind]
+        scores.plot([x - 0.45, x + 0.45], [best, best], "k--", linewidth=1, label="in the source" if not x else None)
+    scores.set_xticks([0, 1], [label for _, label in kinds])
+    scores.set_ylim(0, 1)
+    scores.set_title("share of the target's held-out images localised", fontsize=9)
+    scores.legend(fontsize=7)
+    return figure
+
+
+def passages_figure(
+    source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
+) -> Figure:
+    """Images of both domains, fine-tuning, and accuracy of the four configurations; see `features_figure`."""
+    figure: Any = plt.figure(figsize=(11, 5.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    _pairs(above, source, target)
+    course, scores = below.subplots(1, 2)
+    for name, label in (("B", "B: fresh weights"), ("D", "D: the source's")):
+        mine = [line for line in lines if line["phase"] == name]
+        course.plot([line["epoch"] for line in mine], [line["accuracy"] for line in mine], marker=".", label=label)
+    course.set_xlabel("epoch of fine-tuning")
+    course.set_ylim(0, 1)
+    course.set_title("accuracy on the images learned from", fontsize=9)
+    course.legend(fontsize=7)
+    course.grid(alpha=0.3)
+    names = ("A", "B", "C", "D")
+    _bars(scores, np.arange(4), [results[name]["accuracy"] for name in names], 0.6, "tab:blue", None)
+    scores.axhline(0.5, color="0.5", linewidth=0.8)
+    words = ("A\nfresh", "B\nfresh,\nfine-tuned", "C\nsource", "D\nsource,\nfine-tuned")
+    scores.set_xticks(range(4), words)
+    scores.set_ylim(0, 1)
+    scores.set_title(f"accuracy on {results['tested_on']} held-out target images", fontsize=9)
+    return figure
+
+
+def _pairs(part: Any, source: np.ndarray, target: np.ndarray) -> None:
+    grid = part.subplots(2, _SHOWN, squeeze=False)
+    for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):
+        rows = np.linspace(0, len(images) - 1, _SHOWN).astype(int)
+        for axis, row in zip(line, rows, strict=True):
+            axis.imshow(images[row])
+            axis.set_axis_off()
+        line[0].set_title(name, fontsize=9, loc="left")
+
+
+def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, colour: str, label: str | None) -> None:
+    bars = axis.bar(at, values, width, color=colour, label=label)
+    axis.bar_label(bars, fmt="%.2f", fontsize=7)
