@@ -182,9 +182,9 @@ class ExpertConfig:
     angular_rad_s: float = 0.5
     """Fastest turn, either way."""
     linear_samples: int = 5
-    """Velocities tried between the slowest and the fastest that can be reached in a control period."""
+    """Forward velocities tried, evenly from 0 to the fastest, each as near as a control period can bring it."""
     angular_samples: int = 11
-    """The same, of turning."""
+    """The same, of turning; an odd number has straight ahead."""
     acceleration_m_s2: float = 1.0
     """What can be reached: change of the forward velocity."""
     angular_acceleration_rad_s2: float = 4.0
@@ -252,11 +252,11 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
     reached_m: float = 0.35
     """A node nearer than this is passed."""
-    drive_s: float = 40.0
-    """Longest drive."""
+    leg_s: float = 12.0
+    """A drive has failed that takes longer for an edge."""
     test_share: float = 0.1
     """Share of the nodes whose drives are for testing only."""
-    shard: int = 20
+    shard: int = 10
     """Drives a file of images."""
 
     def __post_init__(self) -> None:
@@ -264,7 +264,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
         ExpertConfig.__post_init__(self)
         require(self, "batch drives legs shard", 1, 10**6)
         require(self, "turn_deg start_turn_deg", 0.0, 180.0)
-        require(self, "edge_m reached_m drive_s", 0.1, 1000.0)
+        require(self, "edge_m reached_m leg_s", 0.1, 1000.0)
         require(self, "detour", 1.0, 100.0)
         require(self, "start_off_m start_clear_m", 0.0, 10.0)
         if not 0.0 < self.test_share < 1.0:

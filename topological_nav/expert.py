@@ -122,20 +122,23 @@ def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: 
 
 
 def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Array]:
-    """Velocities that can be reached within a control period: linear [C] and angular [C], every pair of the samples.
+    """Velocities that can be reached within a control period: linear [C] and angular [C], every pair of a lattice.
+
+    What of the lattice is out of reach is brought as near as can be reached.
 
     Args:
         velocity: [2] commanded last, m/s and rad/s.
         config: limits and counts.
     """
 
-    def around(now, change, low, high, count):
-        least, most = jnp.clip(now - change, low, high), jnp.clip(now + change, low, high)
-        return least + (most - least) * jnp.linspace(0.0, 1.0, count)
+    def around(now, change, lattice):
+        return jnp.clip(lattice, now - change, now + change)
 
-    v = around(velocity[0], config.acceleration_m_s2 * CONTROL_S, 0.0, config.linear_m_s, config.linear_samples)
-    change, most = config.angular_acceleration_rad_s2 * CONTROL_S, config.angular_rad_s
-    w = around(velocity[1], change, -most, most, config.angular_samples)
+    most = config.angular_rad_s
+    v = jnp.linspace(0.0, config.linear_m_s, config.linear_samples)
+    w = jnp.linspace(-most, most, config.angular_samples)
+    v = around(velocity[0], config.acceleration_m_s2 * CONTROL_S, v)
+    w = around(velocity[1], config.angular_acceleration_rad_s2 * CONTROL_S, w)
     pairs = jnp.stack(jnp.meshgrid(v, w, indexing="ij"), -1).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
 

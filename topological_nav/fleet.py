@@ -119,7 +119,7 @@ class Fleet:
         """
         placed = jax.tree.map(jnp.asarray, dataclasses.asdict(tasks))
         carry, parts = self._begin(placed), []
-        for _ in range(-(-round(self._config.drive_s / CONTROL_S) // SEGMENT)):
+        while True:
             carry, part = self._segment(self._terrain, placed, carry)
             parts.append(jax.device_get(part))
             ended = int(carry["ended"].sum())
@@ -149,6 +149,7 @@ class Fleet:
             "state": state,
             "velocity": jnp.zeros((count, 2)),
             "leg": zero,
+            "leg_steps": zero,
             "steps": zero,
             "ended": no,
             "reached": no,
@@ -181,13 +182,14 @@ class Fleet:
         leg = carry["leg"] + arrived
         broken = going & ((state.metrics["nonfinite"] > 0) | (nav.overflow_steps > 0) | (nav.left_out_steps > 0))
         done = arrived & (leg >= tasks["legs"]) & ~broken
-        steps = carry["steps"] + going
+        leg_steps = jnp.where(arrived, 0, carry["leg_steps"] + going)
         out = {
             "state": state,
             "velocity": asked,
             "leg": jnp.minimum(leg, tasks["legs"] - 1),
-            "steps": steps,
-            "ended": carry["ended"] | done | broken | (steps >= round(config.drive_s / CONTROL_S)),
+            "leg_steps": leg_steps,
+            "steps": carry["steps"] + going,
+            "ended": carry["ended"] | done | broken | (leg_steps >= round(config.leg_s / CONTROL_S)),
             "reached": carry["reached"] | done,
             "broken": carry["broken"] | broken,
         }
