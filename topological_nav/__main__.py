@@ -191,6 +191,47 @@ def _train(arguments: argparse.Namespace) -> None:
     print(f"{out}: {results['parameters']:,} parameters")
 
 
+def _policy(arguments: argparse.Namespace) -> None:
+    config = overridden(PolicyConfig(), arguments.settings)
+    out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
+    from topological_nav.drive_figures import policy_figure
+    from topological_nav.figures import save
+    from topological_nav.imitation import embed_drives, grid_table, train_grid, train_policy
+    from train.run_folder import read_metrics
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+
+    with _stops() as stops:
+        halt = lambda: bool(stops)  # noqa: E731
+        runs = (arguments.localiser, arguments.detector)
+        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell, halt)
+        learn = train_grid if arguments.grid else train_policy
+        results = None if frames is None else learn(frames, out, config, tell, halt)
+        if results is None:
+            raise Stopped(stops[0])
+    if isinstance(results, list):
+        for row in results:
+            folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"
+            save(policy_figure(read_metrics(folder / "metrics.jsonl"), row), folder / "curves.png")
+        print(grid_table(results), end="")
+        return
+    save(policy_figure(read_metrics(out / "metrics.jsonl"), results), out / "curves.png")
+    for name in ("linear", "angular") if "test" in results else ():
+        row = results["test"][name]
+        print(
+            f"{name:<8} {results['test']['steps']:,} held-out steps  accuracy {row['accuracy']:.3f} "
+            f"(the commonest class {row['commonest']:.3f})  macro F1 {row['macro_f1']:.3f}"
+        )
+    if "test" in results:
+        test = results["test"]
+        print(f"forward model: error {test['forward']:.4f}, of no change {test['no_change']:.4f}")
+    print(
+        f"{out}: {results['sequences']:,} sequences ({results['nearly_straight']:.2f} of all are nearly straight), "
+        f"{results['parameters']:,} parameters"
+    )
+
+
 def _map(arguments: argparse.Namespace) -> None:
     config = overridden(MapConfig(), arguments.settings)
     from topological_nav.build import build_map

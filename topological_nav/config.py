@@ -215,6 +215,8 @@ class ExpertConfig:
     """Within this much more a metre of it counts for more, up to `near_cost` more."""
     near_cost: float = 3.0
     """Metres added to a metre along the obstacle."""
+    reached_m: float = 0.35
+    """A node nearer than this is passed."""
 
     def __post_init__(self) -> None:
         require(self, "linear_m_s angular_rad_s acceleration_m_s2 angular_acceleration_rad_s2", 0.01, 100.0)
@@ -223,7 +225,7 @@ class ExpertConfig:
         require(self, "horizon_s lidar_range_m", 0.1, 100.0)
         require(self, "lidar_fov_deg", 1.0, 360.0)
         require(self, "margin_m weigh_progress weigh_heading weigh_gap near_cost", 0.0, 100.0)
-        require(self, "caution_m radius_m near_m", 0.001, 10.0)
+        require(self, "caution_m radius_m near_m reached_m", 0.001, 10.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,6 +244,8 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Sharpest turn from one edge to the next: nothing but the images tells the policy where to go."""
     edge_m: float = 2.5
     """Longest edge, as in maps."""
+    least_edge_m: float = 1.0
+    """Shortest edge that a drive begins with."""
     detour: float = 2.0
     """Edges are driven whose planned way, a metre near obstacles counting more, is at most so many times as long."""
     start_off_m: float = 0.3
@@ -250,8 +254,6 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """And up to this much turned away from their edge."""
     start_clear_m: float = 0.36
     """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
-    reached_m: float = 0.35
-    """A node nearer than this is passed."""
     leg_s: float = 12.0
     """A drive has failed that takes longer for an edge."""
     test_share: float = 0.1
@@ -264,7 +266,8 @@ class DriveConfig(ExpertConfig, CameraConfig):
         ExpertConfig.__post_init__(self)
         require(self, "batch drives legs shard", 1, 10**6)
         require(self, "turn_deg start_turn_deg", 0.0, 180.0)
-        require(self, "edge_m reached_m leg_s", 0.1, 1000.0)
+        require(self, "edge_m leg_s", 0.1, 1000.0)
+        require(self, "least_edge_m", 0.0, 100.0)
         require(self, "detour", 1.0, 100.0)
         require(self, "start_off_m start_clear_m", 0.0, 10.0)
         if not 0.0 < self.test_share < 1.0:

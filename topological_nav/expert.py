@@ -221,8 +221,9 @@ def command(
     y = ways_w[..., 1:2] + sin * rim[:, 0] + cos * rim[:, 1]
     known = sample(terrain.clearance_m[scene], origin, resolution, jnp.stack([x, y], -1)).min(-1)
     gap = jnp.minimum(seen, known).min(-1)
-    left, heading = _slope(terrain.to_go_m[goal], origin, resolution, ways_w[:, -1, :2])
-    turn = jnp.abs(wrapped(heading - ways_w[:, -1, 2])) / jnp.pi
+    left, end = _left(terrain.to_go_m[goal], origin, resolution, ways_w, linear, config)
+    heading = _fall(terrain.to_go_m[goal], origin, resolution, end[:, :2])
+    turn = jnp.abs(wrapped(heading - end[:, 2])) / jnp.pi
     cost = (
         config.weigh_progress * left / (config.linear_m_s * config.horizon_s)
         + config.weigh_heading * turn
@@ -234,11 +235,32 @@ def command(
     return jnp.stack([linear[best], angular[best]]), gap[best]
 
 
-def _slope(field: jax.Array, origin: jax.Array, resolution: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Values [C] of a field at points [C, 2], and the headings [C] in which it falls."""
-    offsets = _SLOPE_M * jnp.asarray([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+def _left(
+    field: jax.Array,
+    origin: jax.Array,
+    resolution: jax.Array,
+    ways_w: jax.Array,
+    linear: jax.Array,
+    config: ExpertConfig,
+) -> tuple[jax.Array, jax.Array]:
+    """Way left [C] at the ends of ways [C, K, 3], and the poses [C, 3] where it is read.
+
+    A way past the goal ends there, and what it drives on counts as if it led farther: nobody stops at a node.
+    """
+    values = sample(field, origin, resolution, ways_w[..., :2])
+    steps = values.shape[1]
+    near = values < config.reached_m
+    at = jnp.where(near.any(1), near.argmax(1), steps - 1)
+    rows = jnp.arange(len(values))
+    beyond = linear * config.horizon_s * (steps - 1 - at) / steps
+    return values[rows, at] - beyond, ways_w[rows, at]
+
+
+def _fall(field: jax.Array, origin: jax.Array, resolution: jax.Array, xy: jax.Array) -> jax.Array:
+    """Headings [C] in which a field falls at points [C, 2]."""
+    offsets = _SLOPE_M * jnp.asarray([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     values = sample(field, origin, resolution, xy[:, None] + offsets)
-    return values[:, 0], jnp.arctan2(values[:, 4] - values[:, 3], values[:, 2] - values[:, 1])
+    return jnp.arctan2(values[:, 3] - values[:, 2], values[:, 1] - values[:, 0])
 
 
 def wrapped(angle: jax.Array) -> jax.Array:

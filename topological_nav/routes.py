@@ -54,8 +54,9 @@ def draw_routes(
 ) -> Routes:
     """Draws the drives of a scene.
 
-    The first edge is uniform over all; from its end a drive goes on by an edge that turns less than `turn_deg`, if
-    there is one, uniform over those. A share of the nodes is held out: drives that begin there are for testing.
+    The first edge is uniform over all that are long enough; from its end a drive goes on by an edge that turns less
+    than `turn_deg`, if there is one, uniform over those. A share of the nodes is held out: drives that begin there are
+    for testing.
 
     Args:
         space: of the scene.
@@ -70,14 +71,16 @@ def draw_routes(
     if not len(edges):
         raise SpaceError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")
     heading = angles(nodes_w, edges)
+    length = np.linalg.norm(nodes_w[edges[:, 1]] - nodes_w[edges[:, 0]], axis=1)
+    begins = np.flatnonzero(length >= min(config.least_edge_m, length.max()))
     out_of = [np.flatnonzero(edges[:, 0] == node) for node in range(len(nodes_w))]
-    begun = np.unique(edges[:, 0])
+    begun = np.unique(edges[begins, 0])
     tests = rng.permutation(begun)[: round(config.test_share * len(begun))]
     nodes = np.empty((config.drives, config.legs + 1), np.int32)
     legs, yaw = np.empty(config.drives, np.int32), np.empty(config.drives)
     start = np.empty((config.drives, 2))
     for i in range(config.drives):
-        way = [int(rng.integers(len(edges)))]
+        way = [int(rng.choice(begins))]
         while len(way) < config.legs:
             onward = out_of[edges[way[-1], 1]]
             turn = np.abs((heading[onward] - heading[way[-1]] + np.pi) % (2 * np.pi) - np.pi)
