@@ -46,18 +46,18 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
         axis, mine = axes[index], np.flatnonzero(drives.scene == index)
         floor_plan(axis, free_space(load_scene(scene_folder), robot.height_m))
         for k in mine[~drives.kept[mine]]:
-            axis.plot(*drives.pose_w[drives.first[k] : drives.first[k + 1], :2].T, color="0.35", linewidth=0.8, ls=":")
+            axis.plot(*drives.pose_w[drives.rows(k), :2].T, color="0.35", linewidth=0.8, ls=":")
         pieces, turns = [], []
         for k in mine[drives.kept[mine]]:
-            xy = drives.pose_w[drives.first[k] : drives.first[k + 1], :2]
+            xy = drives.pose_w[drives.rows(k), :2]
             pieces.append(np.stack([xy[:-1], xy[1:]], 1))
-            turns.append(drives.command[drives.first[k] : drives.first[k + 1] - 1, 1])
+            turns.append(drives.command[drives.rows(k)[:-1], 1])
         if pieces:
             shade = LineCollection(list(np.concatenate(pieces)), cmap="coolwarm", linewidths=0.7)
             shade.set_array(np.concatenate(turns))
             shade.set_clim(-config.angular_rad_s, config.angular_rad_s)
             axis.add_collection(shade)
-        hits = np.concatenate([np.arange(drives.first[k], drives.first[k + 1]) for k in mine])
+        hits = drives.rows(mine)
         hits = hits[drives.touching[hits].any(1)]
         axis.scatter(*drives.pose_w[hits, :2].T, s=6, color="k", marker="x", zorder=4)
         axis.set_title(

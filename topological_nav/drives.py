@@ -88,6 +88,10 @@ class Drives:
     def __len__(self) -> int:
         return len(self.scene)
 
+    def rows(self, which: np.ndarray | int) -> np.ndarray:
+        """[f] indices of the control steps of a drive, or of several, drive after drive."""
+        return np.concatenate([np.arange(int(self.first[k]), int(self.first[k + 1])) for k in np.atleast_1d(which)])
+
     @property
     def steps(self) -> np.ndarray:
         """[n] control steps."""
@@ -246,7 +250,7 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
                     if scene.digest != about["digest"]:
                         raise DatasetError(f"{scene_folder}: is not the scene that was driven in; drive again")
                     renderer = SceneRenderer(scene, lens_of(config, robot), config.supersample, config.engine)
-                poses = [drives.pose_w[drives.first[k] : drives.first[k + 1]] for k in rows]
+                poses = [drives.pose_w[drives.rows(k)] for k in rows]
                 sheets = [renderer.draw(camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p)))) for p in poses]
                 write_shard(path, sheets, config.quality)
             done += int(drives.steps[rows].sum())

@@ -4,7 +4,8 @@ Pure functions of one robot, for `jax.vmap`. A global path and a local planner i
 approach (Brock and Khatib 1999): each node of the graph has a field of the way that is left to it round walls and
 furniture, and of the velocities that the robot can reach within a control period (dynamic window: Fox, Burgard and
 Thrun 1997) that one wins which leads it down the field, turns it along the field and keeps its footprint away from
-what the lidar sees and the map holds. The map adds what a planar scan misses, such as table tops.
+what the lidar sees and the map holds. The map adds what a planar scan misses, such as table tops; before what only the
+scan sees, in the middle of its way, the robot stops, because no way round is planned.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def embed_drives(
     count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
     features: np.ndarray | None = None
     for i, (rows, images) in enumerate(drive_images(folder)):
-        at = np.concatenate([np.arange(drives.first[k], drives.first[k + 1]) for k in rows])
+        at = drives.rows(rows)
         for side, shown in enumerate((images, images[:, :, ::-1]) if mirror else (images,)):
             part = np.concatenate([network.embed(shown) for network in networks], -1)
             if features is None:
