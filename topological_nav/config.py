@@ -240,7 +240,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Begun in each scene."""
     legs: int = 3
     """Edges a drive, at most: on from each node by a random edge that turns less than `turn_deg`."""
-    turn_deg: float = 45.0
+    turn_deg: float = 30.0
     """Sharpest turn from one edge to the next: nothing but the images tells the policy where to go."""
     edge_m: float = 2.5
     """Longest edge, as in maps."""
@@ -250,8 +250,8 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Edges are driven whose planned way, a metre near obstacles counting more, is at most so many times as long."""
     start_off_m: float = 0.3
     """Drives begin up to this far from their node."""
-    start_turn_deg: float = 40.0
-    """And up to this much turned away from their edge."""
+    start_turn_deg: float = 15.0
+    """And up to this much turned away from their edge, as a robot is that was turned along it by its compass."""
     start_clear_m: float = 0.36
     """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
     leg_s: float = 12.0

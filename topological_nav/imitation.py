@@ -9,6 +9,7 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -28,7 +29,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from topological_nav.config import DriveConfig, PolicyConfig
 from topological_nav.drives import Drives, drive_images, load_drives, read_drives_header
 from topological_nav.errors import RunError
-from topological_nav.learning import Learner, compiled_epoch, initial
+from topological_nav.learning import Epoch, Learner, compiled_epoch, initial
 from topological_nav.policy import Forward, Policy, policy_loss, unrolled
 from topological_nav.runs import (
     DESCRIPTION,
@@ -211,10 +212,14 @@ def train_policy(
         first, learner = saved["epoch"], restored(learner, saved["learner"], out)
     alone = math.ceil(config.alone * config.epochs - 1e-9)
     shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(learned))
-    epoch, keys = policy_epoch(policy, forward, tx, config, len(learned)), jax.random.PRNGKey(config.seed)
+    epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]
+    keys, weights = (
+        jax.random.PRNGKey(config.seed),
+        {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)},
+    )
 
     def one(learner, number):
-        labels = {**truth, "jointly": jnp.float32(number >= alone)}
+        labels = {**truth, **weights, "jointly": jnp.float32(number >= alone)}
         return epoch(learner, shown, labels, jax.random.fold_in(keys, number))
 
     learner, done = run_epochs("policy", learner, one, range(first, config.epochs), out, tell, should_stop)
@@ -237,14 +242,20 @@ def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dic
     return params
 
 
-def policy_epoch(policy: Policy, forward: Forward, tx: optax.GradientTransformation, config: PolicyConfig, count: int):
-    """An epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`."""
+@functools.cache
+def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: int, count: int) -> Epoch:
+    """An epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`.
 
-    def loss_of(params, scale, u, batch, jointly):
+    Labels: the fields of `Sequences`, and numbers `alpha`, `lam` and `jointly` as `policy_loss` has them: one program
+    serves a whole grid.
+    """
+    tx, most = optax.adam(learning_rate), batch
+
+    def loss_of(params, scale, u, batch, weights):
         x = (u - scale["mean"]) / scale["deviation"]
         logits = unrolled(policy, params["policy"], x[:, :-1])
         truth = (batch["linear"], batch["angular"])
-        sizes = (config.linear_classes, config.angular_classes)
+        sizes = (policy.linear_classes, policy.angular_classes)
         expert = jnp.concatenate([jax.nn.one_hot(t, n) for t, n in zip(truth, sizes, strict=True)], -1)
         own = jnp.concatenate([nn.softmax(value) for value in logits], -1)
 
@@ -252,9 +263,8 @@ def policy_epoch(policy: Policy, forward: Forward, tx: optax.GradientTransformat
             return forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action)  # type: ignore[return-value]
 
         loss, parts = policy_loss(
-            logits, *truth, batch["valid"], next_after(expert), next_after(own), u[:, 1:], batch["followed"],
-            config.alpha, config.lam, jointly,
-        )  # fmt: skip
+            logits, *truth, batch["valid"], next_after(expert), next_after(own), u[:, 1:], batch["followed"], **weights
+        )
         right = {
             f"{name}_accuracy": ((one.argmax(-1) == t) & batch["valid"]).sum() / batch["valid"].sum()
             for name, one, t in zip(("linear", "angular"), logits, truth, strict=True)
@@ -263,7 +273,7 @@ def policy_epoch(policy: Policy, forward: Forward, tx: optax.GradientTransformat
 
     def steps(features, key):
         del features
-        size = min(config.batch, count)
+        size = min(most, count)
         return (jax.random.permutation(key, count)[: count // size * size].reshape(-1, size),)
 
     def update(learner, features, labels, step):
@@ -271,7 +281,8 @@ def policy_epoch(policy: Policy, forward: Forward, tx: optax.GradientTransformat
         batch = {name: labels[name][which] for name in ("rows", "valid", "followed", "linear", "angular")}
         u = features[batch["rows"]].astype(jnp.float32)
         grad = jax.value_and_grad(loss_of, has_aux=True)
-        (_, told), slope = grad(learner.params, learner.batch_stats, u, batch, labels["jointly"])
+        weights = {name: labels[name] for name in ("alpha", "lam", "jointly")}
+        (_, told), slope = grad(learner.params, learner.batch_stats, u, batch, weights)
         change, opt_state = tx.update(slope, learner.opt_state, learner.params)
         return Learner(optax.apply_updates(learner.params, change), learner.batch_stats, opt_state), told
 
@@ -325,6 +336,24 @@ def _finish(
     return results
 
 
+@functools.cache
+def _judge(policy: Policy, forward: Forward) -> Callable[..., tuple[jax.Array, ...]]:
+    """Compiled: the policy's classes, and squared errors of the forward model and of no change."""
+
+    @jax.jit
+    def judged(params, scale, u, linear, angular):
+        x = (u - scale["mean"]) / scale["deviation"]
+        logits = unrolled(policy, params["policy"], x[:, :-1])
+        action = jnp.concatenate(
+            [jax.nn.one_hot(linear, policy.linear_classes), jax.nn.one_hot(angular, policy.angular_classes)], -1
+        )
+        predicted = forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action)
+        errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in (predicted, u[:, :-1])]
+        return *(value.argmax(-1) for value in logits), *errors
+
+    return judged
+
+
 def _scores(
     features: np.ndarray,
     learner: Learner,
@@ -334,24 +363,18 @@ def _scores(
     config: PolicyConfig,
 ) -> dict[str, Any]:
     """How the policy's commands on held-out drives compare with the expert's, and the forward model with no change."""
-    scale, params = learner.batch_stats, learner.params
-
-    @jax.jit
-    def judged(u, linear, angular):
-        x = (u - scale["mean"]) / scale["deviation"]
-        logits = unrolled(policy, params["policy"], x[:, :-1])
-        action = jnp.concatenate(
-            [jax.nn.one_hot(linear, config.linear_classes), jax.nn.one_hot(angular, config.angular_classes)], -1
-        )
-        predicted = forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action)
-        errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in (predicted, u[:, :-1])]
-        return *(value.argmax(-1) for value in logits), *errors
-
+    judged = _judge(policy, forward)  # type: ignore[arg-type]  (flax modules are hashable)
     columns = []
     for first in range(0, len(held_out), config.batch):
         rows = np.minimum(np.arange(first, first + config.batch), len(held_out) - 1)
         part = held_out.take(rows)
-        told = judged(jnp.asarray(features[part.rows], jnp.float32), part.linear, part.angular)
+        told = judged(
+            learner.params,
+            learner.batch_stats,
+            jnp.asarray(features[part.rows], jnp.float32),
+            part.linear,
+            part.angular,
+        )
         columns.append([np.asarray(c)[: len(held_out) - first] for c in told])
     linear, angular, predicted, still = (np.concatenate(c) for c in zip(*columns, strict=True))
     out: dict[str, Any] = {"steps": int(held_out.valid.sum())}

@@ -111,8 +111,8 @@ def policy_loss(
     consistent: jax.Array,
     following: jax.Array,
     followed: jax.Array,
-    alpha: float,
-    lam: float,
+    alpha: jax.Array | float,
+    lam: jax.Array | float,
     jointly: jax.Array | float = 1.0,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """alpha (CE_angular + CE_linear) + |u - f(u, a)|^2 + lambda |u - f(u, a_hat)|^2, means over steps.

@@ -72,7 +72,7 @@ def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames):
     params = imitation.fresh_params(policy, forward, 3, 0)
     learner = Learner(params, {"mean": jnp.zeros(3), "deviation": jnp.ones(3)}, tx.init(params))
     before = jax.tree.map(np.asarray, params)
-    epoch = imitation.policy_epoch(policy, forward, tx, dataclasses.replace(CONFIG, batch=2), 4)
+    epoch = imitation.policy_epoch(policy, forward, 1e-2, 2, 4)
     rng = np.random.default_rng(0)
     labels = {
         "rows": jnp.asarray(rng.integers(0, 9, (4, 21))),
@@ -80,7 +80,7 @@ def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames):
         "followed": jnp.ones((4, 20), bool),
         "linear": jnp.zeros((4, 20), jnp.int32),
         "angular": jnp.zeros((4, 20), jnp.int32),
-        "jointly": jnp.float32(0.0),
+        **{"alpha": jnp.float32(10.0), "lam": jnp.float32(0.5), "jointly": jnp.float32(0.0)},
     }
     after, _ = epoch(learner, jnp.asarray(rng.normal(size=(9, 3)), jnp.float32), labels, jax.random.PRNGKey(0))
     same = jax.tree.map(lambda a, b: bool((np.asarray(a) == b).all()), after.params, before)

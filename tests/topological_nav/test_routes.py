@@ -55,7 +55,7 @@ def test_starts_are_near_their_node_clear_and_turned_within_bounds(space, edges)
     towards = NODES[routes.nodes[:, 1]] - routes.start_xy_w
     off = np.degrees(routes.start_yaw_rad - np.arctan2(towards[:, 1], towards[:, 0]))
     off = (off + 180) % 360 - 180
-    assert np.abs(off).max() <= 40.0 and off.min() < -30 and off.max() > 30
+    assert np.abs(off).max() <= 15.0 and off.min() < -11 and off.max() > 11
 
 
 def test_a_seed_repeats_and_whole_nodes_are_held_out(space, edges):
