@@ -234,7 +234,7 @@ def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dic
     action = jax.ShapeDtypeStruct((1, policy.linear_classes + policy.angular_classes), jnp.float32)
     shapes = {
         "policy": jax.eval_shape(lambda k, x: policy.init(k, policy.fresh(1), x), key, u)["params"],
-        "forward": jax.eval_shape(lambda k, x, a: forward.init(k, x, x, a), key, u, action)["params"],
+        "forward": jax.eval_shape(lambda k, x, a: forward.init(k, x, x, a, x[0]), key, u, action)["params"],
     }
     params = initial(shapes, seed)
     last = params["forward"]["Dense_2"]
@@ -259,8 +259,9 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
         expert = jnp.concatenate([jax.nn.one_hot(t, n) for t, n in zip(truth, sizes, strict=True)], -1)
         own = jnp.concatenate([nn.softmax(value) for value in logits], -1)
 
-        def next_after(action) -> jax.Array:
-            return forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action)  # type: ignore[return-value]
+        def next_after(action) -> Any:
+            given = (u[:, :-1], x[:, :-1], action, scale["deviation"])
+            return forward.apply({"params": params["forward"]}, *given)
 
         loss, parts = policy_loss(
             logits, *truth, batch["valid"], next_after(expert), next_after(own), u[:, 1:], batch["followed"], **weights
@@ -347,7 +348,7 @@ def _judge(policy: Policy, forward: Forward) -> Callable[..., tuple[jax.Array, .
         action = jnp.concatenate(
             [jax.nn.one_hot(linear, policy.linear_classes), jax.nn.one_hot(angular, policy.angular_classes)], -1
         )
-        predicted = forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action)
+        predicted = forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action, scale["deviation"])
         errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in (predicted, u[:, :-1])]
         return *(value.argmax(-1) for value in logits), *errors
 

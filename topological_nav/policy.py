@@ -73,18 +73,19 @@ class Forward(nn.Module):
     hidden: int = 512
 
     @nn.compact
-    def __call__(self, u: jax.Array, x: jax.Array, action: jax.Array) -> jax.Array:
+    def __call__(self, u: jax.Array, x: jax.Array, action: jax.Array, deviation: jax.Array) -> jax.Array:
         """[..., D].
 
         Args:
             u: [..., D] embeddings.
             x: [..., D] the same, standardised.
             action: [..., L + A] one-hot classes, or probabilities of them, linear then angular.
+            deviation: [D] unit in which changes are told.
         """
         y = jnp.concatenate([x, action], -1)
         for _ in range(2):
             y = nn.relu(nn.Dense(self.hidden)(y))
-        return u + nn.Dense(u.shape[-1])(y)
+        return u + deviation * nn.Dense(u.shape[-1])(y)
 
 
 def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -86,12 +86,15 @@ def test_the_forward_model_adds_a_change(made):
     y = np.concatenate([x, action], 1)
     for layer in ("Dense_0", "Dense_1"):
         y = np.maximum(y @ p[layer]["kernel"] + p[layer]["bias"], 0)
-    expected = u + y @ p["Dense_2"]["kernel"] + p["Dense_2"]["bias"]
-    found = Forward(5).apply({"params": params["forward"]}, jnp.asarray(u), jnp.asarray(x), jnp.asarray(action))
-    assert np.asarray(found) == pytest.approx(expected, abs=1e-4)
+    unit = rng.uniform(0.1, 2.0, WIDTH)
+    expected = u + unit * (y @ p["Dense_2"]["kernel"] + p["Dense_2"]["bias"])
+
+    def predicted(weights):
+        return Forward(5).apply({"params": weights}, *(jnp.asarray(v, jnp.float32) for v in (u, x, action, unit)))
+
+    assert np.asarray(predicted(params["forward"])) == pytest.approx(expected, abs=1e-4)
     fresh = fresh_params(Policy(hidden=HIDDEN), Forward(5), WIDTH, 0)["forward"]
-    still = Forward(5).apply({"params": fresh}, jnp.asarray(u), jnp.asarray(x), jnp.asarray(action))
-    assert np.asarray(still) == pytest.approx(u, abs=1e-6)
+    assert np.asarray(predicted(fresh)) == pytest.approx(u, abs=1e-6)
 
 
 def test_the_loss_by_hand():
