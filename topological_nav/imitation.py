@@ -32,6 +32,7 @@ from topological_nav.errors import RunError
 from topological_nav.learning import Epoch, Learner, compiled_epoch, initial
 from topological_nav.policy import Forward, Policy, policy_loss, unrolled
 from topological_nav.runs import (
+    CHECKPOINT,
     DESCRIPTION,
     RESULTS,
     WEIGHTS,
@@ -205,11 +206,11 @@ def train_policy(
         "deviation": jnp.asarray(np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)),
     }
     learner = Learner(params, scale, tx.init(params))
-    saved = read_checkpoint(out)
+    saved = read_checkpoint(out / CHECKPOINT)
     cut_metrics(out, ("policy",), saved)
     first = 0
     if saved:
-        first, learner = saved["epoch"], restored(learner, saved["learner"], out)
+        first, learner = saved["epoch"], restored(learner, saved["learner"], out / CHECKPOINT)
     alone = math.ceil(config.alone * config.epochs - 1e-9)
     shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(learned))
     epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]

@@ -93,13 +93,12 @@ def run_epochs(
     return learner, True
 
 
-def read_checkpoint(out: Path) -> dict[str, Any] | None:
-    """The last checkpoint of a run, if it has one.
+def read_checkpoint(path: Path) -> dict[str, Any] | None:
+    """A checkpoint as plain mappings; None: there is none.
 
     Raises:
         RunError: it is damaged.
     """
-    path = out / CHECKPOINT
     if not path.is_file():
         return None
     try:
@@ -108,8 +107,8 @@ def read_checkpoint(out: Path) -> dict[str, Any] | None:
         raise RunError(f"{path}: not readable ({error}); delete it to begin again") from None
 
 
-def restored(template: Learner, state: Any, out: Path) -> Learner:
-    """A learner as a checkpoint holds it.
+def restored(template: Learner, state: Any, path: Path) -> Learner:
+    """A learner as the checkpoint at a path holds it.
 
     Raises:
         RunError: it is another network's.
@@ -117,7 +116,7 @@ def restored(template: Learner, state: Any, out: Path) -> Learner:
     try:
         learner = flax.serialization.from_state_dict(template, state)
     except (ValueError, KeyError) as error:
-        raise RunError(f"{out / CHECKPOINT}: does not fit the network ({error}); delete it to begin again") from None
+        raise RunError(f"{path}: does not fit the network ({error}); delete it to begin again") from None
     return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
 
 

@@ -42,6 +42,7 @@ from topological_nav.learning import (
 from topological_nav.localise import localisation_scores
 from topological_nav.networks import Contrast, Network
 from topological_nav.runs import (
+    CHECKPOINT,
     DESCRIPTION,
     RESULTS,
     WEIGHTS,
@@ -153,7 +154,7 @@ def train(
         phases.insert(0, ("pairs", config.selfsup_epochs))
     elif config.init != "scratch":
         learner = _started_from(learner, Path(config.init))
-    saved = read_checkpoint(out)
+    saved = read_checkpoint(out / CHECKPOINT)
     cut_metrics(out, ("pairs", "labels"), saved)
     for phase, epochs in phases:
         if phase == "pairs":
@@ -166,7 +167,7 @@ def train(
             epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment)
         first = 0
         if saved and saved["phase"] == phase:
-            first, current = saved["epoch"], restored(current, saved["learner"], out)
+            first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
         elif saved and phase == "pairs":
             continue  # a checkpoint of the later phase holds this one's outcome
         shown, truth = jnp.asarray(images), jnp.asarray(labels)
