@@ -236,7 +236,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Physics: native (CPU), warp (NVIDIA), jax, or auto."""
     batch: int = 256
     """Drives at once: what an interrupted simulation loses at most."""
-    drives: int = 300
+    drives: int = 400
     """Begun in each scene."""
     legs: int = 3
     """Edges a drive, at most: on from each node by a random edge that turns less than `turn_deg`."""
