@@ -9,7 +9,7 @@ import argparse
 import re
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,12 +18,21 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from scenes_mjcf.schema import SceneError
 from topological_nav import adapt_commands
-from topological_nav.config import DataConfig, EvaluationConfig, MapConfig, passage_config, room_config
+from topological_nav.config import (
+    DataConfig,
+    DriveConfig,
+    EvaluationConfig,
+    MapConfig,
+    PolicyConfig,
+    passage_config,
+    room_config,
+)
 from topological_nav.errors import SettingsError, TopologicalError
 from topological_nav.settings import overridden, settings_help
 from train.errors import TrainError
 
 DATASET, RUNS = Path("runs/topological/data"), Path("runs/topological")
+DRIVES = Path("runs/topological/drives")
 TASKS = {"rooms": room_config, "passages": passage_config}
 
 
@@ -39,22 +48,39 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = made.add_subparsers(dest="command", required=True)
 
-    def command(name: str, text: str, config: object) -> argparse.ArgumentParser:
+    def command(name: str, text: str, config: object, **more: object) -> argparse.ArgumentParser:
+        listed = "".join(f"\n\nsettings of {what}:\n{settings_help(c)}" for what, c in more.items())
         sub = commands.add_parser(
             name,
             help=text,
             description=text,
-            epilog=f"settings (key=default):\n{settings_help(config)}",
+            epilog=f"settings (key=default):\n{settings_help(config)}{listed}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         return sub
 
-    data = command("data", "Renders room and passage images of scenes.", DataConfig())
+    data = command(
+        "data",
+        "Renders room and passage images of scenes, or drives of the expert.",
+        DataConfig(),
+        drives=DriveConfig(),
+    )
     data.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
-    data.add_argument("-o", "--out", type=Path, default=DATASET, metavar="DIR", help=f"dataset (default {DATASET})")
-    train = command("train", "Trains the room classifier or the passage detector.", room_config())
-    train.add_argument("task", choices=list(TASKS), help="passages differ in: batch=32 epochs=20")
-    train.add_argument("--data", type=Path, default=DATASET, metavar="DIR", help=f"dataset (default {DATASET})")
+    data.add_argument("--drives", action="store_true", help="drive through the scenes, and render what the robot sees")
+    data.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"dataset (default {DATASET}; drives: {DRIVES})")
+    train = command(
+        "train",
+        "Trains the room classifier, the passage detector or the local policy.",
+        room_config(),
+        policy=PolicyConfig(),
+    )
+    train.add_argument("task", choices=[*TASKS, "policy"], help="passages differ in: batch=32 epochs=20")
+    train.add_argument("--data", type=Path, metavar="DIR", help=f"dataset (default {DATASET}; policy: {DRIVES})")
+    train.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="policy: embeds images")
+    train.add_argument(
+        "--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="policy: embeds them too"
+    )
+    train.add_argument("--grid", action="store_true", help="policy: train with every alpha and lambda of the report")
     train.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"run folder (default {RUNS}/TASK)")
     plan = command("map", "Builds a scene's topological map and draws it.", MapConfig())
     plan.add_argument("scene", metavar="SCENE", help="scene folder")
@@ -121,7 +147,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _data(arguments: argparse.Namespace) -> None:
+    if arguments.drives:
+        return _drives(arguments)
     config = overridden(DataConfig(), arguments.settings)
+    out = arguments.out or DATASET
     from topological_nav.data import dataset_bytes, make_dataset
     from topological_nav.figures import dataset_figure, save
 
@@ -132,8 +161,8 @@ def _data(arguments: argparse.Namespace) -> None:
             if stops and done < total:
                 raise Stopped(stops[0])
 
-        header = make_dataset([Path(s) for s in arguments.scenes], arguments.out, config, progress)
-    save(dataset_figure(arguments.out), arguments.out / "preview.png")
+        header = make_dataset([Path(s) for s in arguments.scenes], out, config, progress)
+    save(dataset_figure(out), out / "preview.png")
     images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
     for s in header["scenes"]:
         rand = "" if s["rooms_agreement"] is None else f", adjusted Rand index {s['rooms_agreement']:.2f}"
@@ -141,11 +170,46 @@ def _data(arguments: argparse.Namespace) -> None:
             f"{s['name']}: {s['rooms']} rooms ({s['rooms_chosen_by']}{rand}), {s['positions']} positions "
             f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
         )
-    size = dataset_bytes(arguments.out)
-    print(f"{arguments.out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+    size = dataset_bytes(out)
+    print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+
+
+def _drives(arguments: argparse.Namespace) -> None:
+    config = overridden(DriveConfig(), arguments.settings)
+    out, scenes = arguments.out or DRIVES, [Path(s) for s in arguments.scenes]
+    from topological_nav.drive_figures import drives_figure
+    from topological_nav.drives import draw_drives, drives_bytes, simulate_drives, summary
+    from topological_nav.figures import save
+
+    with _stops() as stops:
+
+        def ending(tell: Callable[[str, int, int], None]) -> Callable[[str, int, int], None]:
+            def progress(what: str, done: int, total: int) -> None:
+                tell(what, done, total)
+                if stops and done < total:
+                    raise Stopped(stops[0])
+
+            return progress
+
+        with _bar() as tell:
+            drives = simulate_drives(scenes, out, config, ending(tell))
+        with _bar() as tell:
+            draw_drives(scenes, out, ending(tell))
+    save(drives_figure(scenes, out), out / "preview.png")
+    row = summary(drives)
+    print(
+        f"{row['drives']:,} drives: reached {row['reached']:.3f}, in contact {row['touched']:.3f} "
+        f"({row['contact_s']:.2f} s a drive), kept {int(drives.kept.sum()):,}; {row['seconds']:.1f} s long, "
+        f"{row['m_s']:.2f} m/s, turning in {row['turning']:.2f} of the steps"
+    )
+    images = int(drives.steps[drives.kept].sum())
+    size = drives_bytes(out)
+    print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
 
 
 def _train(arguments: argparse.Namespace) -> None:
+    if arguments.task == "policy":
+        return _policy(arguments)
     config = overridden(TASKS[arguments.task](), arguments.settings)
     out = arguments.out or RUNS / arguments.task
     from topological_nav.figures import curves_figure, save
@@ -154,7 +218,12 @@ def _train(arguments: argparse.Namespace) -> None:
 
     with _stops() as stops:
         results = train(
-            arguments.task, arguments.data, out, config, lambda line: print(line, flush=True), lambda: bool(stops)
+            arguments.task,
+            arguments.data or DATASET,
+            out,
+            config,
+            lambda line: print(line, flush=True),
+            lambda: bool(stops),
         )
         if results is None:
             raise Stopped(stops[0])
@@ -167,6 +236,47 @@ def _train(arguments: argparse.Namespace) -> None:
             f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
         )
     print(f"{out}: {results['parameters']:,} parameters")
+
+
+def _policy(arguments: argparse.Namespace) -> None:
+    config = overridden(PolicyConfig(), arguments.settings)
+    out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
+    from topological_nav.drive_figures import policy_figure
+    from topological_nav.figures import save
+    from topological_nav.imitation import embed_drives, grid_table, train_grid, train_policy
+    from train.run_folder import read_metrics
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+
+    with _stops() as stops:
+        halt = lambda: bool(stops)  # noqa: E731
+        runs = (arguments.localiser, arguments.detector)
+        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell, halt)
+        learn = train_grid if arguments.grid else train_policy
+        results = None if frames is None else learn(frames, out, config, tell, halt)
+        if results is None:
+            raise Stopped(stops[0])
+    if isinstance(results, list):
+        for row in results:
+            folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"
+            save(policy_figure(read_metrics(folder / "metrics.jsonl"), row), folder / "curves.png")
+        print(grid_table(results), end="")
+        return
+    save(policy_figure(read_metrics(out / "metrics.jsonl"), results), out / "curves.png")
+    for name in ("linear", "angular") if "test" in results else ():
+        row = results["test"][name]
+        print(
+            f"{name:<8} {results['test']['steps']:,} held-out steps  accuracy {row['accuracy']:.3f} "
+            f"(the commonest class {row['commonest']:.3f})  macro F1 {row['macro_f1']:.3f}"
+        )
+    if "test" in results:
+        test = results["test"]
+        print(f"forward model: error {test['forward']:.4f}, of no change {test['no_change']:.4f}")
+    print(
+        f"{out}: {results['sequences']:,} sequences ({results['nearly_straight']:.2f} of all are nearly straight), "
+        f"{results['parameters']:,} parameters"
+    )
 
 
 def _map(arguments: argparse.Namespace) -> None:

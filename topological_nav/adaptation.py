@@ -31,16 +31,8 @@ from topological_nav.errors import RunError
 from topological_nav.learning import compiled_epoch, initial
 from topological_nav.localise import localisation_scores
 from topological_nav.networks import Network, joined, normalised
-from topological_nav.training import (
-    METRICS,
-    RESULTS,
-    Trained,
-    claim,
-    load_trained,
-    read_checkpoint,
-    restored,
-    save_trained,
-)
+from topological_nav.runs import METRICS, RESULTS, claim, read_checkpoint, restored
+from topological_nav.training import Trained, load_trained, save_trained
 from train.config_io import to_dict
 from train.files import whole_file, write_text
 from train.run_folder import read_metrics, versions

@@ -14,11 +14,11 @@ PITCHES = ("up", "level", "down")
 
 
 @dataclasses.dataclass(frozen=True)
-class DataConfig:
-    """What is drawn of each scene. Defaults: the report's, at a stored size of 128 x 96."""
+class CameraConfig:
+    """Whose eyes draw, and how their images are stored."""
 
     seed: int = 0
-    """Of positions, splits and passages."""
+    """Of everything that is drawn by chance: positions, splits, passages, drives."""
     robot: str = "ttbot"
     """Whose camera draws."""
     engine: Literal["warp", "gl"] = "warp"
@@ -33,6 +33,19 @@ class DataConfig:
     """Vertical field of view; auto: the robot's camera's."""
     quality: int = 90
     """WebP quality of stored images; 100 stores them without loss."""
+
+    def __post_init__(self) -> None:
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "width height", 16, 2048)
+        require(self, "supersample", 1, 16)
+        require(self, "fov_deg", 1.0, 170.0)
+        require(self, "quality", 1, 100)
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig(CameraConfig):
+    """What is drawn of each scene. Defaults: the report's, at a stored size of 128 x 96."""
+
     room_method: Literal["kmeans", "gmm", "spectral"] = "gmm"
     """How free positions are clustered into rooms."""
     num_rooms: int | None = None
@@ -65,11 +78,7 @@ class DataConfig:
     """Sheets of images a file: what an interrupted rendering loses at most."""
 
     def __post_init__(self) -> None:
-        require(self, "seed", 0, 2**32 - 1)
-        require(self, "width height", 16, 2048)
-        require(self, "supersample", 1, 16)
-        require(self, "fov_deg", 1.0, 170.0)
-        require(self, "quality", 1, 100)
+        super().__post_init__()
         require(self, "num_rooms max_per_room positions passage_sources passage_targets shard", 1, 10**6)
         require(self, "clearance_m passage_clearance_m passage_margin_m", 0.0, 10.0)
         require(self, "passage_length_m", 0.05, 100.0)
@@ -239,3 +248,153 @@ class EvaluationConfig(NavigatorConfig):
         require(self, "episodes batch", 1, 10**6)
         require(self, "min_goal_m success_m clearance_m", 0.0, 1000.0)
         require(self, "thinned", 0.01, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExpertConfig:
+    """The expert: what it may command, how far it looks ahead, and what it weighs."""
+
+    linear_m_s: float = 0.5
+    """Fastest forward; it never reverses."""
+    angular_rad_s: float = 0.5
+    """Fastest turn, either way."""
+    linear_samples: int = 5
+    """Forward velocities tried, evenly from 0 to the fastest, each as near as a control period can bring it."""
+    angular_samples: int = 11
+    """The same, of turning; an odd number has straight ahead."""
+    acceleration_m_s2: float = 1.0
+    """What can be reached: change of the forward velocity."""
+    angular_acceleration_rad_s2: float = 4.0
+    """The same, of turning."""
+    horizon_s: float = 1.6
+    """Velocities are judged by where they would lead in this time."""
+    horizon_steps: int = 8
+    """Places on the way there that are looked at."""
+    margin_m: float = 0.04
+    """Least gap between the footprint and any obstacle."""
+    caution_m: float = 0.25
+    """A gap less than this costs."""
+    weigh_progress: float = 1.0
+    """Of the way that is left at the horizon, over the longest that can be driven until then."""
+    weigh_heading: float = 1.2
+    """Of the angle there to the way on, over a half turn."""
+    weigh_gap: float = 0.4
+    """Of a gap of 0; at `caution_m` it is nothing."""
+    lidar_rays: int = 135
+    """Beams of the scan."""
+    lidar_fov_deg: float = 270.0
+    """Angle that they cover."""
+    lidar_range_m: float = 4.0
+    """What is farther is not seen."""
+    radius_m: float = 0.27
+    """The planned way keeps its middle this far from obstacles."""
+    near_m: float = 0.3
+    """Within this much more a metre of it counts for more, up to `near_cost` more."""
+    near_cost: float = 3.0
+    """Metres added to a metre along the obstacle."""
+    reached_m: float = 0.35
+    """A node nearer than this is passed."""
+
+    def __post_init__(self) -> None:
+        require(self, "linear_m_s angular_rad_s acceleration_m_s2 angular_acceleration_rad_s2", 0.01, 100.0)
+        require(self, "linear_samples angular_samples", 2, 101)
+        require(self, "horizon_steps lidar_rays", 1, 1000)
+        require(self, "horizon_s lidar_range_m", 0.1, 100.0)
+        require(self, "lidar_fov_deg", 1.0, 360.0)
+        require(self, "margin_m weigh_progress weigh_heading weigh_gap near_cost", 0.0, 100.0)
+        require(self, "caution_m radius_m near_m reached_m", 0.001, 10.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveConfig(ExpertConfig, CameraConfig):
+    """Drives of the expert along edges of each scene's graph, seen from the robot."""
+
+    backend: str = "auto"
+    """Physics: native (CPU), warp (NVIDIA), jax, or auto."""
+    batch: int = 256
+    """Drives at once: what an interrupted simulation loses at most."""
+    drives: int = 400
+    """Begun in each scene."""
+    legs: int = 3
+    """Edges a drive, at most: on from each node by a random edge that turns less than `turn_deg`."""
+    turn_deg: float = 30.0
+    """Sharpest turn from one edge to the next: nothing but the images tells the policy where to go."""
+    edge_m: float = 2.5
+    """Longest edge, as in maps."""
+    least_edge_m: float = 1.0
+    """Shortest edge that a drive begins with."""
+    detour: float = 2.0
+    """Edges are driven whose planned way, a metre near obstacles counting more, is at most so many times as long."""
+    start_off_m: float = 0.3
+    """Drives begin up to this far from their node."""
+    start_turn_deg: float = 15.0
+    """And up to this much turned away from their edge, as a robot is that was turned along it by its compass."""
+    start_clear_m: float = 0.36
+    """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
+    leg_s: float = 12.0
+    """A drive has failed that takes longer for an edge."""
+    test_share: float = 0.1
+    """Share of the nodes whose drives are for testing only."""
+    shard: int = 10
+    """Drives a file of images."""
+
+    def __post_init__(self) -> None:
+        CameraConfig.__post_init__(self)
+        ExpertConfig.__post_init__(self)
+        require(self, "batch drives legs shard", 1, 10**6)
+        require(self, "turn_deg start_turn_deg", 0.0, 180.0)
+        require(self, "edge_m leg_s", 0.1, 1000.0)
+        require(self, "least_edge_m", 0.0, 100.0)
+        require(self, "detour", 1.0, 100.0)
+        require(self, "start_off_m start_clear_m", 0.0, 10.0)
+        if not 0.0 < self.test_share < 1.0:
+            raise SettingsError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyConfig:
+    """The local policy and how it learns. Defaults: the report's."""
+
+    seed: int = 0
+    """The one seed of weights, order and thinning."""
+    hidden: int = 500
+    """Numbers in the memory of each of the two GRU cells."""
+    projection: int = 0
+    """Features are mapped to so many numbers before the cells, which makes these smaller; 0: they are not."""
+    forward_hidden: int = 512
+    """Units of each of the forward model's two layers."""
+    linear_classes: int = 3
+    """Forward velocities, evenly from 0 to the expert's fastest."""
+    angular_classes: int = 5
+    """Turning velocities, evenly from the fastest right to the fastest left."""
+    steps: int = 50
+    """Control steps a sequence."""
+    overlap_s: float = 4.0
+    """Longest overlap of two sequences of a drive."""
+    straight_share: float = 0.2
+    """A sequence that turns in less than this share of its steps is nearly straight."""
+    straight_kept: float = 0.3
+    """Share of the nearly straight sequences that is learned from."""
+    mirror: bool = True
+    """Learn from mirrored drives too."""
+    alpha: float = 10.0
+    """Weight of the commands' cross-entropies."""
+    lam: float = 0.5
+    """Weight of forward consistency: lambda."""
+    epochs: int = 50
+    """Passes over the sequences."""
+    alone: float = 0.1
+    """Share of them, the first, in which only the forward model learns."""
+    batch: int = 50
+    """Sequences an update."""
+    learning_rate: float = 1e-4
+    """Adam's."""
+
+    def __post_init__(self) -> None:
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "hidden forward_hidden epochs batch", 1, 10**6)
+        require(self, "projection", 0, 10**6)
+        require(self, "linear_classes angular_classes steps", 2, 1000)
+        require(self, "overlap_s alpha lam", 0.0, 1e6)
+        require(self, "straight_share straight_kept alone", 0.0, 1.0)
+        require(self, "learning_rate", 1e-9, 10.0)

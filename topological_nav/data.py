@@ -23,7 +23,7 @@ import numpy as np
 from interactive_nav.rendering.base import Lens
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
-from topological_nav.config import DataConfig
+from topological_nav.config import CameraConfig, DataConfig
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.passages import Passages, draw_passages, held_out
 from topological_nav.rendering import SceneRenderer, camera_pose
@@ -91,7 +91,7 @@ def headings(config: DataConfig) -> np.ndarray:
     return 2 * np.pi * np.arange(config.headings) / config.headings
 
 
-def lens_of(config: DataConfig, robot: RobotSpec) -> Lens:
+def lens_of(config: CameraConfig, robot: RobotSpec) -> Lens:
     """The lens of stored images."""
     return Lens(config.width, config.height, config.fov_deg or robot.camera.fov_deg)
 

@@ -34,8 +34,8 @@ class Learner:
     opt_state: Any
 
 
-Epoch = Callable[[Learner, jax.Array, jax.Array, jax.Array], tuple[Learner, dict[str, jax.Array]]]
-"""(learner, images, labels, key) -> learner and means over the epoch; compiled."""
+Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, jax.Array]]]
+"""(learner, images, labels, key) -> learner and means over the epoch; compiled. Labels may be a tree of arrays."""
 
 
 def make_learner(

@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import hashlib
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,14 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import yaml
 from sklearn.metrics import confusion_matrix, f1_score
 
 from topological_nav.config import PITCHES, TrainConfig
 from topological_nav.data import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.errors import RunError
 from topological_nav.learning import (
-    Epoch,
     Learner,
     decided,
     in_batches,
@@ -44,14 +41,20 @@ from topological_nav.learning import (
 )
 from topological_nav.localise import localisation_scores
 from topological_nav.networks import Contrast, Network
+from topological_nav.runs import (
+    CHECKPOINT,
+    DESCRIPTION,
+    RESULTS,
+    WEIGHTS,
+    claim,
+    cut_metrics,
+    read_checkpoint,
+    restored,
+    run_epochs,
+)
 from train.config_io import to_dict
 from train.files import whole_file, write_text
-from train.run_folder import read_metrics, versions
-
-CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
-WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
-SAVE_EVERY_S = 60.0
-"""Between two checkpoints; one is written at the end of a phase and on a stop as well."""
+from train.run_folder import versions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +155,7 @@ def train(
     elif config.init != "scratch":
         learner = _started_from(learner, Path(config.init))
     saved = read_checkpoint(out / CHECKPOINT)
-    _cut_metrics(out / METRICS, saved)
+    cut_metrics(out, ("pairs", "labels"), saved)
     for phase, epochs in phases:
         if phase == "pairs":
             contrast, contrast_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
@@ -167,9 +170,13 @@ def train(
             first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
         elif saved and phase == "pairs":
             continue  # a checkpoint of the later phase holds this one's outcome
-        current, done = _run(
-            phase, current, epoch, images, labels, range(first, epochs), config, out, tell, should_stop
-        )
+        shown, truth = jnp.asarray(images), jnp.asarray(labels)
+        keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
+
+        def one(learner, number, epoch=epoch, shown=shown, truth=truth, keys=keys):
+            return epoch(learner, shown, truth, jax.random.fold_in(keys, number))
+
+        current, done = run_epochs(phase, current, one, range(first, epochs), out, tell, should_stop)
         if not done:
             return None
         if phase == "pairs":
@@ -253,45 +260,6 @@ def _work(task: str, dataset: Path, config: TrainConfig) -> _Work:
     )  # fmt: skip
 
 
-def _run(
-    phase: str,
-    learner: Learner,
-    epoch: Epoch,
-    images: np.ndarray,
-    labels: np.ndarray,
-    epochs: range,
-    config: TrainConfig,
-    out: Path,
-    tell: Callable[[str], None],
-    should_stop: Callable[[], bool],
-) -> tuple[Learner, bool]:
-    """Epochs of one phase; False where a stop was asked for before the last."""
-    on_device, labels_there = jnp.asarray(images), jnp.asarray(labels)
-    began = saved_at = time.perf_counter()
-    keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
-    for number in epochs:
-        started = time.perf_counter()
-        learner, means = epoch(learner, on_device, labels_there, jax.random.fold_in(keys, number))
-        line = {"phase": phase, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
-        now = time.perf_counter()
-        if not np.isfinite(line["loss"]):
-            raise RunError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning_rate")
-        with open(out / METRICS, "a") as file:
-            file.write(json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
-        left = (now - began) / (number + 1 - epochs.start) * (epochs.stop - number - 1)
-        scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
-        tell(f"{phase}: epoch {number + 1} of {epochs.stop}  {scores}  {now - started:.1f} s  {left:.0f} s left")
-        last, stop = number + 1 == epochs.stop, should_stop()
-        if last or stop or now - saved_at > SAVE_EVERY_S:
-            state = {"phase": phase, "epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}
-            with whole_file(out / CHECKPOINT) as partial:
-                partial.write_bytes(flax.serialization.msgpack_serialize(jax.device_get(state)))
-            saved_at = now
-        if stop:
-            return learner, False
-    return learner, True
-
-
 def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
     """Accuracy and macro F1 of what was held out, and how well the embedding localises."""
     results: dict[str, Any] = {
@@ -344,51 +312,6 @@ def localisation(trained: Trained, rooms: RoomImages) -> dict[str, Any]:
         keys = next(iter(rows.values()))
         rows["mean"] = {k: float(np.average([r[k] for r in rows.values()], weights=weights)) for k in keys}
     return rows
-
-
-def claim(out: Path, settings: dict[str, Any]) -> None:
-    """Writes a new run's settings, or checks that the run there has the same; raises RunError."""
-    path = out / CONFIG
-    if path.is_file():
-        there = yaml.safe_load(path.read_text())
-        for name, value in settings.items():
-            if there.get(name) != value:
-                shown = (there.get(name), value) if name != "dataset" else ("another", "this one")
-                raise RunError(
-                    f"{out}: the run there has {name} = {shown[0]!r}, this one {shown[1]!r}; "
-                    "choose another folder (-o) or delete it"
-                )
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(path, yaml.safe_dump(settings, sort_keys=False))
-
-
-def read_checkpoint(path: Path) -> dict[str, Any] | None:
-    """A checkpoint as plain mappings; None: there is none. Raises RunError."""
-    if not path.is_file():
-        return None
-    try:
-        return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
-    except Exception as error:  # noqa: BLE001  (msgpack raises many kinds for a damaged file)
-        raise RunError(f"{path}: not readable ({error}); delete it to begin again") from None
-
-
-def restored(template: Learner, state: Any, path: Path) -> Learner:
-    """A checkpoint's learner, typed as the template; raises RunError where it does not fit."""
-    try:
-        learner = flax.serialization.from_state_dict(template, state)
-    except (ValueError, KeyError) as error:
-        raise RunError(f"{path}: does not fit the network ({error}); delete it to begin again") from None
-    return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
-
-
-def _cut_metrics(path: Path, saved: dict[str, Any] | None) -> None:
-    """Drops the lines after the checkpoint that a run goes on from: their epochs are run again."""
-    if path.is_file():
-        order = {"pairs": 0, "labels": 1}
-        until = (order[saved["phase"]], saved["epoch"]) if saved else (-1, 0)
-        kept = [line for line in read_metrics(path) if (order[line["phase"]], line["epoch"]) <= until]
-        write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
 
 
 def _started_from(learner: Learner, run: Path) -> Learner:

@@ -32,8 +32,9 @@ from topological_nav.graph import assemble, near_pairs
 from topological_nav.learning import Learner, decided, labelled_epoch, make_learner
 from topological_nav.localise import localisation_scores
 from topological_nav.passages import balanced
+from topological_nav.runs import RESULTS, claim
 from topological_nav.space import free_space
-from topological_nav.training import RESULTS, Trained, claim, load_trained, save_trained
+from topological_nav.training import Trained, load_trained, save_trained
 from train.config_io import to_dict
 from train.files import write_text
 from train.run_folder import versions

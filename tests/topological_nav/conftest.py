@@ -24,6 +24,10 @@ WORDS = (
     ),
     *("passage_sources=24", "passage_length_m=1.2", "shard=4"),
 )
+DRIVEN = (
+    *("width=32", "height=32", "supersample=1", "quality=100", "shard=3"),
+    *("backend=native", "drives=10", "batch=6", "test_share=0.3"),
+)
 TRAINED = ("width=4", "hidden=32", "learning_rate=3e-3")
 
 
@@ -87,3 +91,11 @@ def made(painted, tmp_path_factory) -> Made:
     runs = ["--localiser", str(here.rooms), "--detector", str(here.passages)]
     assert main(["map", str(painted), *runs, "-o", str(here.map), "--route", "0", "1"]) == 0
     return here
+
+
+@pytest.fixture(scope="session")
+def driven(painted, tmp_path_factory) -> Path:
+    """Ten drives through the painted scene, in two batches."""
+    out = tmp_path_factory.mktemp("driven") / "drives"
+    assert main(["data", "--drives", str(painted), "-o", str(out), *DRIVEN]) == 0
+    return out

@@ -57,7 +57,7 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
     else:
         from topological_nav import driving
 
-        policy = driving.load_policy(Path(journey.policy))  # type: ignore[attr-defined]
+        policy = driving.load_policy(Path(journey.policy))
     if not journey.goals:
         raise SettingsError("the navigator has no goal; name a picture taken there: --goal PICTURE")
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in journey.goals])
