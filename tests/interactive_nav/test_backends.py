@@ -219,7 +219,7 @@ def assert_agree(world, native, other, force_rtol):
 @pytest.mark.slow
 def test_mjx_jax_agrees_with_c_mujoco(world, native, mjx_jax):
     # MJX-JAX keeps other contact points of two boxes, so friction on the pusher's face differs.
-    assert_agree(world, native, mjx_jax, force_rtol=0.15)
+    assert_agree(world, native, mjx_jax, force_rtol=0.2)
 
 
 @pytest.mark.slow
