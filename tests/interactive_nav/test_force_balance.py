@@ -183,7 +183,7 @@ def test_fifteen_pushes_balance_on_native(tmp_path):
     # Fast pushes slide: the floor gives mu N. Slow ones rattle, and it gives less (the next test says why).
     share = push.horizontal_n(push.robot_n) / push.coulomb_n
     assert (np.abs(share[WHEEL > 4.0][FRICTION[WHEEL > 4.0] < 0.8] - 1.0) < 0.05).all()
-    assert (share < 1.05).all() and share.min() < 0.9
+    assert (share < 1.05).all() and 0.85 < share.min() < 0.95
     # A force read in the last substep only, or lost in one of them, would be seen.
     lost = push.robot_n.copy()
     lost[:, :, 0] = 0.0

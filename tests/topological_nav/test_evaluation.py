@@ -203,6 +203,7 @@ def test_with_true_sight_the_navigator_finds_the_other_room(first):
     assert all(r["within"] for r in by["expert"]) and not any(r["broken"] for r in rows.to_pylist())
 
 
+@pytest.mark.heavy
 def test_who_else_is_in_the_batch_does_not_matter_and_a_stopped_contest_goes_on(first, toy, tmp_path):
     contest, venues, expected = first
     other = dataclasses.replace(contest, out=tmp_path, config=dataclasses.replace(contest.config, batch=2))

@@ -54,13 +54,14 @@ def test_evidence_on_c_mujoco(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ("turtlebot", pytest.param("husky", marks=pytest.mark.heavy)))
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", ("turtlebot", "husky"))
 def test_evidence_on_mjx_jax(name):
     assert _failures(name, "jax") == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ("turtlebot", "fetch"))
+@pytest.mark.parametrize("name", ("turtlebot", pytest.param("fetch", marks=pytest.mark.heavy)))
 def test_evidence_on_mjx_warp(name):
     pytest.importorskip("warp", reason="the package warp-lang (extra 'warp') is not installed")
     assert _failures(name, "warp") == []
