@@ -138,6 +138,7 @@ def test_networks_are_found_from_the_run_and_must_be_the_same(frames, run, made,
         load_policy(run, localiser=made.passages)
 
 
+@pytest.mark.heavy
 def test_the_command_draws_and_its_grid_is_a_table(made, driven, tmp_path, capsys):
     out = tmp_path / "grid"
     runs = ["--data", str(driven), "--localiser", str(made.rooms), "--detector", str(made.passages)]

@@ -61,7 +61,8 @@ def test_evidence_on_mjx_jax(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ("turtlebot", pytest.param("fetch", marks=pytest.mark.heavy)))
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", ("turtlebot", "fetch"))
 def test_evidence_on_mjx_warp(name):
     pytest.importorskip("warp", reason="the package warp-lang (extra 'warp') is not installed")
     assert _failures(name, "warp") == []
