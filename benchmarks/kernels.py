@@ -29,14 +29,17 @@ from benchmarks.steps_per_second import MODES, _commit, _versions, step_of
 from interactive_nav.wrappers import AutoResetEnv
 
 PARTS = (
-    ("collision", r"broadphase|narrowphase|ccd|collision|contact_match|contact_sort|plane|nxn|sap_"),
-    ("constraint rows", r"efc|friction_dof|limit_|contact_init|jac_|equality|constraint\.|_constraint_"),
-    ("solver", r"solve|linesearch|cholesky|gradient|JTDAJ|update_constraint|mul_m|search|jaref|beta"),
-    ("rendering", r"render|megakernel|bvh|ray"),
-    ("smooth dynamics", r"smooth|kinematics|com_|crb|rne|cinert|passive|forward|euler|implicit|derivative|qfrc|actuat|"
-     r"next_|tendon|factor|camlight|sensor|cacc|cvel"),
-    ("copies", r"memcpy|memset|copy"),
-)  # fmt: skip
+    ("rendering", r"render|bvh"),
+    ("solver", r"solve|linesearch|cholesky|gradient|JTDA|update_constraint|zero_qfrc_constraint|mul_m"),
+    ("collision", r"broadphase|narrowphase|ccd|collision|contact_match|contact_sort"),
+    ("constraint rows", r"efc|friction_dof|limit_|equality"),
+    (
+        "smooth dynamics",
+        r"smooth|kinematics|com_|comvel|crb|_rne|cinert|cdof|gravity|geom_local|passive|implicit|derivative|"
+        r"qfrc|actuator|next_|tendon|camlight|cacc|cvel|qM|xpos",
+    ),
+    ("copies", r"memcpy|memset|memtile"),
+)
 """Parts of a step by what their kernels are called; the first that fits. XLA's own fusions are the task's."""
 
 

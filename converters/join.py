@@ -58,6 +58,7 @@ class Edges:
 
 
 def edges_of(faces: np.ndarray) -> Edges:
+    """The edges of (m, 3) faces, each once."""
     every = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     ends, inverse, count = np.unique(every, axis=0, return_inverse=True, return_counts=True)
     return Edges(ends, count, inverse.reshape(-1, 3))

@@ -197,6 +197,30 @@ def dataset_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in Path(folder).glob("*/*.npz"))
 
 
+def read_versioned(path: Path, version: int, none: str, again: str) -> dict[str, Any]:
+    """A folder's description, of this format.
+
+    Args:
+        path: its JSON file.
+        version: of the format.
+        none: what to say where there is no file.
+        again: what to do about one that cannot be used.
+
+    Raises:
+        DatasetError: missing, not readable, or of another format.
+    """
+    if not path.is_file():
+        raise DatasetError(none)
+    try:
+        header = json.loads(path.read_text(encoding="utf-8"))
+        found = header["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{path}: not readable ({error}); delete the folder and {again}") from None
+    if found != version:
+        raise DatasetError(f"{path}: format {found}, expected {version}; {again}")
+    return header
+
+
 def read_header(folder: Path) -> tuple[dict[str, Any], DataConfig]:
     """dataset.json and the settings in it.
 
@@ -204,15 +228,8 @@ def read_header(folder: Path) -> tuple[dict[str, Any], DataConfig]:
         DatasetError: the folder is no dataset, or of another format.
     """
     path = Path(folder) / "dataset.json"
-    if not path.is_file():
-        raise DatasetError(f"{folder}: is no dataset (no dataset.json); make one: python -m topological_nav data ...")
-    try:
-        header = json.loads(path.read_text(encoding="utf-8"))
-        version = header["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); delete the folder and make it again") from None
-    if version != FORMAT:
-        raise DatasetError(f"{path}: format {version}, expected {FORMAT}; make the dataset again")
+    none = f"{folder}: is no dataset (no dataset.json); make one: python -m topological_nav data ..."
+    header = read_versioned(path, FORMAT, none, "make the dataset again")
     return header, overlaid(DataConfig(), header["settings"], str(path))
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import Scene, load_scene
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
-from topological_nav.data import lens_of
+from topological_nav.data import lens_of, read_versioned
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.expert import CONTROL_S, Terrain, way_field
 from topological_nav.fleet import Driven, Fleet, Tasks, make_env
@@ -290,17 +290,8 @@ def read_drives_header(folder: Path) -> tuple[dict[str, Any], DriveConfig]:
         DatasetError: the folder holds no drives, or of another format.
     """
     path = Path(folder) / "drives.json"
-    if not path.is_file():
-        raise DatasetError(
-            f"{folder}: holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE..."
-        )
-    try:
-        header = json.loads(path.read_text(encoding="utf-8"))
-        version = header["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); delete the folder and drive again") from None
-    if version != FORMAT:
-        raise DatasetError(f"{path}: format {version}, expected {FORMAT}; drive again")
+    none = f"{folder}: holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE..."
+    header = read_versioned(path, FORMAT, none, "drive again")
     return header, overlaid(DriveConfig(), header["settings"], str(path))
 
 

@@ -18,6 +18,10 @@ def test_busy_is_what_the_intervals_cover():
         ("_efc_contact_init__locals__kernel_3a7c064e_b7c9424", None, "constraint rows"),
         ("_update_gradient_JTDAJ_dense_tiled__locals__kernel_87ae7184", None, "solver"),
         ("build_megakernel__locals___render_megakernel_0638279c", None, "rendering"),
+        ("_update_constraint_efc__locals__kernel_0539aa50", None, "solver"),  # in every iteration of the solver
+        ("_JTDACJ_sparse__locals__kernel_0d23ad07", None, "solver"),
+        ("_comvel_branch", None, "smooth dynamics"),
+        ("some_other_kernel", None, "task, observation, window (XLA)"),
         ("loop_add_fusion.12", "loop_add_fusion", "task, observation, window (XLA)"),
         ("MemcpyD2D", "MemcpyD2D", "copies"),
     ],
