@@ -68,7 +68,7 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 
 test: sync .venv/.oracles
 	$(say) "Tests (two workers; the slow ones compile MJX on the CPU)"
-	@$(PY) -m pytest -n 2 --dist loadfile -m "not heavy"
+	@$(PY) -m pytest -n 2 --dist loadfile -m "not heavy" --durations=15
 
 test-all: sync .venv/.oracles
 	$(say) "All tests, the heavy ones too"

@@ -1,4 +1,4 @@
-"""`python -m topological_nav data|train|map|navigate|evaluate|adapt`: words in, files and pictures out.
+"""`python -m topological_nav data|train|map|navigate|evaluate|adapt|export`: words in, files and pictures out.
 
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
 """
@@ -6,7 +6,9 @@ Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import re
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,9 +21,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from scenes_mjcf.schema import SceneError
 from topological_nav import adapt_commands
 from topological_nav.config import (
+    PASSAGE_POLICY,
+    RUNS,
     DataConfig,
     DriveConfig,
     EvaluationConfig,
+    ExportConfig,
     MapConfig,
     PolicyConfig,
     passage_config,
@@ -31,8 +36,7 @@ from topological_nav.errors import SettingsError, TopologicalError
 from topological_nav.settings import overridden, settings_help
 from train.errors import TrainError
 
-DATASET, RUNS = Path("runs/topological/data"), Path("runs/topological")
-DRIVES = Path("runs/topological/drives")
+DATASET, DRIVES = RUNS / "data", RUNS / "drives"
 TASKS = {"rooms": room_config, "passages": passage_config}
 
 
@@ -84,8 +88,6 @@ def parser() -> argparse.ArgumentParser:
     train.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"run folder (default {RUNS}/TASK)")
     plan = command("map", "Builds a scene's topological map and draws it.", MapConfig())
     plan.add_argument("scene", metavar="SCENE", help="scene folder")
-    plan.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
-    plan.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
     plan.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"map (default {RUNS}/maps/SCENE.npz)")
     plan.add_argument("--route", nargs=2, type=int, metavar=("FROM", "TO"), help="draw the way between two nodes")
     one = command("navigate", "Drives one episode of a scene and draws it.", EvaluationConfig())
@@ -105,19 +107,48 @@ def parser() -> argparse.ArgumentParser:
     several.add_argument("--ppo", type=Path, metavar="RUN", help="run folder of `python -m train`: told the goal")
     several.add_argument("-o", "--out", type=Path, default=RUNS / "evaluation", metavar="DIR", help="rows and figures")
     for sub in (one, several):
-        sub.add_argument("--maps", type=Path, default=RUNS / "maps", metavar="DIR", help="of SCENE.npz")
-        sub.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
-        sub.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
+        sub.add_argument(
+            "--maps",
+            type=Path,
+            metavar="DIR",
+            help=f"of SCENE.npz (default {RUNS}/maps, made where missing)",
+        )
         sub.add_argument(
             "--policy",
-            default="passage",
             metavar="RUN",
-            help="local policy; passage (default): straight on while the detector agrees, else turn",
+            help="local policy (default: with the networks, where none is named); passage: straight on while the "
+            "detector agrees, else turn",
+        )
+        sub.add_argument(
+            "--domain",
+            default="clean",
+            metavar="NAME",
+            help="camera that the navigator sees by, goals included: clean (default), lens, light, noise, blur or "
+            "camera; maps of its images: `adapt map`",
         )
         sub.add_argument(
             "--truth", action="store_true", help="maps from the plan, and the truth instead of both networks"
         )
+    for sub in (plan, one, several):
+        sub.add_argument(
+            "--localiser", type=Path, metavar="RUN", help=f"embeds images (default {RUNS}, or the package's)"
+        )
+        sub.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
     adapt_commands.add_to(command, DATASET, RUNS)
+    carry = command("export", "Writes finished runs as a small folder of weights in half precision.", ExportConfig())
+    carry.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
+    carry.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
+    carry.add_argument("--policy", type=Path, metavar="RUN", help="local policy (default: none)")
+    carry.add_argument("--maps", type=Path, metavar="DIR", help="of SCENE.npz, all of them (default: none)")
+    carry.add_argument(
+        "--images",
+        type=Path,
+        default=DATASET,
+        metavar="PATH",
+        help=f"to compare by: dataset, scene (default {DATASET})",
+    )
+    carry.add_argument("-o", "--out", type=Path, default=RUNS / "export", metavar="DIR", help=f"default {RUNS}/export")
+    carry.add_argument("--picture", type=Path, metavar="PATH", help="default DIR.png")
     return made
 
 
@@ -135,14 +166,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             "navigate": _navigate,
             "evaluate": _evaluate,
             "adapt": _adapt,
+            "export": _export,
         }
         run[arguments.command](arguments)
     except (TopologicalError, SceneError, TrainError) as error:
         print(f"topological_nav: {error}", file=sys.stderr)
         return 2
-    except Stopped as stopped:
+    except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)
-        return 128 + stopped.args[0]
+        return 128 + (stopped.args[0] if isinstance(stopped, Stopped) else signal.SIGINT)
     return 0
 
 
@@ -230,6 +262,8 @@ def _train(arguments: argparse.Namespace) -> None:
     save(curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     for name, row in results.get("groups", {}).items():
         print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
+    if rows := results.get("lengths"):
+        print("ahead:  " + ",  ".join(f"{row['ahead_m']:g} m {row['accuracy']:.3f}" for row in rows) + "  right")
     if mean := results["localisation"].get("mean"):
         print(
             f"localisation: nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
@@ -281,11 +315,23 @@ def _policy(arguments: argparse.Namespace) -> None:
 
 def _map(arguments: argparse.Namespace) -> None:
     config = overridden(MapConfig(), arguments.settings)
+    from topological_nav.packaged import choose
+
+    chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
+    if chosen.said:
+        _say(chosen.said)
+    out = arguments.out or chosen.maps[0] / f"{Path(arguments.scene).resolve().name}.npz"
+    _build(Path(arguments.scene), chosen.localiser, chosen.detector, config, out, arguments.route)
+
+
+def _build(
+    scene: Path, localiser: Path, detector: Path, config: MapConfig, out: Path, ends: Sequence[int] | None = None
+) -> None:
+    """Makes a map, draws it and tells of it."""
     from topological_nav.build import build_map, forget
     from topological_nav.figures import map_figure, save
     from topological_nav.graph import save_map
 
-    out = arguments.out or RUNS / "maps" / f"{Path(arguments.scene).resolve().name}.npz"
     parts = out.with_name(f"{out.name}.parts")
     with _stops() as stops, _bar() as tell:
 
@@ -294,13 +340,13 @@ def _map(arguments: argparse.Namespace) -> None:
             if stops:
                 raise Stopped(stops[0])
 
-        built = build_map(Path(arguments.scene), arguments.localiser, arguments.detector, config, progress, parts)
+        built = build_map(scene, localiser, detector, config, progress, parts)
     save_map(built.map, out)
     forget(parts)
     route = None
-    if arguments.route:
-        route = built.map.plan(*arguments.route)
-        print(f"{arguments.route[0]} to {arguments.route[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
+    if ends:
+        route = built.map.plan(*ends)
+        print(f"{ends[0]} to {ends[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
     picture = out.with_suffix(".png")
     save(map_figure(built, route), picture)
     for name, value in built.scores.items():
@@ -312,19 +358,44 @@ def _map(arguments: argparse.Namespace) -> None:
 
 
 def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
+    """The contest asked for; networks and maps that were not named are chosen, and maps that are nowhere made."""
     from topological_nav.contest import Contest
 
-    return Contest(
+    contest = Contest(
         scenes=tuple(Path(scene) for scene in scenes),
         contenders=tuple(contenders),
         out=out,
         config=overridden(EvaluationConfig(), arguments.settings),
         truth=arguments.truth,
-        maps=arguments.maps,
-        localiser=arguments.localiser,
-        detector=arguments.detector,
-        policy=arguments.policy,
+        policy=arguments.policy or PASSAGE_POLICY,
         ppo=getattr(arguments, "ppo", None),
+        domain=arguments.domain,
+    )
+    if arguments.truth or not {"dense", "sparse"} & set(contenders):
+        return contest
+    from interactive_nav.scene import load_scene
+    from topological_nav.packaged import choose, fitting_map
+
+    chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
+    if chosen.told:
+        _say(chosen.told)
+    maps, files = arguments.maps or chosen.maps[0], {}
+    for folder in contest.scenes if arguments.maps is None else ():
+        scene = load_scene(folder)
+        there = fitting_map(chosen, scene.name, scene.digest)
+        own = maps / f"{scene.name}.npz"
+        # One that was made by hand with other networks is refused later, in words, and not written over.
+        if there is None and (chosen.renewed or not own.is_file()):
+            _say(f"{scene.name} has no map of these networks yet; it is made once and kept in {own}")
+            _build(folder, chosen.localiser, chosen.detector, MapConfig(), own)
+        files[scene.name] = there or own
+    return dataclasses.replace(
+        contest,
+        maps=maps,
+        map_files=files,
+        localiser=chosen.localiser,
+        detector=chosen.detector,
+        policy=chosen.policy,
     )
 
 
@@ -332,9 +403,9 @@ def _navigate(arguments: argparse.Namespace) -> None:
     from topological_nav.figures import save
     from topological_nav.journey import drive_episode, film
 
-    contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     if arguments.video and arguments.video.suffix != ".mp4":
         raise SettingsError(f"--video {arguments.video}: expected a name that ends in .mp4")
+    contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     with _stops() as stops, _bar() as tell:
@@ -394,6 +465,35 @@ def _adapt(arguments: argparse.Namespace) -> None:
     with _stops() as stops:
         if not adapt_commands.run(arguments, lambda: bool(stops)):
             raise Stopped(stops[0])
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    config = overridden(ExportConfig(), arguments.settings)
+    from topological_nav.export import export, level_images, size_lines
+    from topological_nav.export_figure import export_figure
+    from topological_nav.figures import save
+    from topological_nav.training import load_trained
+
+    with _stops() as stops, _bar() as tell:
+
+        def progress(what: str, done: int, total: int) -> None:
+            tell(what, done, total)
+            if stops and done < total:
+                raise Stopped(stops[0])
+
+        networks = load_trained(arguments.localiser), load_trained(arguments.detector)
+        images = level_images(arguments.images, networks, config.places, progress)
+        runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
+        made = export(*runs, images, arguments.out, config, progress)
+    picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
+    save(export_figure(made, config.limit_mib), picture)
+    for name, value in made.compared.scores.items():
+        print(f"{name.replace('_', ' ')}: {value:.3g}")
+    print(f"{arguments.out}: {size_lines(made.sizes, config.limit_mib)}; drawn in {picture}")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager

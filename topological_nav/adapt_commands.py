@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,8 +33,8 @@ def add_to(command: Callable[[str, str, object], argparse.ArgumentParser], datas
     adapt.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
     adapt.add_argument("--data", type=Path, default=dataset, metavar="DIR", help=f"source (default {dataset})")
     adapt.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
-    adapt.add_argument("--localiser", type=Path, default=runs / "rooms", metavar="RUN", help="embeds images")
-    adapt.add_argument("--detector", type=Path, default=runs / "passages", metavar="RUN", help="judges passages")
+    adapt.add_argument("--localiser", type=Path, metavar="RUN", help=f"embeds images (default {runs}, or packaged)")
+    adapt.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
     adapt.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {runs}/adapted/WHAT, a map SCENE.npz")
     adapt.set_defaults(adapted=runs / "adapted")
 
@@ -48,6 +49,13 @@ def run(arguments: argparse.Namespace, should_stop: Asked) -> bool:
     if (arguments.what == "map") != bool(arguments.scene):
         raise SettingsError("adapt map takes a scene folder, adapt features and adapt passages none")
     arguments.target = arguments.target or arguments.data
+    from topological_nav.packaged import choose
+
+    needs = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}[arguments.what]
+    chosen = choose(arguments.localiser, arguments.detector, needs=needs)
+    arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
+    if chosen.said:
+        print(chosen.said, file=sys.stderr, flush=True)
     return _RUNS[arguments.what](arguments, config, should_stop)
 
 

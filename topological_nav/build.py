@@ -18,8 +18,8 @@ from interactive_nav.scene import Scene, load_scene
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data import headings, lens_of
 from topological_nav.errors import MapError, SpaceError
-from topological_nav.graph import TopologicalMap, assemble, place_nodes
-from topological_nav.rendering import BATCH, SceneRenderer, camera_pose
+from topological_nav.graph import TopologicalMap, assemble, lengths, place_nodes
+from topological_nav.rendering import SceneRenderer, camera_pose
 from topological_nav.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
 from topological_nav.sight import NetworkSight, Sight
@@ -94,7 +94,7 @@ def build_map(
         else:
             pictures.total += len(edges)
             looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
-        return 1.0 / (1.0 + np.exp(-detector.logits(looked)[:, 0]))
+        return detector.passage(looked, lengths(xy, edges))
 
     about = {
         "settings": to_dict(config),
@@ -164,8 +164,8 @@ def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, da
     return assemble(scene.name, scene.digest, xy, rooms.of(xy), nothing, config.edge_m, probability, about)
 
 
-def renderer_of(scene: Scene, data: DataConfig, batch: int = BATCH) -> SceneRenderer:
-    """What draws a scene as a dataset's images were drawn, so many a call."""
+def renderer_of(scene: Scene, data: DataConfig, batch: int | None = None) -> SceneRenderer:
+    """What draws a scene as a dataset's images were drawn, so many a call (None: see `SceneRenderer`)."""
     return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, batch)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Literal
 
 from topological_nav.errors import SettingsError
@@ -11,6 +12,10 @@ from topological_nav.settings import require
 
 PITCHES = ("up", "level", "down")
 """Order of a position's images by pitch."""
+RUNS = Path("runs/topological")
+"""Where commands write and read when they are told no other place."""
+PASSAGE_POLICY = "passage"
+"""The local policy without weights of its own: straight on while the passage detector agrees, else turn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +74,9 @@ class DataConfig(CameraConfig):
     passage_clearance_m: float = 0.3
     """Least distance of sources from obstacles."""
     passage_length_m: float = 2.0
-    """Length of the segment that is navigable or not."""
+    """Length of the segment that is navigable or not: passages are balanced on it and detectors scored by it."""
+    passage_lengths_m: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5)
+    """Lengths that passages are labelled for, ascending, `passage_length_m` among them: how far the way is free."""
     passage_points: int = 50
     """Points of the segment looked up on the map, both ends included."""
     passage_margin_m: float = 0.225
@@ -83,11 +90,24 @@ class DataConfig(CameraConfig):
         require(self, "clearance_m passage_clearance_m passage_margin_m", 0.0, 10.0)
         require(self, "passage_length_m", 0.05, 100.0)
         require(self, "passage_points", 2, 10**4)
+        lengths = self.passage_lengths_m
+        if not lengths or min(lengths) < 0.05 or list(lengths) != sorted(set(lengths)):
+            raise SettingsError(f"passage_lengths_m is {list(lengths)}, expected ascending lengths from 0.05 m on")
+        if self.passage_length_m not in lengths:
+            raise SettingsError(
+                f"passage_length_m is {self.passage_length_m:g}, expected one of passage_lengths_m {list(lengths)}; "
+                "add it there"
+            )
         require(self, "pitch_deg", 0.0, 80.0)
         if not 0.0 < self.test_share < 1.0:
             raise SettingsError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
         if self.headings < 3 or self.headings % 3:
             raise SettingsError(f"headings is {self.headings}, expected a multiple of 3")
+
+    @property
+    def passage_column(self) -> int:
+        """Which of `passage_lengths_m` is `passage_length_m`."""
+        return self.passage_lengths_m.index(self.passage_length_m)
 
     @property
     def pitches_rad(self) -> tuple[float, float, float]:
@@ -151,11 +171,11 @@ def passage_config() -> TrainConfig:
 class MapConfig:
     """Where nodes stand, and which edges join them."""
 
-    clearance_m: float = 0.3
-    """Least distance of nodes from obstacles."""
+    clearance_m: float = 0.4
+    """Least distance of nodes from obstacles: robots turn about there; TTbot's corners reach 0.33 m."""
     min_per_room: int = 3
     """Nodes a room, at least."""
-    spacing_m: float = 1.2
+    spacing_m: float = 0.9
     """No free place of a room is farther than this from one of its nodes."""
     edge_m: float = 2.5
     """Nodes nearer than this are joined, both ways."""
@@ -191,6 +211,14 @@ class NavigatorConfig:
     """Step of the swing left and right."""
     swings: int = 4
     """Steps to each side before an edge counts as blocked."""
+    ahead_m: float = 2.0
+    """Facing an edge, the way must be free for the edge's length less `slack_m`, at most this far: a run leads no
+    farther at 0.4 m/s."""
+    slack_m: float = 0.3
+    """The robot is not exactly at its node; at most half of the edge's length."""
+    clear_m: float = 1.0
+    """How far the way must be free for the baseline policy to drive on (it takes this to stop and turn) and where the
+    map has no way; and of which heading is the most open."""
     tolerance_deg: float = 3.0
     """A heading is reached when it is off by less."""
     runs: int = 12
@@ -200,6 +228,11 @@ class NavigatorConfig:
     glance: bool = True
     """After every run, tell by the image ahead whether the robot is still at its node or at one joined to it, and plan
     anew from there."""
+    watch_s: float = 0.5
+    """How often to look, within a run, whether the edge's head is passed (nearest of all, and getting farther), which
+    ends the run; 0: never. Needs `glance`."""
+    retry_cost: float = 1.0
+    """Added to the cost of an edge each time that it was driven and the robot was then not found nearer to its head."""
     limit_s: float = 1800.0
     """Time after which an episode has failed."""
     kp: float = 2.0
@@ -215,8 +248,12 @@ class NavigatorConfig:
         require(self, "images swings runs", 1, 1000)
         require(self, "passable", 0.0, 1.0)
         require(self, "swing_deg", 1.0, 180.0)
+        require(self, "ahead_m clear_m", 0.05, 100.0)
+        require(self, "slack_m", 0.0, 100.0)
         require(self, "tolerance_deg", 0.1, 45.0)
         require(self, "run_s limit_s", 0.1, 1e6)
+        require(self, "watch_s", 0.0, 1e6)
+        require(self, "retry_cost", 0.0, 1e6)
         require(self, "kp ki kd", 0.0, 100.0)
         require(self, "max_turn_rad_s", 0.01, 10.0)
 
@@ -398,3 +435,22 @@ class PolicyConfig:
         require(self, "overlap_s alpha lam", 0.0, 1e6)
         require(self, "straight_share straight_kept alone", 0.0, 1.0)
         require(self, "learning_rate", 1e-9, 10.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportConfig:
+    """What an export must keep to."""
+
+    limit_mib: float = 8.0
+    """The whole folder is no larger."""
+    places: int = 24
+    """Places by whose images exported networks are compared with those of the runs."""
+    tolerance: float = 0.02
+    """Most by which a passage's probability, or an embedding (of length 1.41), may differ."""
+    commit: str | None = None
+    """Of runs whose versions.json names none."""
+
+    def __post_init__(self) -> None:
+        require(self, "limit_mib", 0.001, 1e6)
+        require(self, "places", 1, 10**6)
+        require(self, "tolerance", 0.0, 10.0)

@@ -15,7 +15,7 @@ import functools
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,9 @@ import pyarrow as pa
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import Scene, load_scene
 from topological_nav.build import camera_of, renderer_of, true_map
-from topological_nav.config import DataConfig, EvaluationConfig, MapConfig
+from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
+from topological_nav.data import lens_of
+from topological_nav.domains import as_seen_from, preset
 from topological_nav.driving import LocalPolicy
 from topological_nav.errors import RunError, SettingsError
 from topological_nav.evaluation import (
@@ -43,6 +45,7 @@ from topological_nav.evaluation import (
 from topological_nav.graph import TopologicalMap, load_map
 from topological_nav.navigator import Navigator
 from topological_nav.rooms import find_rooms, recorded_rooms
+from topological_nav.settings import overlaid
 from topological_nav.sight import NetworkSight, PassagePolicy, Sight, TrueSight
 from topological_nav.simulation import Camera, Simulator, make_env, pose_camera, scene_camera
 from topological_nav.space import FreeSpace, free_space
@@ -56,9 +59,8 @@ from train.run_folder import RunFolder, versions
 CONTENDERS = ("dense", "sparse", "expert", "ppo")
 """The navigator on its map, and on the same thinned out; an expert with the plan; a learned policy told the goal."""
 CPU_BATCH = 8
-CPU_IMAGES, DEVICE_IMAGES = 6, 192
-"""Images drawn a call; fewer are padded, which costs a CPU as much."""
-PASSAGE_POLICY = "passage"
+CPU_IMAGES = 6
+"""Images drawn a call on a CPU; fewer are padded, which costs as much."""
 Tell = Callable[[str, int, int], None]
 
 
@@ -74,6 +76,8 @@ class Contest:
     """Maps made from the plan, and the truth in the place of localiser and passage detector."""
     maps: Path = Path()
     """Folder of the scenes' maps, unless `truth`."""
+    map_files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    """Name of a scene -> its map, where that lies elsewhere."""
     localiser: Path = Path()
     detector: Path = Path()
     policy: str = PASSAGE_POLICY
@@ -81,6 +85,8 @@ class Contest:
     ppo: Path | None = None
     """Run folder of `python -m train`."""
     robot: str = "ttbot"
+    domain: str = "clean"
+    """The camera that the navigator sees by, goals included: a name of `domains.PRESETS`."""
 
     def __post_init__(self) -> None:
         for name in self.contenders:
@@ -88,6 +94,8 @@ class Contest:
                 raise SettingsError(f"contender is '{name}', expected a choice from {', '.join(CONTENDERS)}")
         if "ppo" in self.contenders and self.ppo is None:
             raise SettingsError("contender ppo needs the run folder of a trained policy: --ppo RUN")
+        if preset(self.domain) != preset("clean") and self.truth:
+            raise SettingsError(f"--domain {self.domain} is of images, --truth has none; leave one of them out")
         names = [Path(s).resolve().name for s in self.scenes]
         if len(set(names)) < len(names):
             raise SettingsError(f"scenes are {', '.join(names)}, expected different names")
@@ -154,15 +162,26 @@ class Venue:
         """The dense map."""
         if self.networks is None:
             return true_map(self.scene, self.space, self.rooms, MapConfig(), DataConfig())
-        return load_map(self.contest.maps / f"{self.scene.name}.npz", self.scene.digest)
+        path = self.contest.map_files.get(self.scene.name) or self.contest.maps / f"{self.scene.name}.npz"
+        return load_map(path, self.scene.digest)
 
     @functools.cached_property
     def camera(self) -> Camera:
         """What the navigator's sight understands."""
         if self.networks is None:
             return pose_camera
-        batch = CPU_IMAGES if jax.default_backend() == "cpu" else DEVICE_IMAGES
-        return scene_camera(renderer_of(self.scene, self.networks.camera, batch), self.robot)
+        batch = CPU_IMAGES if jax.default_backend() == "cpu" else None
+        plain = scene_camera(renderer_of(self.scene, self.drawn, batch), self.robot)
+        domain = preset(self.contest.domain)
+        return lambda xy, yaw: as_seen_from(plain(xy, yaw), domain, xy, yaw)
+
+    @property
+    def drawn(self) -> DataConfig:
+        """How the navigator's images are drawn: as the networks learned, by the map's engine and lens."""
+        assert self.networks is not None
+        of_map = {k: v for k, v in self.map.about.get("data", {}).items() if k in ("engine", "fov_deg")}
+        drawn = overlaid(self.networks.camera, of_map, "map")
+        return dataclasses.replace(drawn, fov_deg=lens_of(drawn, self.robot).fov_deg)
 
     def map_of(self, contender: str) -> TopologicalMap:
         """The map that a navigator goes by."""
@@ -180,7 +199,7 @@ class Venue:
         """Of the dense or the sparse map."""
         made = self.map_of(contender)
         sight = self.sight(made)
-        return Navigator(made, sight, local_policy(self.contest, sight), self.contest.config)
+        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
 
     def contender(self, name: str) -> tuple[Contender, Simulator]:
         """Who plays, and in what."""
@@ -200,7 +219,7 @@ class Venue:
         if contender == "ppo":
             assert self.contest.ppo is not None
             path, meta = checkpoint.find(RunFolder(self.contest.ppo).checkpoints, "best")
-            weights = hashlib.sha256((path / "learner.msgpack").read_bytes()).hexdigest()
+            weights = checkpoint.weights_digest(path)
             return {**asked, "robot": meta.robot, "checkpoint": [meta.env_steps, weights]}
         if contender == "expert":
             return asked
@@ -208,24 +227,32 @@ class Venue:
         parts = [made.xy_w, made.embeddings, made.edges, made.p, made.angle_rad]
         asked["map"] = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
         if self.networks is not None:
-            asked["detector"] = self.networks.detector.about["digest"]
+            asked["detector"] = self.networks.detector.stored
+            if "export" in self.networks.localiser.about:
+                asked["localiser"] = self.networks.localiser.stored
+            if self.contest.domain != "clean":
+                asked["domain"] = to_dict(preset(self.contest.domain))
+            if self.drawn != self.networks.camera:
+                asked["drawn"] = [self.drawn.engine, self.drawn.fov_deg]
         return {**asked, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
 
 
-def local_policy(contest: Contest, sight: Sight) -> LocalPolicy:
-    """What drives along edges.
+def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> LocalPolicy:
+    """What drives along edges; a trained policy sees through adapted networks where the navigator does.
 
     Raises:
         RunError: no such run.
         SettingsError: a trained policy cannot look at poses.
     """
     if contest.policy == PASSAGE_POLICY:
-        return PassagePolicy(sight, contest.config.passable)
+        return PassagePolicy(sight, contest.config.passable, contest.config.clear_m)
     if contest.truth:
         raise SettingsError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
     from topological_nav import driving
 
-    return driving.load_policy(Path(contest.policy))
+    assert networks is not None
+    seeing = (contest.localiser, networks.localiser), (contest.detector, networks.detector)
+    return driving.load_policy_beside(contest.policy, *seeing)
 
 
 def _digest_of(policy: str) -> str:
@@ -340,6 +367,7 @@ def _play(
     constants = {
         "contender": name,
         "sight": ("truth" if venue.networks is None else "networks") if navigates else "none",
+        "domain": venue.contest.domain if navigates else "none",
         "policy": venue.contest.policy if navigates else name,
         "scene": venue.scene.name,
         "split": venue.scene.split,

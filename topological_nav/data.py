@@ -12,6 +12,7 @@ What is decided depends on scene and settings only. Drawing goes file by file an
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from interactive_nav.rendering.base import Lens
+from interactive_nav.rendering.base import CameraPose, Lens
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
 from topological_nav.config import CameraConfig, DataConfig
@@ -29,12 +30,12 @@ from topological_nav.passages import Passages, draw_passages, held_out
 from topological_nav.rendering import SceneRenderer, camera_pose
 from topological_nav.rooms import Rooms, agreement, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
-from topological_nav.shards import read_shard, write_shard
+from topological_nav.shards import ShardWriter, read_shards
 from topological_nav.space import FreeSpace, free_space, spread
 from train.config_io import to_dict
 from train.files import whole_file, write_text
 
-FORMAT = 1
+FORMAT = 2
 """Of the folder; raised whenever older datasets would be read wrongly."""
 Progress = Callable[[str, int, int], None]
 """Called with what is drawn, images done and images in all."""
@@ -79,11 +80,15 @@ class PassageImages:
     images: np.ndarray
     """[N, H, W, 3] u8."""
     free: np.ndarray
-    """[N] bool."""
+    """[N, L] bool, for each of `lengths_m`; never true after false."""
     scene: np.ndarray
     """[N] i32."""
     test: np.ndarray
     """[N] bool."""
+    lengths_m: tuple[float, ...]
+    """[L] ascending."""
+    scored: int
+    """Which of them passages are balanced on and detectors scored by."""
 
 
 def headings(config: DataConfig) -> np.ndarray:
@@ -162,15 +167,29 @@ def make_dataset(
             np.savez_compressed(file, **_plan_arrays(plan))  # type: ignore[arg-type]
     total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
     done = 0
-    for scene, plan in zip(scenes, plans, strict=True):
-        renderer: SceneRenderer | None = None
-        for path, poses in _shards(out / scene.name, plan, robot, config):
-            if not path.is_file():
+    with ShardWriter(config.quality) as writer:
+        for scene, plan in zip(scenes, plans, strict=True):
+            renderer: SceneRenderer | None = None
+            for path, poses in _shards(out / scene.name, plan, robot, config):
+                done += sum(len(pose.pos_w) for pose in poses)
+                told = functools.partial(progress, scene.name, done, total)
+                if path.is_file():
+                    writer.skip(told)
+                    continue
                 renderer = renderer or SceneRenderer(scene, lens_of(config, robot), config.supersample, config.engine)
-                write_shard(path, [renderer.draw(pose) for pose in poses], config.quality)
-            done += sum(len(pose.pos_w) for pose in poses)
-            progress(scene.name, done, total)
+                writer.put(path, draw_sheets(renderer, poses), told)
     return header
+
+
+def draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
+    """Images [n_i, H, W, 3] of groups of cameras, drawn together: full batches."""
+    joined: Any = [np.concatenate(column) for column in zip(*map(_leaves, poses), strict=True)]
+    images = renderer.draw(CameraPose(*joined))
+    return np.split(images, np.cumsum([len(pose.pos_w) for pose in poses])[:-1])
+
+
+def _leaves(pose: CameraPose) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(pose.pos_w), np.asarray(pose.axes_w)
 
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
@@ -264,7 +283,8 @@ def load_passages(folder: Path) -> PassageImages:
         plan = load_plan(folder, scene["name"]).passages
         images = _read_all(Path(folder) / scene["name"], "passages", len(plan), config)
         parts.append((images, plan.free, np.full(len(plan), index, np.int32), plan.test))
-    return PassageImages(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    images, free, scene, test = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return PassageImages(images, free, scene, test, config.passage_lengths_m, config.passage_column)
 
 
 def load_plan(folder: Path, scene: str) -> ScenePlan:
@@ -339,7 +359,7 @@ def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.nda
     missing = [path.name for path in files if not path.is_file()]
     if missing:
         raise DatasetError(f"{folder}: {missing[0]} is missing; the same 'data' command goes on where it stopped")
-    images = [read_shard(path) for path in files]
+    images = list(read_shards(files))
     shape = (config.height, config.width, 3)
     joined = np.concatenate(images) if images else np.zeros((0, *shape), np.uint8)
     if joined.shape != (count, *shape):

@@ -97,32 +97,69 @@ def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.nda
     Returns:
         The same shape, u8. An image depends on the seed, the stream, its place in the set and itself alone.
     """
-    if config == dataclasses.replace(DomainConfig(), seed=config.seed):
+    if _changes_nothing(config):
         return images
     flat = images.reshape(-1, *images.shape[-3:])
     out = np.empty_like(flat)
     for first in range(0, len(flat), _CHUNK):
         rng = np.random.default_rng([config.seed, stream, first])
-        out[first : first + _CHUNK] = _taken(flat[first : first + _CHUNK], config, rng)
+        chunk = flat[first : first + _CHUNK]
+        out[first : first + _CHUNK] = _taken(chunk, config, *_chance(rng, config, chunk.shape))
     return out.reshape(images.shape)
 
 
-def _taken(images: np.ndarray, config: DomainConfig, rng: np.random.Generator) -> np.ndarray:
-    count, height, width, _ = images.shape
+def as_seen_from(images: np.ndarray, config: DomainConfig, xy_w: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+    """Images as the camera would have taken them, whatever set they are taken in.
+
+    Args:
+        images: [N, H, W, 3] u8.
+        config: the camera.
+        xy_w: [N, 2] m, where they were taken.
+        heading_rad: [N].
+
+    Returns:
+        [N, H, W, 3] u8. The chance in an image depends on the seed, and on place and heading to 1 mm and 1 mrad.
+    """
+    if _changes_nothing(config) or not len(images):
+        return images
+    places = np.rint(1000.0 * np.concatenate([xy_w, np.asarray(heading_rad)[:, None]], -1)).astype(np.int64) % 2**32
+    drawn = [
+        _chance(np.random.default_rng([config.seed, *place]), config, (1, *images.shape[1:]))
+        for place in places.tolist()
+    ]
+    ways, stops, noise = (np.concatenate(one) for one in zip(*drawn, strict=True))
+    return _taken(images, config, ways, stops, noise)
+
+
+def _changes_nothing(config: DomainConfig) -> bool:
+    return config == dataclasses.replace(DomainConfig(), seed=config.seed)
+
+
+def _chance(
+    rng: np.random.Generator, config: DomainConfig, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What is drawn for images of a shape: ways [N] (px), exposures [N] and noise, standard normal."""
+    ways, stops = rng.uniform(0.0, config.blur_px, shape[0]), rng.standard_normal(shape[0])
+    noisy = config.shot_noise or config.read_noise
+    return ways, stops, rng.standard_normal(shape) if noisy else np.zeros((shape[0], 1, 1, 1))
+
+
+def _taken(
+    images: np.ndarray, config: DomainConfig, ways: np.ndarray, spread: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    height, width = images.shape[1:3]
     light = (images.astype(np.float32) / 255.0) ** _GAMMA
     if config.zoom != 1.0 or config.barrel:
         light = _through_lens(light, config.zoom, config.barrel)
     if config.vignette:
         light = light * (1.0 - config.vignette * _radius(height, width) ** 2)[..., None]
-    ways = rng.uniform(0.0, config.blur_px, count)
     if config.blur_px:
         light = np.stack([smeared(one, way) for one, way in zip(light, ways, strict=True)])
-    stops = config.exposure_ev + config.exposure_spread_ev * rng.standard_normal(count)
+    stops = config.exposure_ev + config.exposure_spread_ev * spread
     balance = np.array([1.0 + config.warmth, 1.0, 1.0 - config.warmth])
     light = light * (2.0**stops)[:, None, None, None] * balance
     if config.shot_noise or config.read_noise:
-        spread = np.sqrt(config.shot_noise**2 * np.clip(light, 0.0, 1.0) + config.read_noise**2)
-        light = light + spread * rng.standard_normal(light.shape)
+        light = light + np.sqrt(config.shot_noise**2 * np.clip(light, 0.0, 1.0) + config.read_noise**2) * noise
     grey = np.clip(light, 0.0, 1.0) ** (1.0 / _GAMMA)
     grey = (grey - 0.5) * config.contrast + 0.5
     return np.rint(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)

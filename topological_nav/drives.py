@@ -13,6 +13,7 @@ drawn. What is decided depends on scenes and settings only. Simulating and drawi
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ import numpy as np
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import Scene, load_scene
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
-from topological_nav.data import lens_of, read_versioned
+from topological_nav.data import draw_sheets, lens_of, read_versioned
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.expert import CONTROL_S, Terrain, way_field
 from topological_nav.fleet import Driven, Fleet, Tasks, make_env
@@ -33,7 +34,7 @@ from topological_nav.rendering import SceneRenderer, camera_pose
 from topological_nav.rooms import find_rooms, recorded_rooms
 from topological_nav.routes import draw_routes, drivable
 from topological_nav.settings import overlaid
-from topological_nav.shards import read_shard, write_shard
+from topological_nav.shards import ShardWriter, read_shards
 from topological_nav.space import FreeSpace, free_space
 from train.config_io import to_dict
 from train.files import whole_file, write_text
@@ -240,21 +241,24 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
     header, config = read_drives_header(out)
     drives, robot = load_drives(out), get_robot(config.robot)
     total, done = int(drives.steps[drives.kept].sum()), 0
-    for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
-        (out / about["name"]).mkdir(exist_ok=True)
-        renderer: SceneRenderer | None = None
-        for path, rows in _image_files(out, about["name"], index, drives, config):
-            if not path.is_file():
+    with ShardWriter(config.quality) as writer:
+        for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
+            (out / about["name"]).mkdir(exist_ok=True)
+            renderer: SceneRenderer | None = None
+            for path, rows in _image_files(out, about["name"], index, drives, config):
+                done += int(drives.steps[rows].sum())
+                told = functools.partial(progress, about["name"], done, total)
+                if path.is_file():
+                    writer.skip(told)
+                    continue
                 if renderer is None:
                     scene = load_scene(scene_folder)
                     if scene.digest != about["digest"]:
                         raise DatasetError(f"{scene_folder}: is not the scene that was driven in; drive again")
                     renderer = SceneRenderer(scene, lens_of(config, robot), config.supersample, config.engine)
                 poses = [drives.pose_w[drives.rows(k)] for k in rows]
-                sheets = [renderer.draw(camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p)))) for p in poses]
-                write_shard(path, sheets, config.quality)
-            done += int(drives.steps[rows].sum())
-            progress(about["name"], done, total)
+                cameras = [camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p))) for p in poses]
+                writer.put(path, draw_sheets(renderer, cameras), told)
 
 
 def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig):
@@ -272,15 +276,19 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
-    for index, about in enumerate(header["scenes"]):
-        for path, rows in _image_files(Path(folder), about["name"], index, drives, config):
-            if not path.is_file():
-                raise DatasetError(f"{path} is missing; the same 'data --drives' command goes on where it stopped")
-            images = read_shard(path)
-            shape = (int(drives.steps[rows].sum()), config.height, config.width, 3)
-            if images.shape != shape:
-                raise DatasetError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
-            yield rows, images
+    files = [
+        part
+        for index, about in enumerate(header["scenes"])
+        for part in _image_files(Path(folder), about["name"], index, drives, config)
+    ]
+    for path, _ in files:
+        if not path.is_file():
+            raise DatasetError(f"{path} is missing; the same 'data --drives' command goes on where it stopped")
+    for (path, rows), images in zip(files, read_shards([path for path, _ in files]), strict=True):
+        shape = (int(drives.steps[rows].sum()), config.height, config.width, 3)
+        if images.shape != shape:
+            raise DatasetError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
+        yield rows, images
 
 
 def read_drives_header(folder: Path) -> tuple[dict[str, Any], DriveConfig]:

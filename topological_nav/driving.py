@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any, Protocol
 
-import flax.serialization
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from topological_nav.errors import RunError
 from topological_nav.imitation import fresh_params, load_networks
 from topological_nav.policy import Forward, Policy
-from topological_nav.runs import DESCRIPTION, WEIGHTS
+from topological_nav.runs import DESCRIPTION, read_weights
 from topological_nav.training import Trained
 
 
@@ -47,7 +46,8 @@ class TrainedPolicy:
 
     def start(self, batch: int) -> Any:
         """See `LocalPolicy`."""
-        return self._policy.fresh(batch)
+        fresh = np.zeros((batch, self._policy.hidden), np.float32)
+        return fresh, fresh.copy()
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """See `LocalPolicy`.
@@ -57,12 +57,8 @@ class TrainedPolicy:
         """
         if images.shape[1:] != self._shape:
             raise RunError(f"images are {images.shape[1:]}, expected {self._shape}, the size that it learned from")
-        state, (linear, angular) = self._step(self._weights, state, jnp.asarray(images))
-        return (
-            state,
-            np.asarray(self.about["linear_m_s"])[np.asarray(linear)],
-            np.asarray(self.about["angular_rad_s"])[np.asarray(angular)],
-        )
+        state, (linear, angular) = jax.device_get(self._step(self._weights, state, jnp.asarray(images)))
+        return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
 
     def _stepped(self, weights, state, images):
         parts = [
@@ -81,13 +77,14 @@ def load_policy(
     """The policy of a finished run.
 
     Args:
-        run_folder: of `train policy`.
+        run_folder: of `train policy`, or an export of it.
         localiser: run folder of the room classifier that embeds its images; None: where it was when it learned, seen
             from the run folder.
         detector: the same, of the passage detector.
 
     Raises:
-        RunError: the run is not finished or damaged, or the networks are not those that it learned with.
+        RunError: the run is not finished or damaged, or the networks are neither those that it learned with nor
+            adapted from them.
     """
     run = Path(run_folder)
     if not (run / DESCRIPTION).is_file():
@@ -99,7 +96,7 @@ def load_policy(
     paths = [Path(given or there) for given, there in zip((localiser, detector), recorded, strict=True)]
     networks = load_networks(*paths)
     for path, network, learned in zip(paths, networks, about["networks"], strict=True):
-        if network.about["digest"] != learned["digest"]:
+        if learned["digest"] not in (network.about["digest"], network.about.get("adapted_from")):
             raise RunError(f"{path}: is not the network that {run} learned with; train the policy again")
     policy = Policy(about["hidden"], about["projection"], len(about["linear_m_s"]), len(about["angular_rad_s"]))
     width = about["width"]
@@ -107,8 +104,22 @@ def load_policy(
         "params": fresh_params(policy, Forward(1), width, 0)["policy"],
         "scale": {"mean": jnp.zeros(width), "deviation": jnp.ones(width)},
     }
-    try:
-        variables = flax.serialization.from_bytes(template, (run / WEIGHTS).read_bytes())
-    except Exception as error:  # noqa: BLE001  (msgpack and flax raise many kinds for a damaged file)
-        raise RunError(f"{run / WEIGHTS}: not readable ({' '.join(str(error).split())[:200]}); train again") from None
-    return TrainedPolicy(policy, variables, about, networks)
+    return TrainedPolicy(policy, read_weights(run, template, about), about, networks)
+
+
+def load_policy_beside(
+    run_folder: Path | str, localiser: tuple[Path, Trained], detector: tuple[Path, Trained]
+) -> TrainedPolicy:
+    """The policy of a finished run, which sees through a navigator's networks where these are adapted ones.
+
+    Args:
+        run_folder: of `train policy`.
+        localiser: the navigator's run folder and network.
+        detector: the same.
+
+    Raises:
+        RunError: see `load_policy`.
+    """
+    return load_policy(
+        run_folder, *(run if "adapted_from" in network.about else None for run, network in (localiser, detector))
+    )

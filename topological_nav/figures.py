@@ -115,13 +115,13 @@ def dataset_figure(folder: Path) -> Figure:
             room_points(axis, plan.xy_w[mine], plan.room[mine], s=22, marker=marker, edgecolors="k", linewidths=0.4)
         step = 0.35 * np.stack([np.cos(plan.passages.heading_rad), np.sin(plan.passages.heading_rad)], -1)
         ways = list(np.stack([plan.passages.xy_w, plan.passages.xy_w + step], 1))
-        colours = np.where(plan.passages.free, "tab:green", "tab:red")
+        colours = np.where(plan.passages.free[:, config.passage_column], "tab:green", "tab:red")
         axis.add_collection(LineCollection(ways, colors=list(colours), linewidths=0.7))
         axis.set_aspect("equal")
         axis.tick_params(labelsize=6)
         axis.set_title(
             f"{name}: {len(plan.xy_w)} positions (▲ for testing), {len(plan.passages)} passages\n"
-            "(green free, red blocked)",
+            f"(green free for {config.passage_length_m:g} m, red blocked)",
             fontsize=7,
         )
     grid = below.subplots(len(shown), 1, squeeze=False)[:, 0]

@@ -2,7 +2,8 @@
 
 A node is a position with the embeddings of the images around it. An edge leads from a node to each one nearer than
 `edge_m`; its weight is -log p, p the probability that the way is free, so that the shortest way is the one most likely
-to be free as a whole. Edges carry their absolute angle: nothing else about positions is needed to drive along them.
+to be free as a whole. Edges carry their absolute angle and length: nothing else about positions is needed to drive
+along them.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class TopologicalMap:
     digest: str
     """Of the scene's files, as `interactive_nav.scene.Scene.digest`."""
     xy_w: np.ndarray
-    """[N, 2] f32 m: for drawing and for scoring; planning and localising do not look at it."""
+    """[N, 2] f32 m: for drawing and scoring, and for the edges' lengths; planning and localising do not look at it."""
     room: np.ndarray
     """[N] i32."""
     embeddings: np.ndarray
@@ -70,6 +71,11 @@ class TopologicalMap:
     """[E] f32 heading from the first node to the second, world frame."""
     about: dict[str, Any]
     """Settings, and the networks that made it."""
+
+    @functools.cached_property
+    def length_m(self) -> np.ndarray:
+        """[E] of the edges."""
+        return lengths(self.xy_w, self.edges)
 
     @functools.cached_property
     def graph(self) -> nx.DiGraph:
@@ -110,13 +116,24 @@ class TopologicalMap:
             goal: node.
             penalty: [E] added to the edges' weights.
         """
-        weight = self.weight if penalty is None else self.weight + penalty
-        size = len(self.xy_w)
-        back = csr_array((weight, (self.edges[:, 1], self.edges[:, 0])), shape=(size, size))
-        left = np.asarray(dijkstra(back, indices=goal))
+        if penalty is None or not penalty.any():
+            weight, left = self.weight, self.left[goal]
+        else:
+            weight = self.weight + penalty
+            left = self._left_to(weight, goal)
         out = np.flatnonzero(self.edges[:, 0] == start)
         total = weight[out] + left[self.edges[out, 1]]
         return int(out[total.argmin()]) if len(out) and np.isfinite(total.min()) else -1
+
+    @functools.cached_property
+    def left(self) -> np.ndarray:
+        """[N, N] cost of the cheapest way to each goal (first axis) from each node; infinite where there is none."""
+        return self._left_to(self.weight, np.arange(len(self.xy_w)))
+
+    def _left_to(self, weight: np.ndarray, goals: np.ndarray | int) -> np.ndarray:
+        size = len(self.xy_w)
+        back = csr_array((weight, (self.edges[:, 1], self.edges[:, 0])), shape=(size, size))
+        return np.asarray(dijkstra(back, indices=goals))
 
     def localise(self, embeddings: np.ndarray) -> np.ndarray:
         """[Q] i32: the node nearest to each embedding [Q, D], over all images of all nodes."""
@@ -172,6 +189,11 @@ def angles(xy_w: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """[E] rad in (-pi, pi]: headings of edges [E, 2] between points [N, 2]."""
     step = xy_w[edges[:, 1]] - xy_w[edges[:, 0]]
     return np.arctan2(step[:, 1], step[:, 0])
+
+
+def lengths(xy_w: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """[E] m: lengths of edges [E, 2] between points [N, 2]."""
+    return np.linalg.norm(xy_w[edges[:, 1]] - xy_w[edges[:, 0]], axis=-1).astype(float)
 
 
 def place_nodes(
@@ -389,4 +411,5 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
             f"{path}: made in scene '{scene}' with digest {own[:12]}, the scene here has {digest[:12]}; "
             "build the map of this scene"
         )
+    arrays["embeddings"] = arrays["embeddings"].astype(np.float32)  # exported maps hold them in half precision
     return TopologicalMap(scene, own, **arrays, about=about)

@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from topological_nav.config import DriveConfig, PolicyConfig
 from topological_nav.drives import Drives, drive_images, load_drives, read_drives_header
 from topological_nav.errors import RunError
-from topological_nav.learning import Epoch, Learner, compiled_epoch, initial
+from topological_nav.learning import Epoch, Learner, compiled_epoch, in_batches, initial
 from topological_nav.policy import Forward, Policy, policy_loss, unrolled
 from topological_nav.runs import (
     CHECKPOINT,
@@ -141,13 +141,13 @@ def embed_drives(
             )
     count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
     features: np.ndarray | None = None
+    embed = _embedder(networks, mirror)
     for i, (rows, images) in enumerate(drive_images(folder)):
-        at = drives.rows(rows)
-        for side, shown in enumerate((images, images[:, :, ::-1]) if mirror else (images,)):
-            part = np.concatenate([network.embed(shown) for network in networks], -1)
-            if features is None:
-                features = np.zeros(((2 if mirror else 1) * count, part.shape[1]), np.float16)
-            features[at + side * count] = part
+        at, part = drives.rows(rows), in_batches(embed, images)
+        if features is None:
+            features = np.zeros((part.shape[1] * count, part.shape[2]), np.float16)
+        for side in range(part.shape[1]):
+            features[at + side * count] = part[:, side]
         done += len(images)
         if i % _TOLD_EVERY == 0 or done == total:
             tell(f"embedded {done:,} of {total:,} images")
@@ -156,6 +156,21 @@ def embed_drives(
     if features is None:
         raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
     return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
+
+
+def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
+    """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
+    modules, weights = [network.network for network in networks], [network.variables for network in networks]
+
+    @jax.jit
+    def embedded(weights: Any, images: jax.Array) -> jax.Array:
+        sides = []
+        for shown in (images, images[:, :, ::-1]) if mirror else (images,):
+            parts = [m.apply(w, shown, method="embed") for m, w in zip(modules, weights, strict=True)]
+            sides.append(jnp.concatenate(parts, -1))  # type: ignore[arg-type]
+        return jnp.stack(sides, 1).astype(jnp.float16)
+
+    return functools.partial(embedded, weights)
 
 
 def train_policy(

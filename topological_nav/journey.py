@@ -14,7 +14,7 @@ from topological_nav.episode_figures import episode_figure, plan_picture, video_
 from topological_nav.errors import SettingsError
 from topological_nav.evaluation import Journeys, NavigatorPlayer, Played, play
 from topological_nav.graph import TopologicalMap
-from topological_nav.navigator import PHASES, Events, State
+from topological_nav.navigator import FACE, PHASES, Events, State
 from topological_nav.simulation import Seen
 from topological_nav.space import FreeSpace
 
@@ -133,11 +133,14 @@ def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
     node, edge = int(state.node[0]), int(state.edge[0])
     if events.localised[0] or events.glanced[0]:
         yield f"{'looked about' if events.localised[0] else 'glanced'}: at node {node}"
+    still = bool(events.run_ended[0]) and not events.glanced[0] and state.phase[0] == FACE
+    if still:
+        yield f"glanced: still at node {node}"
     if events.blocked[0]:
         yield "no heading near the edge's is open"
     if events.lost[0]:
         yield f"the map has no way from node {node} to {int(state.goal[0])}"
-    elif edge >= 0 and (events.localised[0] or events.glanced[0] or events.blocked[0]):
+    elif edge >= 0 and (events.localised[0] or events.glanced[0] or events.blocked[0] or still):
         degrees = np.rad2deg(made.angle_rad[edge])
         yield f"next: node {made.edges[edge, 1]}, heading {degrees:.0f} degrees, p {made.p[edge]:.2f}"
     if events.run_started[0] and state.run[0] == 0:

@@ -19,8 +19,8 @@ import optax
 
 from topological_nav.networks import Contrast, Network, augmented, vicreg_loss
 
-EVALUATED = 64
-"""Images a call where nothing is learned."""
+EVALUATED, DEVICE_EVALUATED = (8, 64), (16, 64, 256)
+"""Images a call where nothing is learned, on a CPU and on an accelerator: each call takes the least that serves."""
 VIEW_STEPS = 2
 """Two views of a place differ by at most so many headings."""
 
@@ -92,29 +92,32 @@ def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
 
 
 def labelled_epoch(
-    network: Network, tx: optax.GradientTransformation, batch: int, smoothing: float, augment: bool
+    network: Network, tx: optax.GradientTransformation, batch: int, smoothing: float, augment: bool, scored: int = 0
 ) -> Epoch:
-    """An epoch of classification; images [N, H, W, 3] u8, labels [N] i32.
+    """An epoch of classification; images [N, H, W, 3] u8, labels [N] i32, of passages [N, outputs].
 
     The last, incomplete batch is left out: order changes every epoch, so every image has its turn.
 
     Args:
-        network: with one output for two classes, else as many outputs as classes.
+        network: of rooms with as many outputs as classes, of passages with as many as lengths.
         tx: optimiser.
         batch: images an update; all where there are fewer.
-        smoothing: of one-hot labels, where there are more than two classes.
+        smoothing: of one-hot labels, of rooms.
         augment: vary the images; those of passages also by mirroring.
+        scored: of passages, the output whose accuracy is told.
     """
 
     def loss_of(params, stats, x, y, key):
         variables = {"params": params, "batch_stats": stats}
         logits, new = network.apply(variables, x, train=True, mutable=["batch_stats"], rngs={"dropout": key})
-        if network.outputs == 1:
-            loss = optax.sigmoid_binary_cross_entropy(logits[:, 0], y.astype(jnp.float32)).mean()
+        if network.task == "passages":
+            loss = optax.sigmoid_binary_cross_entropy(logits, y.astype(jnp.float32)).mean()
+            right = (logits[:, scored] > 0) == y[:, scored]
         else:
             target = optax.smooth_labels(jax.nn.one_hot(y, network.outputs), smoothing)
             loss = optax.softmax_cross_entropy(logits, target).mean()
-        return loss, (new.get("batch_stats", stats), (decided(logits) == y).mean())
+            right = logits.argmax(1) == y
+        return loss, (new.get("batch_stats", stats), right.mean())
 
     def steps(images, key):
         count = len(images)
@@ -198,16 +201,25 @@ def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epo
     return by_updates if jax.default_backend() == "cpu" else jax.jit(whole, donate_argnums=0)
 
 
-def decided(logits: jax.Array) -> jax.Array:
-    """[N] i32 classes of logits [N, outputs]; one output tells 0 from 1 by its sign."""
-    return (logits[:, 0] > 0).astype(jnp.int32) if logits.shape[1] == 1 else logits.argmax(1).astype(jnp.int32)
-
-
 def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -> np.ndarray:
-    """A compiled function's rows for any number of images [N, H, W, 3], a fixed number at a time."""
-    rows = []
-    for first in range(0, len(images), EVALUATED):
-        part = images[first : first + EVALUATED]
-        padded = np.concatenate([part, np.zeros((EVALUATED - len(part), *part.shape[1:]), part.dtype)])
-        rows.append(np.asarray(function(jnp.asarray(padded)))[: len(part)])
+    """A compiled function's rows for any number of images [N, H, W, 3], a fixed number at a time; fewer are padded."""
+    sizes = EVALUATED if jax.default_backend() == "cpu" else DEVICE_EVALUATED
+    rows, waiting, first = [], None, 0
+    while first < len(images) or waiting is None:
+        size = next((n for n in sizes if n >= len(images) - first), sizes[-1])
+        part = images[first : first + size]
+        padded = np.concatenate([part, np.zeros((size - len(part), *part.shape[1:]), part.dtype)])
+        asked = function(jnp.asarray(padded)), len(part)
+        if waiting is not None:  # copied while an accelerator works on the next
+            rows.append(np.asarray(waiting[0]))
+        waiting, first = asked, first + size
+    rows.append(np.asarray(waiting[0])[: waiting[1]])  # cut here: on a device each length would be compiled
     return np.concatenate(rows)
+
+
+def padded_size(count: int) -> int:
+    """Rows of a batch that holds `count`: few sizes, because each is compiled. Powers of two, on accelerators of four,
+    where little is faster than 16."""
+    if jax.default_backend() == "cpu":
+        return 1 << (count - 1).bit_length()
+    return max(16, 1 << ((count - 1).bit_length() + 1) // 2 * 2)

@@ -3,12 +3,13 @@
     LOCALISE  turn about, looking along `images` headings; the nearest node is where the robot is
        |      there: ARRIVED; else Dijkstra gives the next edge
     FACE      turn to the edge's angle by PID, and ask the passage detector
-       |      agrees: DRIVE; else
+       |      whether the way is free for as long as the edge is; agrees: DRIVE; else
     SWING     the same at headings left and right of it, wider and wider
-       |      none agrees: the edge costs more from now on; another one: FACE, else
+       |      none agrees: the edge costs more from now on; another one: FACE, else all round; still none:
     LEAN      turn to the most open of the headings asked, and drive all the same
-    DRIVE     the local policy, in runs of 5 s; after twelve: LOCALISE. After each a glance: where the image ahead
-              shows a neighbour of the last node rather than that node, plan anew from there: FACE
+    DRIVE     the local policy, in runs of 5 s, or until the edge's head is passed; after twelve: LOCALISE. After each
+              a glance tells by the image ahead whether the robot is still at its node or at a neighbour of it. An
+              edge that was driven in vain costs more from now on. Plan anew from there: FACE
 
 `Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
 sees a position, and looks at images only through `sight.Sight`. `Pilot` keeps the state for those who drive one robot.
@@ -26,6 +27,7 @@ from topological_nav.config import NavigatorConfig
 from topological_nav.driving import LocalPolicy
 from topological_nav.errors import SettingsError
 from topological_nav.graph import TopologicalMap
+from topological_nav.learning import padded_size
 from topological_nav.sight import Sight
 
 LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
@@ -65,9 +67,11 @@ class State:
     """i32 headings asked since the edge was planned."""
     best_p: np.ndarray
     best_rad: np.ndarray
-    """The most open of them."""
+    """The most open of them, for `NavigatorConfig.clear_m`."""
     penalty: np.ndarray
     """[B, E] added to the edges' weights."""
+    driven: np.ndarray
+    """i32 edge that was driven since the robot was last found, -1: none."""
     lost: np.ndarray
     """i32 times that the map had no way."""
     integral: np.ndarray
@@ -79,6 +83,10 @@ class State:
     run: np.ndarray
     """i32 runs done since the robot last looked about."""
     run_end_s: np.ndarray
+    watch_s: np.ndarray
+    """Next time to look, within a run, whether the edge's head is passed."""
+    least: np.ndarray
+    """Least distance to the head in this run, as `Sight.distances` tells it."""
     acts: np.ndarray
     """i32 control steps of this run."""
     linear: np.ndarray
@@ -141,7 +149,9 @@ class Navigator:
         self._tolerance = np.deg2rad(config.tolerance_deg)
         self._period = int(getattr(policy, "period", 1))
         self._near = np.eye(len(made.xy_w), dtype=bool)
+        self._all_round = int(np.ceil(360.0 / config.swing_deg)) - 1
         self._near[made.edges[:, 0], made.edges[:, 1]] = True
+        self._ask_m = _asked_m(made.length_m, config)
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[B] i32: the nodes nearest to goals, by the images [B, K, ...] taken there along headings [K]."""
@@ -172,12 +182,15 @@ class Navigator:
             best_p=zero - 1.0,
             best_rad=zero,
             penalty=np.zeros((batch, len(self.map.edges))),
+            driven=count - 1,
             lost=count,
             integral=zero,
             error_rad=zero + np.nan,
             clock_s=zero + np.nan,
             run=count,
             run_end_s=zero,
+            watch_s=zero,
+            least=zero + np.inf,
             acts=count,
             linear=zero,
             angular=zero,
@@ -192,12 +205,13 @@ class Navigator:
     def looks(self, state: State, heading_rad: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
         """[B] bool: whose image `step` will look at, given these; the others' need not be taken."""
         heading = np.asarray(heading_rad, float)
-        turning = np.isin(state.phase, TURNING)
+        turning = _any_of(state.phase, TURNING)
         # A first target is the heading itself, or near it.
         target = np.where(np.isnan(state.target_rad), self._first_heading(heading), state.target_rad)
         reached = turning & (np.abs(wrap(target - heading)) <= self._tolerance)
         ends = np.asarray(time_s) >= state.run_end_s - SLACK_S
-        return reached | ((state.phase == DRIVE) & (ends | (state.acts % self._period == 0)))
+        acts = ends | (state.acts % self._period == 0) | self._watches(state, np.asarray(time_s))
+        return reached | ((state.phase == DRIVE) & acts)
 
     def step(
         self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
@@ -245,7 +259,13 @@ class Navigator:
 
     def _reached(self, s: _Work, heading: np.ndarray, *phases: int) -> np.ndarray:
         """Rows in one of the phases whose heading is reached."""
-        return np.flatnonzero(np.isin(s.phase, phases) & (np.abs(wrap(s.target_rad - heading)) <= self._tolerance))
+        return np.flatnonzero(_any_of(s.phase, phases) & (np.abs(wrap(s.target_rad - heading)) <= self._tolerance))
+
+    def _watches(self, s: State | _Work, time: np.ndarray) -> np.ndarray:
+        """[B] bool: who looks now, within a run, whether the edge's head is passed."""
+        if not self.config.glance or not self.config.watch_s:
+            return np.zeros(len(s.phase), bool)
+        return (s.phase == DRIVE) & (s.edge >= 0) & (time >= s.watch_s - SLACK_S)
 
     def _localise(self, s: _Work, images: np.ndarray, heading: np.ndarray) -> None:
         rows = self._reached(s, heading, LOCALISE)
@@ -257,9 +277,18 @@ class Navigator:
         s.target_rad[rows] = wrap(s.base_rad[rows] + s.looks[rows] * 2 * np.pi / self.config.images)
         s.restart_pid(rows)
         done = rows[s.looks[rows] >= self.config.images]
-        s.node[done] = s.evidence[done].argmin(-1)
+        self._found(s, done, s.evidence[done].argmin(-1).astype(np.int32))
         s.localised[done] = True
         self._decide(s, done, heading)
+
+    def _found(self, s: _Work, rows: np.ndarray, node: np.ndarray) -> None:
+        """Where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
+        s.node[rows] = node
+        edge = s.driven[rows]
+        tail, head = self.map.edges[edge].T if len(self.map.edges) else (node, node)
+        failed = (edge >= 0) & (node != head) & ~(self.map.left[head, node] < self.map.left[head, tail])
+        s.penalty[rows[failed], edge[failed]] += self.config.retry_cost
+        s.driven[rows] = -1
 
     def _decide(self, s: _Work, rows: np.ndarray, heading: np.ndarray) -> None:
         """Where to go from the nodes found."""
@@ -287,9 +316,10 @@ class Navigator:
         rows = self._reached(s, heading, FACE, SWING)
         if not len(rows):
             return
-        p = self.sight.passage(images[rows])
-        better = rows[p > s.best_p[rows]]
-        s.best_p[better], s.best_rad[better] = p[p > s.best_p[rows]], s.target_rad[better]
+        clear_m = np.full(len(rows), self.config.clear_m)
+        p, clear = self.sight.passage(images[rows], np.stack([self._ask_m[s.edge[rows]], clear_m], -1)).T
+        better = rows[clear > s.best_p[rows]]
+        s.best_p[better], s.best_rad[better] = clear[clear > s.best_p[rows]], s.target_rad[better]
         agrees = p >= self.config.passable
         self._begin_drive(s, rows[agrees], time)
         rows = rows[~agrees]
@@ -300,29 +330,32 @@ class Navigator:
         s.phase[rows] = SWING
         s.target_rad[rows] = wrap(s.base_rad[rows] + offset)
         s.restart_pid(rows)
-        blocked = rows[count > 2 * self.config.swings]
+        blocked = rows[count == 2 * self.config.swings + 1]
         s.blocked[blocked] = True
         for i in blocked:
             old = s.edge[i]
-            if old >= 0 and s.penalty[i, old] == 0.0:
-                s.penalty[i, old] = PENALTY
+            if old >= 0 and s.penalty[i, old] < PENALTY:
+                s.penalty[i, old] += PENALTY
                 if self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i]) != old:
                     self._plan(s, np.array([i]), heading)
-                    continue
-            s.phase[i], s.target_rad[i] = LEAN, s.best_rad[i]
+        # Without another way it goes on swinging, all round.
+        asked = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
+        s.phase[asked], s.target_rad[asked] = LEAN, s.best_rad[asked]
 
     def _begin_drive(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
-        s.phase[rows] = DRIVE
+        s.phase[rows], s.driven[rows] = DRIVE, s.edge[rows]
         self._begin_run(s, rows, time)
 
     def _begin_run(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
         if len(rows):
             s.run_end_s[rows], s.acts[rows] = time[rows] + self.config.run_s, 0
+            s.watch_s[rows], s.least[rows] = time[rows] + self.config.watch_s, np.inf
             s.run_started[rows] = True
             s.put_hidden(rows, self.policy.start(len(rows)))
 
     def _drive(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
-        ended = np.flatnonzero((s.phase == DRIVE) & (time >= s.run_end_s - SLACK_S))
+        over = (time >= s.run_end_s - SLACK_S) | self._passed(s, images, heading, time)
+        ended = np.flatnonzero((s.phase == DRIVE) & over)
         if len(ended):
             s.run_ended[ended] = True
             s.run[ended] += 1
@@ -333,23 +366,40 @@ class Navigator:
                 away = self.sight.distances(images[ended], heading[ended])
                 found = np.where(self._near[s.node[ended]], away, np.inf).argmin(-1).astype(np.int32)
                 new = found != s.node[ended]
-                s.node[ended[new]] = found[new]
                 s.glanced[ended[new]] = True
+                self._found(s, ended, found)
                 # A glance is no proof of having arrived: that takes a look about.
-                self._begin_localise(s, ended[new & (found == s.goal[ended])])
-                self._plan(s, ended[new & (found != s.goal[ended])], heading)
-                ended = ended[~new]
+                there = new & (found == s.goal[ended])
+                self._begin_localise(s, ended[there])
+                # Where the map has no way, on along the heading that was chosen.
+                on = ~new & (s.edge[ended] < 0)
+                self._plan(s, ended[~there & ~on], heading)
+                ended = ended[on]
             self._begin_run(s, ended, time)
         acting = np.flatnonzero((s.phase == DRIVE) & (s.acts % self._period == 0))
         if len(acting):
-            # Padded to a power of two by the first row: what is compiled for few sizes serves all.
-            size = 1 << (len(acting) - 1).bit_length()
+            # Padded by the first row: what is compiled for few sizes serves all.
+            size = padded_size(len(acting))
             rows = np.concatenate([acting, np.full(size - len(acting), acting[0])])
             hidden, linear, angular = self.policy.act(jax.tree.map(lambda x: x[rows], s.hidden), images[rows])
             s.put_hidden(acting, jax.tree.map(lambda x: np.asarray(x)[: len(acting)], hidden))
             s.linear[acting] = np.asarray(linear)[: len(acting)]
             s.angular[acting] = np.asarray(angular)[: len(acting)]
         s.acts[s.phase == DRIVE] += 1
+
+    def _passed(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """[B] bool: of all nodes in question the edge's head is nearest, and it is getting farther."""
+        passed = np.zeros(len(s.phase), bool)
+        rows = np.flatnonzero(self._watches(s, time))
+        if len(rows):
+            s.watch_s[rows] += self.config.watch_s
+            away = self.sight.distances(images[rows], heading[rows])
+            head = self.map.edges[s.edge[rows], 1]
+            there = away[np.arange(len(rows)), head]
+            nearest = np.where(self._near[s.node[rows]], away, np.inf).argmin(-1) == head
+            passed[rows] = nearest & (there > s.least[rows])
+            s.least[rows] = np.minimum(s.least[rows], there)
+        return passed
 
     def _begin_localise(self, s: _Work, rows: np.ndarray) -> None:
         s.phase[rows], s.looks[rows], s.edge[rows], s.run[rows] = LOCALISE, 0, -1, 0
@@ -360,7 +410,7 @@ class Navigator:
 
     def _turn(self, s: _Work, heading: np.ndarray, time: np.ndarray) -> None:
         """PID to the target heading, as `simple_pid.PID` computes it."""
-        rows = np.flatnonzero(np.isin(s.phase, TURNING) & ~np.isnan(s.target_rad))
+        rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
         config, most = self.config, self.config.max_turn_rad_s
         error = wrap(s.target_rad[rows] - heading[rows])
         dt = np.maximum(np.nan_to_num(time[rows] - s.clock_s[rows], nan=0.0), 0.0)
@@ -423,6 +473,17 @@ class _Work:
     def events(self) -> Events:
         names = [f.name for f in dataclasses.fields(Events)]
         return Events(**{name: getattr(self, self._events.get(name, name)) for name in names})
+
+
+def _asked_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
+    """[E + 1] m: how far the way must be free to drive along each edge of lengths [E], and, last, along none."""
+    asked = np.minimum(length_m - np.minimum(config.slack_m, 0.5 * length_m), config.ahead_m)
+    return np.append(asked, config.clear_m)
+
+
+def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:
+    """[B] bool; many times as fast as `np.isin` for few rows."""
+    return np.logical_or.reduce([phase == one for one in phases])
 
 
 def wrap(angle_rad: Any) -> Any:

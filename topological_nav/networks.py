@@ -70,7 +70,8 @@ class Network(nn.Module):
     """A backbone and the head of a task."""
 
     task: str
-    """rooms: two layers with leaky ReLU; passages: one output, after AlexNet its own two layers with dropout."""
+    """rooms: two layers with leaky ReLU; passages: an output a length, never more for a longer
+    one; after AlexNet its own two layers with dropout."""
     backbone: str = "resnet18"
     width: int = 64
     hidden: int = 512
@@ -89,7 +90,7 @@ class Network(nn.Module):
         self.last = nn.Dense(self.outputs)
 
     def __call__(self, images: jax.Array, train: bool = False) -> jax.Array:
-        """Logits [N, outputs]."""
+        """Logits [N, outputs]; of passages they never rise."""
         _, x = self.body(normalised(images), train)
         x = x.reshape(len(x), -1) if self.backbone == "alexnet" else x.mean((1, 2))
         for layer in self.layers:
@@ -97,7 +98,8 @@ class Network(nn.Module):
                 x = nn.relu(layer(self.drop(x, deterministic=not train)))
             else:
                 x = nn.leaky_relu(layer(x))
-        return self.last(x)
+        x = self.last(x)
+        return falling(x) if self.task == "passages" else x
 
     def embed(self, images: jax.Array) -> jax.Array:
         """[N, D] f32: both feature maps max-pooled over space, each scaled to length 1, one after the other."""
@@ -117,6 +119,11 @@ class Contrast(nn.Module):
         _, x = body(normalised(images), train)
         x = nn.relu(_norm(train)(nn.Dense(8 * self.width)(x.mean((1, 2)))))
         return nn.Dense(8 * self.width)(x)
+
+
+def falling(x: jax.Array) -> jax.Array:
+    """[N, L] to logits that fall from each to the next, by softplus of it: what is free to 2 m is free to 1 m."""
+    return x[:, :1] - jnp.cumsum(jnp.pad(nn.softplus(x[:, 1:]), ((0, 0), (1, 0))), 1)
 
 
 def joined(maps: tuple[jax.Array, jax.Array]) -> jax.Array:

@@ -1,8 +1,9 @@
-"""Sources and targets in, passage labels out: is the straight way ahead free?"""
+"""Sources and targets in, passage labels out: how far is the straight way ahead free?"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,7 +21,7 @@ class Passages:
     heading_rad: np.ndarray
     """[n] towards the targets."""
     free: np.ndarray
-    """[n] bool labels."""
+    """[n, L] bool labels for `DataConfig.passage_lengths_m`; never true after false."""
     source: np.ndarray
     """[n] i32 index of the source."""
     room: np.ndarray
@@ -37,7 +38,9 @@ class Passages:
 
 
 def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.random.Generator) -> Passages:
-    """Sources of every room, targets on a circle about each, labels from the map; as many free as blocked.
+    """Sources of every room, targets on a circle about each, labels from the map.
+
+    As many are free as blocked for `passage_length_m`.
 
     A room with fewer eligible places than sources gives them all. Surplus passages of the commoner label are left
     out at random, apart for training and testing, so that guessing scores one half in both.
@@ -62,8 +65,7 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
     phase = rng.uniform(0, 2 * np.pi, n)
     heading = (phase[:, None] + 2 * np.pi * np.arange(each) / each).ravel() % (2 * np.pi)
     start = np.repeat(sources, each, 0)
-    end = start + config.passage_length_m * np.stack([np.cos(heading), np.sin(heading)], -1)
-    free = space.segment_free(start, end, config.passage_points, config.passage_margin_m)
+    free = free_lengths(space, start, heading, config)
     every = Passages(
         start,
         heading,
@@ -72,8 +74,47 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
         np.repeat(room, each),
         np.repeat(test, each),
     )
-    kept = [balanced(np.flatnonzero(every.test == held), free, rng) for held in (False, True)]
+    scored = free[:, config.passage_column]
+    kept = [balanced(np.flatnonzero(every.test == held), scored, rng) for held in (False, True)]
     return every.take(np.sort(np.concatenate(kept)))
+
+
+def free_lengths(space: FreeSpace, xy_w: np.ndarray, heading_rad: np.ndarray, config: DataConfig) -> np.ndarray:
+    """[n, L] bool: whether the ways from places [n, 2] along headings [n] are free for `passage_lengths_m`.
+
+    Every length has points of its own, of another spacing, and one may hit a corner that the others miss. So
+    `passage_length_m` decides: what is free for it is free for less, what is not is not for more, and so on outwards.
+    """
+    step = np.stack([np.cos(heading_rad), np.sin(heading_rad)], -1)
+    points, margin_m, scored = config.passage_points, config.passage_margin_m, config.passage_column
+    ways = [space.segment_free(xy_w, xy_w + length * step, points, margin_m) for length in config.passage_lengths_m]
+    free = np.stack(ways, -1)
+    free[:, : scored + 1] = np.logical_or.accumulate(free[:, scored::-1], 1)[:, ::-1]
+    free[:, scored:] = np.logical_and.accumulate(free[:, scored:], 1)
+    return free
+
+
+def logits_at(logits: np.ndarray, lengths_m: Sequence[float], ahead_m: np.ndarray | float) -> np.ndarray:
+    """A detector's logits at any length: between two of its own on the line between them, beyond them the nearest.
+
+    Args:
+        logits: [n, L].
+        lengths_m: [L] ascending.
+        ahead_m: [n], or [n, M] for M lengths of each; a number is for all.
+
+    Returns:
+        As `ahead_m`; [n] for a number.
+    """
+    own = np.asarray(lengths_m, float)
+    ahead = np.asarray(ahead_m, float)
+    ahead = np.broadcast_to(ahead, (len(logits), *ahead.shape[1:]))
+    if len(own) == 1:
+        return np.broadcast_to(logits.reshape(-1, *[1] * (ahead.ndim - 1)), ahead.shape).astype(float)
+    x = np.clip(ahead, own[0], own[-1])
+    right = np.clip(np.searchsorted(own, x), 1, len(own) - 1)
+    share = (x - own[right - 1]) / (own[right] - own[right - 1])
+    rows = np.arange(len(logits)).reshape(-1, *[1] * (ahead.ndim - 1))
+    return (1.0 - share) * logits[rows, right - 1] + share * logits[rows, right]
 
 
 def balanced(rows: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -7,11 +7,11 @@ learned from the other.
 
 from __future__ import annotations
 
-import math
-import os
-import warnings
 from collections.abc import Callable
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -21,7 +21,11 @@ from interactive_nav.scene import Scene
 from topological_nav.errors import TopologicalError
 
 BATCH = 18
-"""Images a call unless asked otherwise: the headings of one position and pitch."""
+"""Images a call on a CPU unless asked otherwise: the headings of one position and pitch."""
+DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
+"""Least and most images a call on an accelerator, and the most pixels drawn for them."""
+Painter = Callable[[np.ndarray, np.ndarray], Any]
+"""Positions [n, 3] and axes [n, 3, 3] of cameras to images [n, H, W, 3] u8, in an array of any kind."""
 _SHOWN = 2
 """Geom group of all that is drawn."""
 
@@ -57,7 +61,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 class SceneRenderer:
     """Draws one scene, its furniture at rest and no robot in it."""
 
-    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", batch: int = BATCH):
+    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", batch: int | None = None):
         """Loads the scene's meshes; the first picture may compile.
 
         Args:
@@ -65,78 +69,102 @@ class SceneRenderer:
             lens: of the images returned.
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
-            batch: images a call of the engine; fewer are padded.
+            batch: images a call of the engine; fewer are padded. None: `BATCH` on a CPU; on an accelerator powers of
+                two up to what `DEVICE_PIXELS` allows, of which each call takes the least that serves.
         """
-        self._lens, self._by, self._batch = lens, supersample, batch
+        self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
         self._model = _visual_model(scene, self._large)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
-        self._draw: Callable[[np.ndarray, np.ndarray], np.ndarray] = (
-            self._warp_painter() if engine == "warp" else self._gl_painter()
-        )
+        self._painters: dict[int, Painter] = {}
+        """By images a call."""
+        if engine == "warp":
+            self._sizes = (batch,) if batch else batch_sizes(self._large, jax.default_backend())
+            self._painter(self._sizes[0])  # an engine that does not start says so here
+        else:
+            self._sizes = (1,)
+            self._painters[1] = self._gl_painter()
 
     def draw(self, pose: CameraPose) -> np.ndarray:
         """[N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
-        count = len(pos)
+        count, first = len(pos), 0
         out = np.empty((count, self._lens.height, self._lens.width, 3), np.uint8)
-        for first in range(0, count, self._batch):
-            # Padded by the last camera: Warp draws batches of one size only.
-            rows = np.minimum(np.arange(first, first + self._batch), count - 1)
-            drawn = self._draw(pos[rows], axes[rows])[: count - first]
-            out[first : first + self._batch] = shrink(drawn, self._by)
+        drawn: list[tuple[int, Any]] = []
+
+        def fetch(waiting: int) -> None:
+            while len(drawn) > waiting:
+                at, images = drawn.pop(0)
+                out[at : at + len(images)] = np.asarray(images)[: count - at]
+
+        while first < count:
+            size = next((n for n in self._sizes if n >= count - first), self._sizes[-1])
+            # Padded by the last camera: Warp draws batches of fixed sizes only.
+            rows = np.minimum(np.arange(first, first + size), count - 1)
+            drawn.append((first, self._painter(size)(pos[rows], axes[rows])))
+            first += size
+            fetch(1)  # the accelerator draws the next batch while this one is copied
+        fetch(0)
         return out
 
-    def _warp_painter(self):
+    def _painter(self, size: int) -> Painter:
+        if size not in self._painters:
+            self._painters[size] = self._warp_painter(size)
+        return self._painters[size]
+
+    def _warp_painter(self, size: int) -> Painter:
         try:
             from interactive_nav.rendering.warp import WarpColour
         except ImportError as error:
             raise TopologicalError(
                 f"engine 'warp' does not start here ({error}); pip install 'interactive-nav[warp]', or engine=gl"
             ) from error
-        painter = WarpColour(self._model, self._large, self._batch, [_SHOWN])
-        xpos = np.tile(self._data.geom_xpos, (self._batch, 1, 1))
-        xmat = np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (self._batch, 1, 1, 1))
-        return lambda pos, axes: np.asarray(painter.draw(xpos, xmat, CameraPose(pos, axes)))
+        painter = WarpColour(self._model, self._large, size, [_SHOWN])
+        xpos = jnp.asarray(np.tile(self._data.geom_xpos, (size, 1, 1)), jnp.float32)
+        xmat = jnp.asarray(np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (size, 1, 1, 1)), jnp.float32)
 
-    def _gl_painter(self):
-        if not os.environ.get("DISPLAY"):
-            os.environ.setdefault("MUJOCO_GL", "egl")
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                renderer = mujoco.Renderer(self._model, self._large.height, self._large.width)
-        except Exception as error:  # noqa: BLE001  (GL bindings raise what they like where no GL is)
-            raise TopologicalError(
-                f"engine 'gl' does not start here ({error!r}); set MUJOCO_GL to egl or osmesa and install that "
-                "library, or engine=warp"
-            ) from error
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = np.arange(6) == _SHOWN
-        self._model.vis.global_.fovy = self._large.fov_deg
+        @jax.jit
+        def paint(xpos: jax.Array, xmat: jax.Array, pos: jax.Array, axes: jax.Array) -> jax.Array:
+            return shrink(painter.draw(xpos, xmat, CameraPose(pos, axes)), self._by)
 
-        def paint(pos: np.ndarray, axes: np.ndarray) -> np.ndarray:
-            pictures = []
-            for at, frame in zip(pos.astype(float), axes.astype(float), strict=True):
-                forward = frame[:, 0]
-                camera = mujoco.MjvCamera()
-                camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-                camera.lookat[:], camera.distance = at + forward, 1.0
-                camera.elevation = math.degrees(math.asin(np.clip(forward[2], -1.0, 1.0)))
-                camera.azimuth = math.degrees(math.atan2(forward[1], forward[0]))
-                renderer.update_scene(self._data, camera, option)
-                pictures.append(renderer.render())
-            return np.stack(pictures)
+        return lambda pos, axes: paint(xpos, xmat, pos, axes)
 
-        return paint
+    def _gl_painter(self) -> Painter:
+        from topological_nav.gl import GlPainter
+
+        painter = GlPainter(self._model, self._data, self._large, _SHOWN)
+        return lambda pos, axes: shrink(painter.draw(pos, axes), self._by)
 
 
-def shrink(images: np.ndarray, by: int) -> np.ndarray:
-    """[N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, rounded."""
+def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
+    """Images a call of the engine, ascending.
+
+    Args:
+        lens: of the images as they are drawn.
+        platform: `jax.default_backend()`.
+    """
+    if platform == "cpu":
+        return (BATCH,)
+    least, most = DEVICE_BATCH
+    most = min(most, max(least, DEVICE_PIXELS // (lens.width * lens.height)))
+    return tuple(1 << n for n in range(least.bit_length() - 1, most.bit_length()))
+
+
+def shrink(images: Any, by: int) -> Any:
+    """[N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, halves rounded to even.
+
+    In whole numbers, so that NumPy and every device give the same; the result is of the images' own kind of array.
+    """
+    if by == 1:
+        return images
+    xp = jnp if isinstance(images, jax.Array) else np
     n, height, width, channels = images.shape
     blocks = images.reshape(n, height // by, by, width // by, by, channels)
-    return np.rint(blocks.mean((2, 4), dtype=np.float32)).astype(np.uint8)
+    total, area = blocks.sum((2, 4), dtype=xp.uint32), by * by
+    whole, rest = total // area, total % area
+    up = (2 * rest > area) | ((2 * rest == area) & (whole % 2 == 1))
+    return (whole + up).astype(xp.uint8)
 
 
 def _visual_model(scene: Scene, lens: Lens) -> mujoco.MjModel:

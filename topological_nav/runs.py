@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -91,6 +92,30 @@ def run_epochs(
         if stop:
             return learner, False
     return learner, True
+
+
+def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
+    """Variables of a finished run, in the template's precision.
+
+    Args:
+        run: its folder.
+        template: tree of arrays or shapes.
+        about: content of network.json.
+
+    Raises:
+        RunError: weights.msgpack is damaged, another network's, or not what an export wrote.
+    """
+    path = run / WEIGHTS
+    try:
+        content = path.read_bytes()
+        zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
+        found = flax.serialization.from_bytes(zeros, content)
+    except Exception as error:  # noqa: BLE001  (msgpack and flax raise many kinds for a damaged file)
+        raise RunError(f"{path}: not readable ({' '.join(str(error).split())[:200]}); train again") from None
+    own = about.get("export", {}).get("weights_digest")
+    if own and hashlib.sha256(content).hexdigest() != own:
+        raise RunError(f"{path}: is not the file that was exported with its {DESCRIPTION}; export the run again")
+    return jax.tree.map(lambda s, x: jnp.asarray(x, s.dtype), template, found)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:

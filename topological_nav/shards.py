@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import io
 import math
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -14,6 +19,15 @@ from train.files import whole_file
 
 COLUMNS = 18
 """Images a row of a sheet."""
+
+
+def usable_cores() -> int:
+    """Of the machine, those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+THREADS = min(usable_cores(), 16)
+"""That encode and decode: WebP's library runs outside of Python's lock."""
 
 
 def encode(images: np.ndarray, quality: int) -> bytes:
@@ -66,3 +80,81 @@ def read_shard(path: Path) -> np.ndarray:
         )
     except Exception as error:  # noqa: BLE001  (zip, npy and WebP readers raise many kinds for a damaged file)
         raise DatasetError(f"{path}: not readable ({error}); delete it and run 'data' again") from None
+
+
+class ShardWriter:
+    """Writes files in threads while the caller draws the next; `with` waits for all of them.
+
+    Files end in any order, but are told in theirs. Where the block raises, files that are being written are finished
+    and the others left out.
+    """
+
+    def __init__(self, quality: int):
+        """Starts nothing yet.
+
+        Args:
+            quality: of WebP; 100 is without loss.
+        """
+        self._quality = quality
+        self._pool = ThreadPoolExecutor(THREADS)
+        self._waiting: deque[tuple[Future[Any] | None, Callable[[], None]]] = deque()
+
+    def __enter__(self) -> ShardWriter:
+        """Itself."""
+        return self
+
+    def put(self, path: Path, sheets: list[np.ndarray], told: Callable[[], None]) -> None:
+        """Has a file written; see `write_shard`.
+
+        Args:
+            path: the file.
+            sheets: groups of images.
+            told: called in this thread once it and all before it are there; may raise.
+        """
+        self._waiting.append((self._pool.submit(write_shard, path, sheets, self._quality), told))
+        self._tell(2 * THREADS)
+
+    def skip(self, told: Callable[[], None]) -> None:
+        """A file that is there already: `told` as in `put`."""
+        self._waiting.append((None, told))
+        self._tell(2 * THREADS)
+
+    def _tell(self, most: int) -> None:
+        """Tells of what is done, and waits until at most so many files are not."""
+        while self._waiting and (len(self._waiting) > most or _done(self._waiting[0][0])):
+            future, told = self._waiting.popleft()
+            if future is not None:
+                future.result()
+            told()
+
+    def __exit__(self, kind: Any, *_: Any) -> None:
+        """Waits for what is being written, and tells of the rest."""
+        try:
+            if kind is None:
+                self._tell(0)
+        finally:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _done(future: Future[Any] | None) -> bool:
+    return future is None or future.done()
+
+
+def read_shards(paths: Sequence[Path]) -> Iterator[np.ndarray]:
+    """`read_shard` of each file, in order, some files ahead in threads.
+
+    Raises:
+        DatasetError: see `read_shard`.
+    """
+    with ThreadPoolExecutor(THREADS) as pool:
+        ahead: deque[Future[np.ndarray]] = deque()
+        try:
+            for path in paths:
+                ahead.append(pool.submit(read_shard, path))
+                if len(ahead) > THREADS:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for future in ahead:
+                future.cancel()

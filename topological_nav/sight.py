@@ -31,8 +31,11 @@ class Sight(Protocol):
         """Images [n, ...] taken along headings [n] to [n, N]: how far each node is."""
         ...
 
-    def passage(self, images: np.ndarray) -> np.ndarray:
-        """[n] probability that the way ahead is navigable."""
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """Probability that the way ahead is navigable for lengths [n], or for M lengths of each [n, M]; as they are.
+
+        A number is a length for all images, and gives [n].
+        """
         ...
 
 
@@ -74,9 +77,9 @@ class NetworkSight:
             return out
         return _apart(asked, nodes.reshape(-1, nodes.shape[-1])).reshape(len(asked), -1, around).min(-1)
 
-    def passage(self, images: np.ndarray) -> np.ndarray:
-        """[n] the detector's probability."""
-        return 1.0 / (1.0 + np.exp(-self._detector.logits(images)[:, 0]))
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """The detector's probability; see `Sight.passage`."""
+        return self._detector.passage(images, ahead_m)
 
 
 class TrueSight:
@@ -84,16 +87,15 @@ class TrueSight:
 
     summed = True
 
-    def __init__(self, made: TopologicalMap, space: FreeSpace, ahead_m: float = 1.0, margin_m: float = 0.225):
+    def __init__(self, made: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
         """Takes the plan.
 
         Args:
             made: the map; of it only where its nodes stand.
             space: free space of its scene.
-            ahead_m: how far the way must be free.
             margin_m: clearance that it needs.
         """
-        self._xy, self._space, self._ahead_m, self._margin_m = made.xy_w.astype(float), space, ahead_m, margin_m
+        self._xy, self._space, self._margin_m = made.xy_w.astype(float), space, margin_m
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[n, N] m to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
@@ -102,11 +104,20 @@ class TrueSight:
         seen = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
         return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~seen
 
-    def passage(self, images: np.ndarray) -> np.ndarray:
-        """[n] 1 where the way ahead is free, else 0."""
-        xy, yaw = images[:, :2], images[:, 2]
-        end = xy + self._ahead_m * np.stack([np.cos(yaw), np.sin(yaw)], -1)
-        return self._space.segment_free(xy, end, LINE_POINTS, self._margin_m).astype(float)
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """1 where the way ahead is free, else 0; see `Sight.passage`.
+
+        Who stands nearer to an obstacle than the margin may leave it: the way may begin as near, but come no nearer.
+        """
+        ahead = np.asarray(ahead_m, float)
+        ahead = np.broadcast_to(ahead, (len(images), *ahead.shape[1:]))
+        poses = images.reshape(len(images), *[1] * ahead.ndim, -1)
+        xy, yaw = poses[..., :2], poses[..., 2]
+        along = (ahead[..., None] * np.linspace(0.0, 1.0, LINE_POINTS))[..., None]
+        room = self._space.at(xy + along * np.stack([np.cos(yaw), np.sin(yaw)], -1))
+        least = np.minimum(self._margin_m, room[..., :1])
+        free = ((room >= least - 1e-9) & (room > 0.0)).all(-1) & (room[..., -1] >= self._margin_m - 1e-9)
+        return free.astype(float)
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -128,8 +139,15 @@ class PassagePolicy:
     SWEEP = 4
     """Looks (of 0.15 rad) that the first turn to the left lasts."""
 
-    def __init__(self, sight: Sight, passable: float = 0.5):
-        self._sight, self._passable = sight, passable
+    def __init__(self, sight: Sight, passable: float = 0.5, ahead_m: float = 1.0):
+        """Takes whose judgement it trusts.
+
+        Args:
+            sight: judges images.
+            passable: least probability of a free way.
+            ahead_m: how far it must be free: what it takes to stop and turn.
+        """
+        self._sight, self._passable, self._ahead_m = sight, passable, ahead_m
 
     def start(self, batch: int) -> Any:
         """[batch] i32 looks since the way was last free."""
@@ -137,7 +155,7 @@ class PassagePolicy:
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """See `driving.LocalPolicy`."""
-        free = self._sight.passage(images) >= self._passable
+        free = self._sight.passage(images, self._ahead_m) >= self._passable
         # Turns end after 1, 3, 5, ... times SWEEP looks: sides change after SWEEP * k^2.
         side = np.where(np.floor(np.sqrt(state / self.SWEEP)).astype(int) % 2 == 0, 1.0, -1.0)
         linear = np.where(free, self.CRUISE_M_S, 0.0)

@@ -15,7 +15,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,6 @@ from topological_nav.data import PassageImages, RoomImages, load_passages, load_
 from topological_nav.errors import RunError
 from topological_nav.learning import (
     Learner,
-    decided,
     in_batches,
     labelled_epoch,
     make_learner,
@@ -41,6 +40,7 @@ from topological_nav.learning import (
 )
 from topological_nav.localise import localisation_scores
 from topological_nav.networks import Contrast, Network
+from topological_nav.passages import logits_at
 from topological_nav.runs import (
     CHECKPOINT,
     DESCRIPTION,
@@ -49,6 +49,7 @@ from topological_nav.runs import (
     claim,
     cut_metrics,
     read_checkpoint,
+    read_weights,
     restored,
     run_epochs,
 )
@@ -66,6 +67,11 @@ class Trained:
     about: dict[str, Any]
     """Content of network.json."""
 
+    @property
+    def stored(self) -> str:
+        """Names the numbers that it computes with: the run's digest, and the precision of an exported network."""
+        return self.about["digest"] + (f"-{self.about['export']['precision']}" if "export" in self.about else "")
+
     def logits(self, images: np.ndarray) -> np.ndarray:
         """[N, outputs] of images [N, H, W, 3] u8, of the size that it learned from.
 
@@ -73,6 +79,15 @@ class Trained:
             RunError: images of another size.
         """
         return self._rows(images, "__call__")
+
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """Probability that the way ahead is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`.
+
+        Raises:
+            RunError: images of another size.
+        """
+        logits = self.logits(images).astype(float)
+        return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 
     def embed(self, images: np.ndarray) -> np.ndarray:
         """[N, D] localisation embeddings of images [N, H, W, 3] u8; see `Network.embed`."""
@@ -103,17 +118,21 @@ class _Work:
     images: np.ndarray
     """[N, H, W, 3] u8 for learning."""
     labels: np.ndarray
-    """[N] i32."""
+    """[N] i32; of passages [N, outputs]."""
     places: np.ndarray
     """[P, K, H, W, 3] u8, the headings around places of training, for learning without labels."""
     held_out: np.ndarray
     """[M, H, W, 3] u8."""
     truth: np.ndarray
-    """[M] i32."""
+    """[M] i32; of passages [M, outputs]."""
     groups: dict[str, np.ndarray]
     """Name -> rows of `held_out` that are scored together."""
     names: tuple[str, ...]
     rooms: RoomImages
+    lengths_m: tuple[float, ...] = ()
+    """Of the outputs, of passages."""
+    scored: int = 0
+    """Which of them is scored, of passages."""
 
 
 def train(
@@ -164,7 +183,7 @@ def train(
             images, labels = work.places, np.zeros(0, np.int32)
         else:
             current, images, labels = learner, work.images, work.labels
-            epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment)
+            epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
         first = 0
         if saved and saved["phase"] == phase:
             first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
@@ -191,6 +210,7 @@ def train(
         "hidden": config.hidden,
         "outputs": work.outputs,
         "names": list(work.names),
+        **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
         "data": header["settings"],
         "fov_deg": header["fov_deg"],
         "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
@@ -203,7 +223,8 @@ def train(
 def save_trained(out: Path, trained: Trained) -> Trained:
     """Writes a network as `load_trained` reads it; returns it with the digest of its weights in `about`."""
     weights = flax.serialization.to_bytes(jax.device_get(trained.variables))
-    about = {**trained.about, "digest": hashlib.sha256(weights).hexdigest()}
+    kept = {name: value for name, value in trained.about.items() if name != "export"}
+    about = {**kept, "digest": hashlib.sha256(weights).hexdigest()}
     with whole_file(out / WEIGHTS) as partial:
         partial.write_bytes(weights)
     write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
@@ -211,23 +232,23 @@ def save_trained(out: Path, trained: Trained) -> Trained:
 
 
 def load_trained(run: Path) -> Trained:
-    """The network of a finished run.
+    """The network of a finished run, or of an export of one (`export`): its weights are f32 in memory either way.
 
     Raises:
-        RunError: no such run, or it is not finished.
+        RunError: no such run, or it is not finished, damaged, or a passage detector of one length without saying which.
     """
     run = Path(run)
     if not (run / DESCRIPTION).is_file():
         raise RunError(f"{run}: holds no trained network; finish it: python -m topological_nav train TASK -o {run}")
     about = json.loads((run / DESCRIPTION).read_text())
+    if about["task"] == "passages" and "lengths_m" not in about:
+        raise RunError(
+            f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
+            "its dataset again and train it again"
+        )
     network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
     template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
-    try:
-        zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
-        variables = flax.serialization.from_bytes(zeros, (run / WEIGHTS).read_bytes())
-    except Exception as error:  # noqa: BLE001  (msgpack and flax raise many kinds for a damaged file)
-        raise RunError(f"{run / WEIGHTS}: not readable ({' '.join(str(error).split())[:200]}); train again") from None
-    return Trained(network, jax.tree.map(jnp.asarray, variables), about)
+    return Trained(network, read_weights(run, template, about), about)
 
 
 def _work(task: str, dataset: Path, config: TrainConfig) -> _Work:
@@ -240,8 +261,9 @@ def _work(task: str, dataset: Path, config: TrainConfig) -> _Work:
         held = passages.test
         groups = {"all": np.arange(int(held.sum()))}
         return _Work(
-            task, 1, passages.images[~held], passages.free[~held].astype(np.int32), places, passages.images[held],
-            passages.free[held].astype(np.int32), groups, ("blocked", "free"), rooms,
+            task, len(passages.lengths_m), passages.images[~held], passages.free[~held].astype(np.int32), places,
+            passages.images[held], passages.free[held].astype(np.int32), groups, ("blocked", "free"), rooms,
+            passages.lengths_m, passages.scored,
         )  # fmt: skip
     pitches = list(range(3)) if config.pitch == "all" else [PITCHES.index(config.pitch)]
     learned = rooms.images[~rooms.test][:, pitches]
@@ -268,19 +290,32 @@ def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
         "trained_on": len(work.images),
     }
     if len(work.held_out):
-        found = np.asarray(decided(jnp.asarray(trained.logits(work.held_out))))
+        logits, truth = trained.logits(work.held_out), work.truth
+        if work.task == "passages":
+            results["lengths"] = length_scores(logits, truth, work.lengths_m)
+            found, truth = (logits[:, work.scored] > 0).astype(np.int32), truth[:, work.scored]
+        else:
+            found = logits.argmax(1)
         results["groups"] = {
             name: {
                 "images": len(rows),
-                "accuracy": float((found[rows] == work.truth[rows]).mean()),
-                "macro_f1": float(f1_score(work.truth[rows], found[rows], average="macro")),
+                "accuracy": float((found[rows] == truth[rows]).mean()),
+                "macro_f1": float(f1_score(truth[rows], found[rows], average="macro")),
             }
             for name, rows in work.groups.items()
         }
         if work.task == "passages":
-            results["confusion"] = confusion_matrix(work.truth, found, labels=[0, 1]).tolist()
+            results["confusion"] = confusion_matrix(truth, found, labels=[0, 1]).tolist()
     results["localisation"] = localisation(trained, work.rooms)
     return results
+
+
+def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[float]) -> list[dict[str, float]]:
+    """For each length the share of images that are free so far, and of those judged right; logits and free [N, L]."""
+    return [
+        {"ahead_m": length, "free": float(truth.mean()), "accuracy": float(((logit > 0) == truth).mean())}
+        for length, logit, truth in zip(lengths_m, logits.T, free.T, strict=True)
+    ]
 
 
 def localisation(trained: Trained, rooms: RoomImages) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,13 @@ from topological_nav.config import PITCHES, DataConfig
 from topological_nav.data import headings, load_passages, read_header
 from topological_nav.domains import as_seen, preset
 from topological_nav.errors import DatasetError, MapError, RunError
-from topological_nav.graph import assemble, near_pairs
-from topological_nav.learning import Learner, decided, labelled_epoch, make_learner
+from topological_nav.graph import assemble, lengths, near_pairs
+from topological_nav.learning import Learner, labelled_epoch, make_learner
 from topological_nav.localise import localisation_scores
 from topological_nav.passages import balanced
 from topological_nav.runs import RESULTS, claim
 from topological_nav.space import free_space
-from topological_nav.training import Trained, load_trained, save_trained
+from topological_nav.training import Trained, length_scores, load_trained, save_trained
 from train.config_io import to_dict
 from train.files import write_text
 from train.run_folder import versions
@@ -47,7 +48,8 @@ CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "
 class _Labelled:
     images: np.ndarray
     free: np.ndarray
-    """[N] i32."""
+    """[N, L] i32."""
+    scored: int
 
 
 def passage_configurations(
@@ -77,7 +79,7 @@ def passage_configurations(
     trained = load_trained(run)
     if trained.about["task"] != "passages":
         raise RunError(f"{run}: was trained for '{trained.about['task']}', expected a run of 'train passages'")
-    learned, tested = _labelled(target, config)
+    learned, tested = _labelled(target, trained.about["lengths_m"], config)
     header, _ = read_header(target)
     about = {"run": trained.about["digest"][:12], "target": digest_of(header)}
     claim(out, {"task": "transfer", **to_dict(config), **about})
@@ -85,7 +87,7 @@ def passage_configurations(
     network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
     shape = (trained.about["data"]["height"], trained.about["data"]["width"])
     fresh = make_learner(network, shape, tx, config.seed)
-    epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True)
+    epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
     images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free)
     results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
     for name, (from_source, tunes) in CONFIGURATIONS.items():
@@ -147,7 +149,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
         if not len(edges):
             return np.zeros(0)
         turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
-        return 1.0 / (1.0 + np.exp(-detector.logits(shown[edges[:, 0], turn])[:, 0]))
+        return detector.passage(shown[edges[:, 0], turn], lengths(xy, edges))
 
     if not len(near_pairs(xy, config.edge_m)):
         raise MapError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
@@ -195,19 +197,26 @@ def _map_scores(localiser, made, free, asked, rooms, held, label, config: AdaptC
     return scores
 
 
-def _labelled(target: Path, config: AdaptConfig) -> tuple[_Labelled, _Labelled]:
+def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[_Labelled, _Labelled]:
     """Target images to learn from and to test, as many free as blocked, no source in both."""
     passages = load_passages(target)
+    if list(passages.lengths_m) != list(lengths_m):
+        told = ",".join(f"{length:g}" for length in lengths_m)
+        raise DatasetError(
+            f"{target}: passages are labelled for {list(passages.lengths_m)} m, the detector judges {list(lengths_m)}; "
+            f"make it again with passage_lengths_m=[{told}]"
+        )
+    scored = passages.free[:, passages.scored]
     images = as_seen(passages.images, preset(config.domain), PASSAGES_STREAM)
     rng, parts = np.random.default_rng([config.seed, 4]), []
     for held, most in ((False, config.fine_tune), (True, config.test)):
-        rows = balanced(np.flatnonzero(passages.test == held), passages.free, rng)
-        yes, no = (rng.permutation(rows[passages.free[rows] == label])[: most // 2] for label in (True, False))
+        rows = balanced(np.flatnonzero(passages.test == held), scored, rng)
+        yes, no = (rng.permutation(rows[scored[rows] == label])[: most // 2] for label in (True, False))
         rows = np.sort(np.concatenate([yes, no]))
         if not len(rows):
             what = "for testing" if held else "to learn from"
             raise DatasetError(f"{target}: has no passages {what}; make it with more passage_sources or test_share")
-        parts.append(_Labelled(images[rows], passages.free[rows].astype(np.int32)))
+        parts.append(_Labelled(images[rows], passages.free[rows].astype(np.int32), passages.scored))
     return parts[0], parts[1]
 
 
@@ -217,9 +226,11 @@ def _of(trained: Trained, tx: optax.GradientTransformation) -> Learner:
 
 
 def _scores(trained: Trained, tested: _Labelled) -> dict[str, Any]:
-    found = np.asarray(decided(jnp.asarray(trained.logits(tested.images))))
+    logits = trained.logits(tested.images)
+    found, truth = (logits[:, tested.scored] > 0).astype(np.int32), tested.free[:, tested.scored]
     return {
-        "accuracy": float((found == tested.free).mean()),
-        "macro_f1": float(f1_score(tested.free, found, average="macro")),
-        "confusion": confusion_matrix(tested.free, found, labels=[0, 1]).tolist(),
+        "accuracy": float((found == truth).mean()),
+        "macro_f1": float(f1_score(truth, found, average="macro")),
+        "confusion": confusion_matrix(truth, found, labels=[0, 1]).tolist(),
+        "lengths": length_scores(logits, tested.free, trained.about["lengths_m"]),
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from train import policy_file
 from train.errors import CheckpointError, RunFolderError
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
@@ -125,20 +127,43 @@ def read_meta(folder: Path) -> CheckpointMeta:
         raise CheckpointError(f"{folder / META}: not readable ({error}); remove this checkpoint") from None
 
 
+def is_whole(folder: Path) -> bool:
+    """Whether a checkpoint holds all of the learner; one that was exported holds the policy alone."""
+    return (folder / LEARNER).is_file() or not (folder / policy_file.POLICY).is_file()
+
+
+def keep_policy(folder: Path, target: Path) -> None:
+    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`."""
+    meta = read_meta(folder)
+    target.mkdir(parents=True)
+    policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY)
+    shutil.copy2(folder / META, target / META)
+
+
+def weights_digest(folder: Path) -> str:
+    """SHA-256 of a checkpoint's weights."""
+    path = folder / (LEARNER if is_whole(folder) else policy_file.POLICY)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def load_learner(folder: Path, template: Any) -> Any:
-    """The learner of a checkpoint, as arrays in the template's structure.
+    """The learner of a checkpoint, as arrays in the template's structure; of an exported one only the policy counts.
 
     Raises:
         CheckpointError: damaged, or of other networks than the template's.
     """
     path = folder / LEARNER
-    try:
-        learner = flax.serialization.from_bytes(template, path.read_bytes())
-    except Exception as error:  # msgpack and flax raise many kinds for a damaged or foreign file
-        raise CheckpointError(
-            f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
-            "use the run's own config, or another checkpoint"
-        ) from None
+    if not is_whole(folder):
+        path = folder / policy_file.POLICY
+        learner = policy_file.read(path, template)
+    else:
+        try:
+            learner = flax.serialization.from_bytes(template, path.read_bytes())
+        except Exception as error:  # msgpack and flax raise many kinds for a damaged or foreign file
+            raise CheckpointError(
+                f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
+                "use the run's own config, or another checkpoint"
+            ) from None
     for name, expected in jax.tree_util.tree_leaves_with_path(template):
         got = _leaf_at(learner, name)
         if np.shape(got) != np.shape(expected):

@@ -36,7 +36,7 @@ TYPES: dict[str, pa.DataType] = {
     "deterministic": pa.bool_(),
 }
 """Of the constant columns, which are empty where they mean nothing (a yardstick has no seed)."""
-IDENTITY = ("run", "policy", "evaluation_seed", "scene", "episode")
+IDENTITY = ("run", "robot", "policy", "evaluation_seed", "scene", "episode")
 """Columns that name an episode that was played."""
 
 

@@ -64,6 +64,11 @@ class FolderCallbacks:
         if not checkpoint.list_checkpoints(self._folder.checkpoints):
             return None
         path, meta = checkpoint.find(self._folder.checkpoints, "last")
+        if not checkpoint.is_whole(path):
+            raise CheckpointError(
+                f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
+                "go on from; train into another folder (run.out_dir, run.name)"
+            )
         check_fits(meta, path, self._config.env, self._env)
         self._wall_before_s = meta.wall_s
         learner = checkpoint.load_learner(path, template.learner)

@@ -49,6 +49,7 @@ def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_
     assert sum(int(n) for n in model.body_jntnum) == 7
 
 
+@pytest.mark.heavy
 def test_the_patches_of_the_real_room_join_it(sample_data, hull_cache):
     """Before the borders were joined 9 m of the floor's border and 25 m of the walls' were open.
 

@@ -189,7 +189,7 @@ def test_the_force_on_a_pushed_block_on_warp(world, mjx_warp):
     "backend",
     [
         "native",
-        pytest.param("jax", marks=pytest.mark.slow),
+        pytest.param("jax", marks=pytest.mark.heavy),
         pytest.param("warp", marks=[pytest.mark.slow, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
     ],
 )
@@ -316,7 +316,7 @@ def host_primitives(jaxpr) -> set[str]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_the_loop_is_traced_once_and_never_leaves_the_device(tmp_path):
     """Steps with episodes ending among them: one program, and nothing passes between host and device."""
     room = write_room(tmp_path / "room", (3.0, 3.0), ())

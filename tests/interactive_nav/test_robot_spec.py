@@ -93,6 +93,7 @@ def _run(world, backend, periods=4):
     return np.stack(out)
 
 
+@pytest.mark.heavy
 def test_control_law_sees_state_and_time_at_every_substep(brake_world):
     native = _run(brake_world, "native")
     # 10 rad/s is 0.352 m/s: less than 0.1 m by 0.15 s; the law turns at the time limit, within the second period.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -22,7 +23,7 @@ WORDS = (
         "room_method=kmeans",
         "quality=100",
     ),
-    *("passage_sources=24", "passage_length_m=1.2", "shard=4"),
+    *("passage_sources=24", "passage_length_m=1.2", "passage_lengths_m=[0.6,1.2,1.8]", "shard=4"),
 )
 DRIVEN = (
     *("width=32", "height=32", "supersample=1", "quality=100", "shard=3"),
@@ -99,3 +100,26 @@ def driven(painted, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("driven") / "drives"
     assert main(["data", "--drives", str(painted), "-o", str(out), *DRIVEN]) == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def steered(made, driven, tmp_path_factory) -> Path:
+    """A local policy that learned a little of those drives."""
+    out = tmp_path_factory.mktemp("steered") / "policy"
+    runs = ["--data", str(driven), "--localiser", str(made.rooms), "--detector", str(made.passages)]
+    words = ("hidden=16", "projection=8", "forward_hidden=8", "steps=20", "overlap_s=1.5", "batch=8", "epochs=3")
+    words = [*words, "learning_rate=1e-2", "straight_kept=1", "mirror=false"]
+    assert main(["train", "policy", *runs, "-o", str(out), *words]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def exported(made, steered, tmp_path_factory) -> Path:
+    """All of it in half precision, with the map, as a package would carry it."""
+    base = tmp_path_factory.mktemp("exported")
+    (base / "maps").mkdir()
+    shutil.copyfile(made.map, base / "maps" / "painted.npz")
+    runs = ["--localiser", str(made.rooms), "--detector", str(made.passages), "--policy", str(steered)]
+    what = ["--maps", str(base / "maps"), "--images", str(made.data)]
+    assert main(["export", *runs, *what, "-o", str(base / "weights"), "commit=toy"]) == 0
+    return base / "weights"

@@ -54,8 +54,10 @@ def test_passages_are_stored_with_their_labels(made):
     passages, plan = data.load_passages(made.data), data.load_plan(made.data, "painted").passages
     assert passages.images.shape == (len(plan), 32, 32, 3)
     assert (passages.free == plan.free).all() and (passages.test == plan.test).all()
+    assert passages.free.shape == (len(plan), 3) and passages.lengths_m == (0.6, 1.2, 1.8) and passages.scored == 1
+    assert (passages.free[:, :-1] >= passages.free[:, 1:]).all()
     for held in (False, True):
-        mine = passages.free[passages.test == held]
+        mine = passages.free[passages.test == held, 1]
         assert len(mine) and 2 * mine.sum() == len(mine)
 
 
@@ -87,6 +89,15 @@ def test_a_changed_scene_is_refused(made, tmp_path):
     (copy / "dataset.json").write_text(json.dumps(header))
     with pytest.raises(DatasetError, match="the dataset there is of painted as they were; the scenes differ"):
         data.make_dataset([made.scene], copy, CONFIG)
+
+
+def test_a_dataset_of_an_older_format_is_refused(made, tmp_path):
+    copy = tmp_path / "data"
+    shutil.copytree(made.data, copy)
+    header = json.loads((copy / "dataset.json").read_text())
+    (copy / "dataset.json").write_text(json.dumps({**header, "format": 1}))
+    with pytest.raises(DatasetError, match="format 1, expected 2; make the dataset again"):
+        data.load_passages(copy)
 
 
 def test_seeds_draw_other_positions(made):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from topological_nav.domains import PRESETS, DomainConfig, as_seen, preset, smeared
+from topological_nav.domains import PRESETS, DomainConfig, as_seen, as_seen_from, preset, smeared
 from topological_nav.errors import SettingsError
 
 
@@ -93,6 +93,23 @@ def test_chance_follows_from_seed_and_stream_alone():
     assert (as_seen(images, dataclasses.replace(camera, seed=1)) != first).any()
     # Not on how the set is shaped.
     assert (as_seen(images[None], camera)[0] == first).all()
+
+
+def test_chance_may_follow_from_where_an_image_was_taken():
+    images = np.random.default_rng(1).integers(0, 256, (4, 12, 16, 3), np.uint8)
+    images[1] = images[0]
+    xy, heading = np.array([[1.0, 2.0], [1.0, 2.0], [-1.0, 2.0], [1.0, -2.0]]), np.array([0.3, 0.3, 0.3, -0.3])
+    camera = PRESETS["camera"]
+    seen = as_seen_from(images, camera, xy, heading)
+    assert (seen[0] == seen[1]).all()
+    assert (as_seen_from(images[2:], camera, xy[2:], heading[2:]) == seen[2:]).all()
+    moved = as_seen_from(images, camera, xy + [0.0, 1e-5], heading + [0.0, 0.002, 0.0, 0.0])
+    assert (moved[[0, 2, 3]] == seen[[0, 2, 3]]).all() and (moved[1] != seen[1]).any()
+    assert (as_seen_from(images, dataclasses.replace(camera, seed=1), xy, heading) != seen).any(axis=(1, 2, 3)).all()
+    # Without chance it is the camera of every set.
+    lens = PRESETS["lens"]
+    assert (as_seen_from(images, lens, xy, heading) == as_seen(images, lens)).all()
+    assert as_seen_from(images, DomainConfig(), xy, heading) is images
 
 
 def test_unknown_cameras_and_impossible_ones_are_refused():

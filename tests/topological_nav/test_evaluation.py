@@ -2,7 +2,9 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -271,7 +273,9 @@ def test_the_commands_draw_and_tell(first, toy, capsys, tmp_path):
         (["evaluate", "nowhere", "--contenders", "ppo"], "contender ppo needs the run folder of a trained policy"),
         (["evaluate", "nowhere", "a/nowhere"], "scenes are nowhere, nowhere, expected different names"),
         (["evaluate", "nowhere", "--truth"], "nowhere/scene.json: no such file"),
-        (["evaluate", "nowhere", "--localiser", "gone"], "gone: holds no trained network"),
+        (["evaluate", "nowhere", "--localiser", "gone"], "no trained networks of passages"),
+        (["evaluate", APARTMENT, "--localiser", "gone", "--detector", "gone"], "gone: holds no trained network"),
+        (["evaluate", "nowhere", "--domain", "fog"], "domain is 'fog', expected one of clean, lens"),
         (["navigate", "nowhere", "--video", "a.avi"], "expected a name that ends in .mp4"),
         (["navigate", APARTMENT, "--truth", "--episode", "25"], "episode is 25, expected 0 to 24"),
     ],
@@ -316,3 +320,27 @@ def test_a_policy_told_the_goal_plays_the_same_episodes(first, toy):
     assert found.duration_s == pytest.approx(5.0 * found.runs)
     start = simulator.start(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, journeys.number, 0)
     assert np.abs(np.asarray(start.info["nav"].object_pos_w)[:, 0, 0]).min() > 100.0  # parked
+
+
+def test_one_array_tells_what_the_state_holds():
+    rng = np.random.default_rng(0)
+    nav = {
+        "robot_pos_w": rng.normal(size=(3, 3)),
+        "yaw_rad": rng.normal(size=3),
+        "robot_path_m": rng.uniform(0, 90, 3),
+        "touching": np.array([[True, False, True], [False, True, False], [False, False, True]]),
+        "overflow_steps": np.array([0, 2, 0], np.int32),
+    }
+    nav = {
+        name: jnp.asarray(value, value.dtype if value.dtype != float else jnp.float32) for name, value in nav.items()
+    }
+    state = SimpleNamespace(info={"nav": SimpleNamespace(**nav)}, metrics={"nonfinite": jnp.asarray([0.0, 0.0, 1.0])})
+    simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step"), abs)))
+    seen = simulator.seen(state)
+    assert (seen.xy_w == np.asarray(nav["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float
+    assert (seen.yaw_rad == np.asarray(nav["yaw_rad"])).all()
+    assert (seen.path_m == np.asarray(nav["robot_path_m"])).all()
+    assert seen.movable.tolist() == [True, False, False]
+    assert seen.wall.tolist() == [False, True, False]
+    assert seen.broken.tolist() == [False, True, True]
+    assert simulator.seen(state) is seen  # the same state is not asked twice

@@ -174,3 +174,24 @@ def test_rooms_that_no_way_joins_are_told(plan):
     config = MapConfig(min_per_room=1, spacing_m=100.0)
     _, lacking = graph.place_nodes(space, rooms, config, 0.6, 50)
     assert len(lacking) == 1 and "parts of the scene are not joined by any way with 0.6 m clearance" in lacking[0]
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_next_edge_begins_the_cheapest_way_also_where_edges_were_refused(seed):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, 5, (9, 2))
+    made = hand_map({tuple(e): rng.uniform(0.05, 0.95) for e in graph.near_pairs(xy, 2.9).tolist()}, xy)
+    refused = rng.choice([0.0, 3.0], len(made.edges))
+    for penalty in (None, np.zeros(len(made.edges)), refused):
+        dense = np.zeros((9, 9))
+        dense[made.edges[:, 0], made.edges[:, 1]] = made.weight + (0.0 if penalty is None else penalty)
+        left = dijkstra(dense)
+        for start in range(9):
+            for goal in set(range(9)) - {start}:
+                edge = made.next_edge(start, goal, penalty)
+                if not np.isfinite(left[start, goal]):
+                    assert edge == -1
+                    continue
+                a, b = made.edges[edge]
+                assert a == start and dense[a, b] + left[b, goal] == pytest.approx(left[start, goal], abs=1e-9)

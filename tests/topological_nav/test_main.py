@@ -87,13 +87,22 @@ def test_a_map_that_was_stopped_goes_on(made, tmp_path, monkeypatch):
         (["data", "nowhere"], "nowhere/scene.json: no such file"),
         (["data", "nowhere", "heading=3"], "unknown key 'heading', did you mean 'headings'?"),
         (["train", "rooms", "--data", "nowhere"], "nowhere: is no dataset"),
-        (["map", "nowhere", "--localiser", "gone"], "gone: holds no trained network"),
+        (["map", "nowhere", "--localiser", "gone", "--detector", "gone"], "gone: holds no trained network"),
     ],
 )
 def test_mistakes_are_one_line(words, told, capsys):
     assert main(words) == 2
     error = capsys.readouterr().err
     assert error.startswith("topological_nav: ") and told in error and error.count("\n") == 1
+
+
+def test_a_stop_before_the_work_begins_is_one_line(monkeypatch, capsys):
+    def stopped(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("topological_nav.__main__._data", stopped)
+    assert main(["data", "nowhere"]) == 128 + signal.SIGINT
+    assert capsys.readouterr().err == "topological_nav: stopped; the same command goes on\n"
 
 
 def test_a_room_classifier_judges_no_passages(made, capsys, tmp_path):

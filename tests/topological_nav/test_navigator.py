@@ -27,8 +27,8 @@ class Told:
     def distances(self, images, heading_rad):
         return np.abs(images[:, :1] - np.arange(self.nodes)) * 1.0
 
-    def passage(self, images):
-        return images[:, 1]
+    def passage(self, images, ahead_m):
+        return np.broadcast_to(images[:, 1:2], ahead_m.shape)
 
 
 class Counting:
@@ -113,6 +113,52 @@ def test_after_localising_it_faces_the_edge_and_drives_when_the_detector_agrees(
     assert robot.angular[0] == pytest.approx(0.05)
 
 
+class Free(Told):
+    """Images are (node, how far the way is free, m)."""
+
+    def passage(self, images, ahead_m):
+        return (images[:, 1:2] >= ahead_m).astype(float)
+
+
+@pytest.mark.parametrize(
+    ("edge", "settings", "asked_m"),
+    [
+        ((0, 1), {}, 1.7),  # 2 m less 0.3 m
+        ((0, 2), {}, 2.0),  # the diagonal: 2.83 m less 0.3 m, but 2 m at most
+        ((0, 2), {"ahead_m": 2.6}, 2.828 - 0.3),
+        ((0, 1), {"slack_m": 0.0}, 2.0),
+        ((0, 1), {"slack_m": 5.0}, 1.0),  # half of the edge at most
+    ],
+)
+def test_an_edge_is_driven_where_the_way_is_free_for_its_length(edge, settings, asked_m):
+    for free_m, phase in ((asked_m + 0.01, DRIVE), (asked_m - 0.01, SWING)):
+        navigator = square({edge: 0.99}, **settings)
+        navigator.sight = Free()
+        robot = Robot(navigator, goal=edge[1])
+        robot.localise(0)
+        assert robot.navigator.map.edges[robot.state.edge[0]].tolist() == list(edge)
+        assert robot.step(0, p=free_m) == phase
+
+
+def test_without_an_edge_a_metre_is_enough_and_the_most_open_heading_is_the_one_free_that_far():
+    for free_m, phase in ((1.01, DRIVE), (0.99, SWING)):
+        made = square().map
+        made = dataclasses.replace(made, edges=made.edges[:0], p=made.p[:0], angle_rad=made.angle_rad[:0])
+        robot = Robot(Navigator(made, Free(), Counting(), NavigatorConfig(images=6)), goal=3)
+        robot.localise(0)
+        assert robot.state.edge[0] == -1 and robot.step(0, p=free_m) == phase
+    # With one: no heading is free for 1.7 m, the third is for 1 m.
+    navigator = square({(0, 1): 0.99})
+    navigator.sight = Free()
+    robot = Robot(navigator, goal=1)
+    robot.localise(0)
+    for free_m in (0.9, 0.2, 1.1, 0.5):
+        assert robot.step(0, p=free_m) == SWING
+        if free_m == 1.1:
+            third = robot.heading
+    assert robot.state.best_p[0] == 1.0 and robot.state.best_rad[0] == pytest.approx(third)
+
+
 def test_twelve_runs_of_five_seconds_each_with_a_fresh_hidden_state():
     robot = Robot(square({(0, 1): 0.9, (1, 2): 0.9}, glance=False), goal=2)
     robot.localise(0)
@@ -140,9 +186,9 @@ def test_a_glance_at_a_neighbour_plans_from_there():
     # It goes on counting: after twelve runs in all it looks about, wherever it is.
     assert robot.step(1, p=0.9) == DRIVE and robot.state.run[0] == 1
     ended = 1
-    while robot.step(1, p=0.9) == DRIVE:
+    while robot.step(1, p=0.9) != LOCALISE:
         ended += int(robot.events[-1].run_ended[0])
-    assert ended == 11 and robot.state.phase[0] == LOCALISE and robot.state.run[0] == 0
+    assert ended == 11 and robot.events[-1].run_ended[0] and robot.state.run[0] == 0
 
 
 def test_a_glance_at_the_goal_is_checked_by_looking_about():
@@ -165,8 +211,10 @@ def test_a_glance_chooses_among_the_node_and_its_neighbours():
     robot.step(0, p=0.9)
     for _ in range(50):
         robot.step(0, p=0.9)
-    assert robot.state.phase[0] == DRIVE and robot.state.run[0] == 1 and robot.state.node[0] == 0
+    # Still there: it turns along the edge once more.
+    assert robot.state.phase[0] == FACE and robot.state.run[0] == 1 and robot.state.node[0] == 0
     assert not robot.events[-1].glanced[0]
+    robot.step(0, p=0.9)
     for _ in range(50):
         robot.step(3, p=0.9)  # looks like node 3, which cannot be: of 0 and 1, 1 is more like it
     assert robot.events[-1].glanced[0] and robot.state.node[0] == 1 and robot.state.phase[0] == FACE
@@ -202,13 +250,101 @@ def test_a_blocked_edge_costs_more_and_another_way_is_taken():
     assert robot.state.penalty[0].sum() == nav.PENALTY
 
 
-def test_without_another_way_it_leaves_by_the_most_open_heading():
+def test_without_another_way_it_looks_all_round_and_leaves_by_the_most_open_heading():
     only = {(0, 1): 0.9, (1, 2): 0.9, (0, 2): 1e-6, (0, 3): 1e-6, (3, 2): 1e-6}
-    robot = Robot(square(only, swings=1, swing_deg=20.0), goal=2)
+    robot = Robot(square(only, swings=1, swing_deg=60.0), goal=2)
     robot.localise(0)
-    assert swings(robot, 0, lambda a: 0.4 if a == 20 else 0.2) == [0, 20, -20]
-    assert robot.state.phase[0] == LEAN and robot.state.target_rad[0] == pytest.approx(math.radians(20))
+    assert swings(robot, 0, lambda a: 0.4 if a == 60 else 0.2) == [0, 60, -60]
+    assert robot.state.phase[0] == SWING and robot.state.penalty[0].sum() == nav.PENALTY
+    assert swings(robot, 0, lambda _: 0.3) == [120, -120, -180]
+    assert robot.state.phase[0] == LEAN and robot.state.target_rad[0] == pytest.approx(math.radians(60))
     assert robot.step(0, 0.2) == DRIVE
+    # Blocked once more it costs no more, and behind it is a way out.
+    for _ in range(50):
+        robot.step(0, 0.2)
+    assert swings(robot, 0, lambda _: 0.2) == [0, 60, -60]
+    assert swings(robot, 0, lambda a: 0.5 if a == -120 else 0.2) == [120, -120]
+    assert robot.state.phase[0] == DRIVE and robot.state.penalty[0].sum() == nav.PENALTY + 1.0  # of the run in vain
+
+
+def driven(robot, node, runs=1, p=0.9):
+    """Faces the edge and drives along it, found at a node after each run; the edge's ends."""
+    robot.step(robot.state.node[0], p)
+    assert robot.state.phase[0] == DRIVE
+    edge = robot.navigator.map.edges[robot.state.edge[0]].tolist()
+    while runs:
+        robot.step(node, p)
+        runs -= int(robot.events[-1].run_ended[0])
+    return edge
+
+
+def test_an_edge_driven_in_vain_costs_more_each_time():
+    robot = Robot(square({(0, 1): 0.9, (1, 2): 0.9}, retry_cost=0.3), goal=2)
+    robot.localise(0)
+    # By node 1: -2 log 0.9 = 0.21; straight: -log 0.5 = 0.69.
+    assert driven(robot, 0) == [0, 1]
+    assert driven(robot, 0) == [0, 1]  # 0.51
+    assert driven(robot, 0) == [0, 2]  # 0.81 by node 1
+    assert driven(robot, 0) == [0, 1]  # 0.99 straight
+    assert driven(robot, 1) == [0, 2]  # 1.11 by node 1; and so it gets to node 1, nearer to its head than node 0
+    edges = robot.navigator.map.edges.tolist()
+    assert {tuple(e): c for e, c in zip(edges, robot.state.penalty[0], strict=True) if c} == pytest.approx(
+        {(0, 1): 0.9, (0, 2): 0.3}
+    )
+
+
+def test_a_success_forgets_nothing():
+    robot = Robot(square({(0, 1): 0.9, (1, 2): 0.9}, retry_cost=0.2), goal=2)
+    robot.localise(0)
+    assert [driven(robot, node) for node in (0, 1)] == [[0, 1], [0, 1]]
+    assert robot.state.node[0] == 1 and robot.state.penalty[0].sum() == pytest.approx(0.2)
+
+
+def test_without_glances_the_localisation_judges_the_edge():
+    robot = Robot(square({(0, 1): 0.9, (1, 2): 0.9}, glance=False, retry_cost=1.0), goal=2)
+    robot.localise(0)
+    assert driven(robot, 3, runs=12) == [0, 1]
+    assert robot.state.penalty[0].sum() == 0.0  # not known yet
+    robot.localise(0)
+    assert robot.state.penalty[0].sum() == 1.0 and driven(robot, 1, runs=12) == [0, 2]
+
+
+class Line:
+    """Images are (x, p): how far along a line of nodes 2 m apart they were taken."""
+
+    summed = True
+
+    def distances(self, images, heading_rad):
+        return np.abs(images[:, :1] - 2.0 * np.arange(3))
+
+    def passage(self, images, ahead_m):
+        return np.broadcast_to(images[:, 1:2], ahead_m.shape)
+
+
+def line(**settings):
+    """Nodes 0 to 2 on a line, which `Line` sees."""
+    made = hand_map({}, ((0.0, 0.0), (2.0, 0.0), (4.0, 0.0)))
+    made = dataclasses.replace(made, embeddings=np.zeros((3, 6, 2), np.float32))
+    robot = Robot(Navigator(made, Line(), Counting(), NavigatorConfig(**{"images": 6, **settings})), goal=2)  # type: ignore[arg-type]
+    robot.localise(0.0)
+    robot.step(0.0, p=0.9)
+    assert robot.state.phase[0] == DRIVE
+    return robot
+
+
+def test_a_run_ends_where_the_edges_head_is_passed():
+    robot, x = line(), 0.0
+    while robot.state.phase[0] == DRIVE:
+        x = round(x + 0.07, 6)
+        robot.step(x, p=0.9)
+    # 3.5 m in 5 s. Looks every 0.5 s: at 0.35 (not yet node 1), ..., 1.75, 2.1: 0.10 m from it, 2.45: 0.45 m.
+    assert x == pytest.approx(2.45) and robot.events[-1].run_ended[0] and robot.events[-1].glanced[0]
+    assert robot.state.node[0] == 1 and robot.state.phase[0] == FACE and robot.state.run[0] == 1
+    robot, x = line(watch_s=0.0), 0.0
+    while robot.state.phase[0] == DRIVE:
+        x = round(x + 0.07, 6)
+        robot.step(x, p=0.9)
+    assert x == pytest.approx(3.5)
 
 
 def test_where_the_map_has_no_way_it_tries_headings_that_never_repeat():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topological_nav.learning import initial, variable_shapes
-from topological_nav.networks import Network, augmented, joined, vicreg_loss
+from topological_nav.networks import Network, augmented, falling, joined, vicreg_loss
 
 
 def sizes(network: Network, height: int = 224, width: int = 224) -> dict:
@@ -61,6 +61,23 @@ def test_max_pooling_before_normalising_by_hand():
     b = jnp.array([[[[0.0], [2.0]], [[1.0], [-7.0]]]])  # maximum 2
     assert joined((a, b))[0].tolist() == pytest.approx([0.6, 0.8, 1.0])
     assert joined((0 * a, b))[0].tolist() == [0.0, 0.0, 1.0]
+
+
+def test_outputs_for_lengths_never_rise():
+    # softplus of 0 is log 2, of log(e - 1) it is 1.
+    x = jnp.array([[3.0, 0.0, np.log(np.e - 1.0)], [-2.0, -50.0, 40.0]])
+    expected = [[3.0, 3.0 - np.log(2.0), 2.0 - np.log(2.0)], [-2.0, -2.0, -42.0]]
+    assert np.asarray(falling(x)) == pytest.approx(np.array(expected), abs=1e-5)
+    assert falling(x[:, :1]).tolist() == [[3.0], [-2.0]]
+
+
+@pytest.mark.parametrize("backbone", ["resnet18", "alexnet"])
+def test_detectors_have_an_output_a_length_that_cannot_contradict_the_next(backbone):
+    network = Network("passages", backbone, 4, outputs=5)
+    variables = initial(variable_shapes(network, (32, 48)), 1)
+    images = jnp.asarray(np.random.default_rng(1).integers(0, 256, (6, 32, 48, 3)), jnp.uint8)
+    logits = np.asarray(jax.jit(lambda v, x: network.apply(v, x))(variables, images))
+    assert logits.shape == (6, 5) and (np.diff(logits, axis=1) < 0).all()
 
 
 def test_vicreg_by_hand():

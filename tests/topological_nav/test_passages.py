@@ -1,4 +1,4 @@
-"""Passage labels by hand, balance, and splits that share no source."""
+"""Passage labels and lengths by hand, balance, and splits that share no source."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.scene import load_scene
+from tests.topological_nav.test_sight import two_rooms_space
 from topological_nav.config import DataConfig
-from topological_nav.passages import balanced, draw_passages, held_out
+from topological_nav.errors import SettingsError
+from topological_nav.passages import balanced, draw_passages, free_lengths, held_out, logits_at
 from topological_nav.rooms import find_rooms
 from topological_nav.space import free_space
 
@@ -16,14 +18,16 @@ from topological_nav.space import free_space
 def drawn(two_rooms):
     space = free_space(load_scene(two_rooms), 1.1)
     rooms = find_rooms(space, "kmeans", 2, None, 0, 0.2)
-    config = DataConfig(passage_length_m=1.5, passage_sources=8, passage_margin_m=0.1)
+    config = DataConfig(
+        passage_length_m=1.5, passage_lengths_m=(0.7, 1.5, 2.2), passage_sources=8, passage_margin_m=0.1
+    )
     return space, config, draw_passages(space, rooms, config, np.random.default_rng(0))
 
 
 def test_labels_are_the_plans(drawn):
     space, config, passages = drawn
     end = passages.xy_w + 1.5 * np.stack([np.cos(passages.heading_rad), np.sin(passages.heading_rad)], -1)
-    for xy, to, free in zip(passages.xy_w, end, passages.free, strict=True):
+    for xy, to, free in zip(passages.xy_w, end, passages.free[:, 1], strict=True):
         points = [xy + (to - xy) * i / 49 for i in range(50)]
         assert free == all(space.at(p) >= config.passage_margin_m - 1e-9 for p in points)
 
@@ -39,7 +43,7 @@ def test_sources_keep_clear_and_look_all_round(drawn):
 def test_both_splits_are_balanced_and_share_no_source(drawn):
     _, _, passages = drawn
     for held in (False, True):
-        mine = passages.free[passages.test == held]
+        mine = passages.free[passages.test == held, 1]
         assert len(mine) > 0 and mine.sum() * 2 == len(mine)
     assert not set(passages.source[passages.test]) & set(passages.source[~passages.test])
     places = [set(map(tuple, passages.xy_w[passages.test == held])) for held in (False, True)]
@@ -53,6 +57,65 @@ def test_a_wall_ahead_is_blocked_and_a_gap_is_free(drawn):
     gap = space.segment_free(np.array([-0.8, 1.5]), np.array([1.2, 1.5]), 50, 0.3)
     narrow = space.segment_free(np.array([-0.8, 1.5]), np.array([1.2, 1.5]), 50, 0.6)
     assert (bool(blocked), bool(gap), bool(narrow)) == (False, True, False)
+
+
+def test_labels_of_all_lengths_are_the_plans_and_never_free_again(drawn):
+    space, config, passages = drawn
+    step = np.stack([np.cos(passages.heading_rad), np.sin(passages.heading_rad)], -1)
+    every = [space.segment_free(passages.xy_w, passages.xy_w + m * step, 50, 0.1) for m in config.passage_lengths_m]
+    ruled = np.stack(every, -1)
+    # Where the rule itself does not contradict itself it is the label.
+    sure = (ruled[:, :-1] >= ruled[:, 1:]).all(1)
+    assert sure.mean() > 0.95 and (passages.free[sure] == ruled[sure]).all()
+    assert (passages.free[:, :-1] >= passages.free[:, 1:]).all()
+    # All four answers occur: blocked within 0.7 m, within 1.5 m, within 2.2 m, free.
+    assert set(passages.free.sum(1).tolist()) == {0, 1, 2, 3}
+
+
+def test_the_scored_length_decides_where_points_contradict_each_other():
+    """Rules for 1, 2, 3 and 4 m; 2 m is scored."""
+    ruled = {1.0: [0, 1, 0, 1], 2.0: [1, 0, 0, 1], 3.0: [0, 1, 0, 0], 4.0: [1, 1, 1, 1]}
+
+    class Ruled:
+        """Free space that answers by length."""
+
+        def segment_free(self, start, end, points, margin_m):
+            return np.array(ruled[round(float(np.linalg.norm(end[0] - start[0])), 6)], bool)
+
+    config = DataConfig(passage_length_m=2.0, passage_lengths_m=(1.0, 2.0, 3.0, 4.0))
+    free = free_lengths(Ruled(), np.zeros((4, 2)), np.zeros(4), config)  # type: ignore[arg-type]
+    expected = [[1, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [1, 1, 0, 0]]
+    assert free.astype(int).tolist() == expected
+
+
+def test_a_wall_1_3_m_ahead_is_free_for_a_metre():
+    """Walls stand 1.3 m ahead and 1.6 m behind; a way keeps 0.225 m from them."""
+    places = np.array([[-1.4, 0.0], [-1.4, 0.0]])
+    free = free_lengths(two_rooms_space(), places, np.array([0.0, np.pi]), DataConfig())
+    assert free.astype(int).tolist() == [[1, 1, 0, 0, 0], [1, 1, 0, 0, 0]]
+    wider = free_lengths(two_rooms_space(), places, np.array([0.0, np.pi]), DataConfig(passage_margin_m=0.0))
+    assert wider.astype(int).tolist() == [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0]]
+
+
+def test_logits_between_lengths_by_hand():
+    logits, own = np.array([[4.0, 2.0, -4.0], [1.0, 0.0, -1.0]]), (0.5, 1.0, 2.0)
+    assert logits_at(logits, own, np.array([1.0, 2.0])).tolist() == [2.0, -1.0]
+    # 0.75 m: half way from 4 to 2; 1.25 m: a quarter of the way from 0 to -1.
+    assert logits_at(logits, own, np.array([0.75, 1.25])).tolist() == [3.0, -0.25]
+    assert logits_at(logits, own, np.array([0.1, 9.0])).tolist() == [4.0, -1.0]
+    assert logits_at(logits, own, 1.5).tolist() == [-1.0, -0.5]
+    assert logits_at(logits, own, np.array([[0.5, 1.5], [2.0, 0.2]])).tolist() == [[4.0, -1.0], [-1.0, 1.0]]
+    assert logits_at(logits[:, :1], (2.0,), np.array([[0.5, 2.5], [1.0, 2.0]])).tolist() == [[4.0, 4.0], [1.0, 1.0]]
+    assert logits_at(logits[:0], own, np.zeros(0)).shape == (0,)
+
+
+def test_lengths_that_do_not_fit_are_refused():
+    with pytest.raises(SettingsError, match="passage_length_m is 1.2, expected one of passage_lengths_m .* add it"):
+        DataConfig(passage_length_m=1.2)
+    for wrong in ((), (2.0, 1.0), (1.0, 1.0, 2.0), (0.0, 2.0)):
+        with pytest.raises(SettingsError, match="expected ascending lengths from 0.05 m on"):
+            DataConfig(passage_lengths_m=wrong)
+    assert DataConfig().passage_column == 3
 
 
 def test_balance_by_hand():

@@ -2,6 +2,8 @@
 
 import math
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from interactive_nav.rendering.base import Lens
 from interactive_nav.rendering.mount import make_mount
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from topological_nav import rendering
 from topological_nav.errors import TopologicalError
-from topological_nav.rendering import BATCH, SceneRenderer, camera_pose, shrink
+from topological_nav.rendering import BATCH, SceneRenderer, batch_sizes, camera_pose, shrink
 
 
 def test_the_camera_stands_where_the_robots_mount_has_it():
@@ -71,3 +74,40 @@ def test_images_do_not_depend_on_how_many_are_drawn_at_once(painted):
     pose = camera_pose(robot, np.array([-1.5, 0.0]), np.linspace(0.0, 6.0, 8), np.zeros(8))
     few = SceneRenderer(scene, lens, batch=3).draw(pose)
     assert (few == SceneRenderer(scene, lens).draw(pose)).all() and few.std() > 10
+
+
+@pytest.mark.parametrize("by", [1, 2, 3, 5, 16])
+def test_shrinking_on_a_device_gives_the_same_levels(by):
+    images = np.random.default_rng(by).integers(0, 256, (3, 4 * by, 6 * by, 3), np.uint8)
+    images[0, :by, :by] = np.arange(by * by).reshape(by, by, 1) % 2  # means of a half, or near it
+    device = jax.jit(shrink, static_argnums=1)(jnp.asarray(images), by)
+    exact = images.reshape(3, 4, by, 6, by, 3).astype(float).mean((2, 4))
+    assert isinstance(device, jax.Array) and device.dtype == np.uint8
+    assert (np.asarray(device) == np.rint(exact)).all()
+    assert (shrink(images, by) == np.rint(exact)).all()
+
+
+def test_batches_grow_on_an_accelerator_as_far_as_memory_allows():
+    assert batch_sizes(Lens(640, 480, 60.0), "cpu") == (BATCH,)
+    assert batch_sizes(Lens(640, 480, 60.0), "gpu") == (8, 16, 32, 64, 128, 256)
+    assert batch_sizes(Lens(64, 48, 60.0), "gpu")[-1] == 2048
+    assert batch_sizes(Lens(4096, 4096, 60.0), "gpu") == (8,)
+
+
+def test_each_call_takes_the_least_batch_that_serves(painted, monkeypatch):
+    monkeypatch.setattr(rendering, "batch_sizes", lambda *_: (2, 4, 8))
+    asked, make = [], SceneRenderer._warp_painter
+
+    def noted(self, size):
+        paint = make(self, size)
+        return lambda pos, axes: asked.append(len(pos)) or paint(pos, axes)
+
+    monkeypatch.setattr(SceneRenderer, "_warp_painter", noted)
+    scene, lens, robot = load_scene(painted), Lens(16, 12, 60.0), get_robot("ttbot")
+    pose = camera_pose(robot, np.array([-1.5, 0.0]), np.linspace(0.0, 6.0, 19), np.zeros(19))
+    many = SceneRenderer(scene, lens, supersample=2)
+    images = many.draw(pose)
+    assert asked == [8, 8, 4]
+    monkeypatch.undo()
+    assert (images == SceneRenderer(scene, lens, supersample=2, batch=3).draw(pose)).all() and images.std() > 10
+    assert many.draw(camera_pose(robot, np.zeros((0, 2)), np.zeros(0), np.zeros(0))).shape == (0, 12, 16, 3)

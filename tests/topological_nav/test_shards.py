@@ -1,10 +1,13 @@
 """Images through files and back."""
 
+import threading
+
 import numpy as np
 import pytest
 
 from topological_nav import shards
 from topological_nav.errors import DatasetError
+from train.errors import TrainError
 
 
 def smooth(count: int, height: int = 16, width: int = 24) -> np.ndarray:
@@ -42,3 +45,46 @@ def test_a_damaged_file_is_refused_by_name(tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(DatasetError, match="rooms-000.npz: not readable .* delete it and run 'data' again"):
         shards.read_shard(path)
+
+
+def test_files_are_written_in_threads_and_told_in_order(tmp_path, monkeypatch):
+    write, told = shards.write_shard, []
+
+    def slow_first(path, sheets, quality):
+        if path.name == "0.npz":
+            second_done.wait(10)
+        size = write(path, sheets, quality)
+        if path.name == "1.npz":
+            second_done.set()
+        return size
+
+    second_done = threading.Event()
+    monkeypatch.setattr(shards, "write_shard", slow_first)
+    monkeypatch.setattr(shards, "THREADS", 2)
+    with shards.ShardWriter(100) as writer:
+        for k in range(4):
+            writer.put(tmp_path / f"{k}.npz", [smooth(k + 1)], lambda k=k: told.append(k))
+        writer.skip(lambda: told.append(4))
+    assert told == [0, 1, 2, 3, 4]
+    back = list(shards.read_shards([tmp_path / f"{k}.npz" for k in range(4)]))
+    assert all((images == smooth(k + 1)).all() for k, images in enumerate(back)) and len(back) == 4
+
+
+def test_a_stop_leaves_whole_files_only(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "THREADS", 1)
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), shards.ShardWriter(100) as writer:
+        for k in range(50):
+            writer.put(tmp_path / f"{k}.npz", [smooth(20)], stop if k == 2 else lambda: None)
+    there = sorted(tmp_path.iterdir())
+    assert 3 <= len(there) < 50
+    assert all(len(images) == 20 for images in shards.read_shards(there))
+
+
+def test_what_a_thread_could_not_write_is_said(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(TrainError, match="cannot be written"), shards.ShardWriter(100) as writer:
+        writer.put(tmp_path / "taken" / "0.npz", [smooth(2)], lambda: None)

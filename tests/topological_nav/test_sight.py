@@ -10,6 +10,7 @@ from topological_nav.build import localisation_check
 from topological_nav.errors import MapError
 from topological_nav.sight import OUT_OF_SIGHT_M, NetworkSight, PassagePolicy, TrueSight
 from topological_nav.space import FreeSpace
+from topological_nav.training import Trained
 
 
 def two_rooms_space() -> FreeSpace:
@@ -22,11 +23,11 @@ def two_rooms_space() -> FreeSpace:
     return FreeSpace(clearance(free, 0.1), 0.1, (-3.1, -2.1))
 
 
-class Fake:
-    """A network: an image's first numbers are its embedding, or its logit."""
+class Fake(Trained):
+    """A network: an image's first numbers are its embedding, or its logits for 1 and 2 m."""
 
     def __init__(self, digest):
-        self.about = {"digest": digest}
+        super().__init__(None, {}, {"digest": digest, "lengths_m": [1.0, 2.0]})  # type: ignore[arg-type]
 
     def embed(self, images):
         return np.asarray(images, np.float32)
@@ -60,7 +61,12 @@ def test_nearest_images_are_compared_with_all(made):
     expected = [[min(np.linalg.norm(i - e) for e in made.embeddings[n]) for n in range(4)] for i in images]
     assert sight.distances(images, np.zeros(3)) == pytest.approx(np.array(expected), rel=1e-5)
     assert not sight.summed
-    assert sight.passage(np.array([[0.0], [np.log(3.0)]])) == pytest.approx([0.5, 0.75])
+    asked = np.array([[np.log(3.0), 0.0], [np.log(3.0), -np.log(3.0)]])
+    assert sight.passage(asked, np.array([0.5, 1.5])) == pytest.approx([0.75, 0.5])
+    assert sight.passage(asked, 2.0) == pytest.approx([0.5, 0.25])
+    assert sight.passage(asked, np.array([[2.0, 1.0], [1.0, 3.0]])) == pytest.approx(
+        np.array([[0.5, 0.75], [0.75, 0.25]])
+    )
 
 
 def test_a_map_of_other_networks_is_refused(made):
@@ -95,7 +101,7 @@ def test_how_well_a_map_localises_by_hand():
 
 def test_the_truth_sees_nodes_and_ways():
     made = hand_map({}, ((-1.0, 0.0), (1.0, 0.0), (1.0, 1.5), (-1.0, 1.5)))
-    sight = TrueSight(made, two_rooms_space(), ahead_m=1.0, margin_m=0.225)
+    sight = TrueSight(made, two_rooms_space(), margin_m=0.225)
     poses = np.array([[-1.0, 1.5, 0.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, np.pi]])
     found = sight.distances(poses, np.zeros(3))
     # From (-1, 1.5) the gap shows (1, 1.5); the wall hides (1, 0). From (-1, 0) it hides both beyond.
@@ -103,13 +109,21 @@ def test_the_truth_sees_nodes_and_ways():
     assert found[0] == pytest.approx([1.5, hidden + 2.5, 2.0, 0.0])
     assert found[1] == pytest.approx([0.0, hidden + 2.0, hidden + 2.5, 1.5])
     # 1 m through the gap is free; 1 m to the wall leaves no margin; 1 m to the far side does.
-    assert sight.passage(poses).tolist() == [1.0, 0.0, 1.0]
+    assert sight.passage(poses, 1.0).tolist() == [1.0, 0.0, 1.0]
+    # To the wall's side at x = -0.1 are 0.9 m, less 0.225 m: 0.6 m are free, 0.8 m not; to the outer wall 1.9 m.
+    assert sight.passage(poses, np.array([1.5, 0.6, 1.7])).tolist() == [1.0, 1.0, 1.0]
+    both = np.array([[1.5, 5.0], [0.6, 0.8], [1.7, 1.9]])
+    assert sight.passage(poses, both).tolist() == [[1.0, 0.0], [1.0, 0.0], [1.0, 0.0]]
+    # 0.15 m from the wall on the left (the middle of the nearest free cell): along it and towards it not, away from it.
+    near = np.array([[-2.85, 0.0, angle] for angle in (np.pi / 2, np.pi, 0.0, np.pi / 4, 3 * np.pi / 4)])
+    assert sight.passage(near, np.full(5, 1.0)).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0]
 
 
 class Gate:
-    """A sight whose images are the probability itself."""
+    """A sight whose images are the probability itself; who asks for 1 m is told it."""
 
-    def passage(self, images):
+    def passage(self, images, ahead_m):
+        assert ahead_m == 1.0
         return images[:, 0]
 
 

@@ -11,7 +11,7 @@ from topological_nav import training
 from topological_nav.config import TrainConfig
 from topological_nav.data import load_passages, load_rooms
 from topological_nav.errors import RunError
-from topological_nav.learning import compiled_epoch, in_batches
+from topological_nav.learning import compiled_epoch, in_batches, padded_size
 from topological_nav.settings import overridden
 from train.run_folder import read_metrics
 
@@ -46,6 +46,38 @@ def test_passages_are_told_better_than_by_chance(made):
     confusion, passages = np.array(results["confusion"]), load_passages(made.data)
     assert confusion.sum(1).tolist() == [passages.test.sum() / 2] * 2
     assert np.trace(confusion) / confusion.sum() == pytest.approx(results["groups"]["all"]["accuracy"])
+    # The scored length is one of all; what is free so far is of the dataset.
+    lengths = results["lengths"]
+    assert [row["ahead_m"] for row in lengths] == [0.6, 1.2, 1.8]
+    assert lengths[1]["accuracy"] == pytest.approx(results["groups"]["all"]["accuracy"])
+    free = passages.free[passages.test].mean(0)
+    assert [row["free"] for row in lengths] == pytest.approx(free.tolist())
+    trained = training.load_trained(made.passages)
+    assert trained.about["lengths_m"] == [0.6, 1.2, 1.8] and trained.about["outputs"] == 3
+    logits = trained.logits(passages.images[passages.test])
+    assert (np.diff(logits, axis=1) <= 0).all() and lengths[1]["free"] == 0.5
+    asked = trained.passage(passages.images[passages.test], np.array([[1.2, 0.9]]).repeat(len(logits), 0))
+    between = np.stack([logits[:, 1], 0.5 * (logits[:, 0] + logits[:, 1])], -1)
+    assert asked == pytest.approx(1 / (1 + np.exp(-between)), abs=1e-6)
+
+
+def test_scores_of_lengths_by_hand():
+    logits = np.array([[1.0, -1.0], [2.0, 1.0], [-1.0, -2.0], [0.5, 0.4]])
+    free = np.array([[1, 0], [1, 0], [1, 0], [1, 1]])
+    assert training.length_scores(logits, free, (1.0, 2.0)) == [
+        {"ahead_m": 1.0, "free": 1.0, "accuracy": 0.75},
+        {"ahead_m": 2.0, "free": 0.25, "accuracy": 0.75},
+    ]
+
+
+def test_a_detector_that_does_not_say_its_lengths_is_refused(made, tmp_path):
+    run = tmp_path / "old"
+    shutil.copytree(made.passages, run)
+    about = json.loads((run / "network.json").read_text())
+    del about["lengths_m"]
+    (run / "network.json").write_text(json.dumps(about))
+    with pytest.raises(RunError, match="does not say for which lengths .* make its dataset again and train it again"):
+        training.load_trained(run)
 
 
 @pytest.fixture(scope="module")
@@ -142,8 +174,15 @@ def test_one_program_an_epoch_does_what_one_an_update_does(monkeypatch):
         assert float(learner) == 12.0 and float(told["sum"]) == pytest.approx(20 / 3)
 
 
-@pytest.mark.parametrize("count", [1, 64, 65, 150])
+@pytest.mark.parametrize("count", [1, 8, 9, 64, 65, 150])
 def test_any_number_of_images_goes_through_fixed_batches(count):
     images = np.arange(count, dtype=np.uint8)[:, None, None, None] * np.ones((1, 2, 2, 3), np.uint8)
     rows = in_batches(lambda x: x.mean((1, 2, 3))[:, None], images)
     assert rows[:, 0].tolist() == list(range(count))
+
+
+def test_batches_of_few_sizes_hold_any_number(monkeypatch):
+    sizes = {"cpu": [1, 2, 4, 8, 64, 128], "gpu": [16, 16, 16, 16, 64, 256]}
+    for backend, expected in sizes.items():
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        assert [padded_size(n) for n in (1, 2, 3, 8, 64, 65)] == expected

@@ -222,7 +222,17 @@ def test_a_map_of_collected_images_has_their_positions_as_nodes(made, tmp_path, 
     detector = load_trained(made.passages)
     a, angle = read.edges[7, 0], read.angle_rad[7]
     turn = round(float(angle) / (2 * np.pi / 18)) % 18
-    assert read.p[7] == pytest.approx(1 / (1 + np.exp(-detector.logits(level[a][[turn]])[0, 0])), abs=1e-5)
+    logit = np.interp(away[7], [0.6, 1.2, 1.8], detector.logits(level[a][[turn]])[0])
+    assert read.p[7] == pytest.approx(1 / (1 + np.exp(-logit)), abs=1e-5)
+    # Edges judged by one image: the longer one is the less likely to be free.
+    turns = np.rint(read.angle_rad / (2 * np.pi / 18)).astype(int) % 18
+    keys, pairs = list(zip(read.edges[:, 0].tolist(), turns.tolist(), strict=True)), 0
+    for i, key in enumerate(keys):
+        for j in range(i):
+            if keys[j] == key and abs(away[i] - away[j]) > 0.05 and max(away[i], away[j]) < 1.8:
+                pairs += 1
+                assert (read.p[i] < read.p[j]) == (away[i] > away[j])
+    assert pairs > 3
     mean = localisation(trained, rooms)["mean"]
     assert f"held-out images localised: nearest node {mean['node']:.3f}, right room {mean['room']:.3f}" in said
     assert np.asarray(Image.open(out.with_suffix(".png")).convert("RGB")).std() > 10
@@ -251,6 +261,13 @@ def test_what_does_not_fit_is_refused(made, adapted, painted, tmp_path, capsys):
         AdaptConfig(domain="fog")
     with pytest.raises(RunError, match="was trained for 'rooms', expected a run of 'train passages'"):
         transfer.passage_configurations(made.rooms, made.data, tmp_path / "x", SHORT)
+    other = tmp_path / "other"
+    shutil.copytree(made.data, other)
+    header = json.loads((other / "dataset.json").read_text())
+    header["settings"]["passage_lengths_m"] = [1.2, 1.8, 2.5]
+    (other / "dataset.json").write_text(json.dumps(header))
+    with pytest.raises(DatasetError, match=r"detector judges \[0.6, 1.2, 1.8\]; make it again with passage_lengths_m="):
+        transfer.passage_configurations(made.passages, other, tmp_path / "y", SHORT)
     with pytest.raises(MapError, match="was trained for 'rooms'"):
         transfer.collected_map(made.scene, made.data, made.rooms, made.rooms, SHORT)
     changed = tmp_path / "painted"

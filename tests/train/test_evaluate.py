@@ -95,7 +95,7 @@ def second(run, tmp_path_factory):
 
 
 def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, evaluated, tmp_path):
-    """One environment, compiled once; a file a run, with the rows that each has alone; pandas reads the folder."""
+    """One environment, compiled once; a file a run, with the rows that it has alone; pandas and DuckDB read all."""
     pandas = pytest.importorskip("pandas")
     built = []
 
@@ -130,6 +130,12 @@ def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, ev
     alone = pq.read_table(evaluated).to_pandas().query("policy == 'learned'")
     both = frame.query("run == 'toy'").sort_values("episode")
     np.testing.assert_allclose(both["robot_path_m"], alone["robot_path_m"], rtol=1e-5)
+    duckdb = pytest.importorskip("duckdb")
+    query = f"""select run, count(*), avg("ins_0.5") from '{tmp_path}/*.parquet' group by run order by run"""
+    means = frame.groupby("run")["ins_0.5"].mean()
+    assert duckdb.sql(query).fetchall() == [
+        (name, 12, pytest.approx(means[name], rel=1e-6)) for name in ("other", "toy")
+    ]
     # The same question replaces its file, another one adds to the folder.
     files = {path.name for path in tmp_path.glob("*.parquet")}
     assert len(files) == 2

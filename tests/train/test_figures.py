@@ -115,6 +115,20 @@ def test_the_plane_has_cells_in_front_of_what_never_learned():
     assert texts == {"w=0", "w=0.5", "w=1", "follower"}
 
 
+def test_what_lies_far_from_the_runs_is_named_beside_them():
+    """All runs within 0.02 of each other: who never learned would squeeze them into one blot."""
+    runs = [run_rows("turtlebot", a, 0.1, 0, p, (0.98, 0.98)) for a, p in (("ppo", 0.95), ("sac", 0.96))]
+    known = yardstick_rows()
+    known = known.filter(pa.array([name == "follower" for name in known["policy"].to_pylist()]))
+    rows = pa.concat_tables([*runs, known], promote_options="permissive")
+    figure = scores.efficiency_plane(rows, "turtlebot", "test")
+    (axis,) = figure.axes
+    (told,) = [text.get_text() for text in axis.texts if "outside" in text.get_text()]
+    assert told == "outside: follower (0.85, 0.55)"
+    assert axis.get_ylim()[0] > 0.9 and "mean of 1 seed," in axis.get_title() and "steps of 0.01" in axis.get_title()
+    assert [style.seeds_text(counts) for counts in ({3}, {1, 2}, set())] == ["3 seeds", "1-2 seeds", "0 seeds"]
+
+
 def test_learning_curves_meet_at_the_steps_all_seeds_have():
     runs = [
         [{"env_steps": t, "s": v} for t, v in ((0, 0.0), (100, 1.0), (200, 1.0))],

@@ -147,6 +147,7 @@ def test_rows_and_file(tmp_path):
 def test_rows_of_many_files_are_one_table(tmp_path):
     one = pa.table({"run": ["a"] * 2, "policy": ["learned"] * 2, "evaluation_seed": [1] * 2, "scene": ["s"] * 2})
     one = one.append_column("episode", pa.array([0, 1])).append_column("success", pa.array([1.0, 0.0]))
+    one = one.append_column("robot", pa.array(["turtlebot"] * 2))
     write_parquet(one, tmp_path / "a.parquet", {"asked": "x"})
     # The same episodes again: the later file counts. And a column that the other lacks.
     again = one.set_column(5, "success", pa.array([0.5, 0.5])).append_column("lifted", pa.array([1.0, 0.0]))
@@ -155,6 +156,10 @@ def test_rows_of_many_files_are_one_table(tmp_path):
     rows = read_rows([tmp_path / f"{name}.parquet" for name in "cab"]).to_pydict()
     assert rows["policy"] == ["learned"] * 2 + ["random"] * 2
     assert rows["success"] == [0.5, 0.5, 1.0, 0.0] and rows["lifted"] == [1.0, 0.0, None, None]
+    # Another robot's episodes of the same policy are others.
+    write_parquet(one.set_column(6, "robot", pa.array(["fetch"] * 2)), tmp_path / "e.parquet")
+    rows = read_rows([tmp_path / f"{name}.parquet" for name in "ae"]).to_pydict()
+    assert rows["robot"] == ["turtlebot"] * 2 + ["fetch"] * 2
     assert read_notes(tmp_path / "a.parquet") == {"asked": "x"} and read_notes(tmp_path / "b.parquet") == {}
     (tmp_path / "d.parquet").write_bytes(b"PAR1 not")
     assert read_notes(tmp_path / "d.parquet") == {}

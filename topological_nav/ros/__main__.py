@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from scenes_mjcf.schema import SceneError
-from topological_nav.config import NavigatorConfig
+from topological_nav.config import RUNS, NavigatorConfig
 from topological_nav.errors import TopologicalError
 from topological_nav.ros import debian, launch
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
@@ -27,7 +27,6 @@ from train.signals import stop_signals
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
 """Driver -> its settings."""
-RUNS = Path("runs/topological")
 _DELIVERY_S = 1.0
 """Between the last message and the end of a node: rospy sends in threads of their own."""
 
@@ -93,25 +92,31 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _add_journey(sub: argparse.ArgumentParser) -> None:
     group = sub.add_argument_group("driver topological")
     group.add_argument("--map", type=Path, metavar="PATH", help="of `python -m topological_nav map`")
-    group.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
-    group.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
-    group.add_argument("--policy", default="passage", metavar="RUN", help="drives along edges (default: passage)")
+    group.add_argument("--localiser", type=Path, metavar="RUN", help=f"embeds images (default {RUNS}, or packaged)")
+    group.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
+    group.add_argument(
+        "--policy", metavar="RUN", help="drives along edges; or passage (default: as the networks, if none is named)"
+    )
     group.add_argument("--goal", type=Path, action="append", default=[], metavar="PICTURE", help="taken at the goal")
     group.add_argument("--goal-heading", type=float, default=0.0, metavar="RAD", help="along which the first was")
 
 
 def _journey(arguments: argparse.Namespace) -> Any:
+    from topological_nav.packaged import choose
     from topological_nav.ros.pilot import Journey
 
     if arguments.map is None:
         raise TopologicalError("--driver topological needs a map: --map PATH")
+    chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
+    if chosen.told:
+        _tell(chosen.told)
     return Journey(
         arguments.map,
-        arguments.localiser,
-        arguments.detector,
+        chosen.localiser,
+        chosen.detector,
         tuple(arguments.goal),
         arguments.goal_heading,
-        arguments.policy,
+        chosen.policy,
     )
 
 

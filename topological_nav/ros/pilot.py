@@ -11,7 +11,7 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from topological_nav.build import camera_of
-from topological_nav.config import NavigatorConfig
+from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
 from topological_nav.data import lens_of
 from topological_nav.errors import SettingsError
 from topological_nav.graph import load_map
@@ -20,8 +20,6 @@ from topological_nav.ros.drivers import PilotDriver
 from topological_nav.ros.messages import seen_through
 from topological_nav.sight import NetworkSight, PassagePolicy
 from topological_nav.training import load_trained
-
-PASSAGE_POLICY = "passage"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +51,12 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
     lens = lens_of(camera, get_robot(camera.robot))
     sight = NetworkSight(made, *networks, config.match)
     if journey.policy == PASSAGE_POLICY:
-        policy = PassagePolicy(sight, config.passable)
+        policy = PassagePolicy(sight, config.passable, config.clear_m)
     else:
         from topological_nav import driving
 
-        policy = driving.load_policy(Path(journey.policy))
+        seeing = (journey.localiser, networks[0]), (journey.detector, networks[1])
+        policy = driving.load_policy_beside(journey.policy, *seeing)
     if not journey.goals:
         raise SettingsError("the navigator has no goal; name a picture taken there: --goal PICTURE")
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in journey.goals])

@@ -147,6 +147,9 @@ def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping
             for k in k_ints
         ]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-        told = "-".join(str(n) for n in sorted({min(seeds), max(seeds)})) if seeds else "0"
-        figure.suptitle(f"training episodes (exploring policy); mean of {told} seeds, 95 % t interval", fontsize=9)
+        figure.suptitle(
+            f"training episodes that ended (exploring policy), mean of {style.seeds_text(seeds)}, 95 % t interval\n"
+            "before all environments have had the time of a whole episode, those that end are those that succeed",
+            fontsize=9,
+        )
     return figure

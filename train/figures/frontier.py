@@ -49,7 +49,7 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
         axis.legend(loc="lower left", fontsize=8)
     low_x, low_y = axis.get_xlim()[0], axis.get_ylim()[0]
     equal_ins(axis)
-    axis.set_xlim(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.09)
+    axis.set_xlim(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.12)
     axis.set_ylim(low_y, 1.02)
     axis.set_xlabel("P$_{eff}$: shortest path over path driven, 0 on failure")
     axis.set_ylabel("E$_{eff}$: effort efficiency")
@@ -57,8 +57,8 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
     return figure
 
 
-def equal_ins(axis: Axes) -> None:
-    """Lines of equal INS_0.5, in steps of 0.1."""
+def equal_ins(axis: Axes, step: float = 0.1) -> None:
+    """Lines of equal INS_0.5."""
     p = np.array([-1.0, 2.0])
-    for level in np.arange(0.1, 1.0, 0.1):
+    for level in np.arange(step, 1.0, step):
         axis.plot(p, 2 * level - p, color="0.85", linewidth=0.7, zorder=0)

@@ -30,8 +30,7 @@ class Legend:
         self.robots = sorted({run.robot for run in means}, reverse=True)
         self.algorithms = style.in_order({run.algorithm for run in means})
         self.k_ints = sorted({run.k_int for run in means})
-        seeds = sorted({len(runs) for runs in cells(means).values()})
-        self.seeds = "-".join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1]))) if seeds else "0"
+        self.seeds = style.seeds_text({len(runs) for runs in cells(means).values()})
 
     def algorithm_handles(self) -> list[Line2D]:
         """For a legend."""
@@ -100,9 +99,7 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
             axis.tick_params(labelbottom=True)
         handles = [*has.algorithm_handles(), *has.k_int_handles()]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-        figure.suptitle(
-            f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds} seeds, 95 % t interval", fontsize=9
-        )
+        figure.suptitle(f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds}, 95 % t interval", fontsize=9)
     return figure
 
 
@@ -112,16 +109,16 @@ def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
     has = Legend(means)
     with style.applied():
         figure, axis = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
-        _yardsticks(axis, rows, robot, split)
         for algorithm in has.algorithms:
             colour, marker = style.look(style.ALGORITHMS, algorithm, has.algorithms)
             _chain(axis, [run for run in means if run.algorithm == algorithm], has.k_ints, colour, marker)
-        _finish_plane(axis)
+        _yardsticks(axis, rows, robot, split)
+        step = _finish_plane(axis)
         handles = [*has.algorithm_handles(), *_without_line(has.k_int_handles())]
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6))
         axis.set_title(
-            f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds} seeds, 95 % t intervals\n"
-            "grey lines: equal INS$_{0.5}$, steps of 0.1"
+            f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds}, 95 % t intervals\n"
+            f"grey lines: equal INS$_{{0.5}}$, steps of {step:g}"
         )
     return figure
 
@@ -150,7 +147,7 @@ def robots_plane(rows: pa.Table, split: str | None) -> Figure:
             for robot, (c, m) in looks.items()
         ]
         figure.legend(handles=[*handles, *_without_line(has.k_int_handles())], loc="outside lower center", ncols=5)
-        figure.suptitle(f"{SPLITS[split]}; mean of {has.seeds} seeds, 95 % t intervals", fontsize=9)
+        figure.suptitle(f"{SPLITS[split]}; mean of {has.seeds}, 95 % t intervals", fontsize=9)
     return figure
 
 
@@ -267,39 +264,72 @@ def _chain(axis: Axes, runs: Sequence[RunMean], k_ints: list[float], colour: str
 
 
 def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> None:
-    """Policies that never learned, in grey: the planner's weights as a line, the others as named points."""
+    """Policies that never learned, in grey: the planner's weights as a line, the others as named points.
+
+    What lies far from runs and planners is named in a corner instead: the runs would be one blot beside it.
+    """
     policy = np.asarray(rows["policy"].to_pylist())
     chosen = (policy != "learned") & (np.asarray(rows["robot"].to_pylist()) == robot)
     if split is not None:
         chosen &= np.asarray(rows["split"].to_pylist()) == split
     p, e = (rows[name].to_numpy() for name in ("path_efficiency", "effort_efficiency"))
-    line = []
-    for name in dict.fromkeys(policy[chosen]):
-        at = chosen & (policy == name)
-        place = float(p[at].mean()), float(e[at].mean())
+    places = {
+        name: (float(p[chosen & (policy == name)].mean()), float(e[chosen & (policy == name)].mean()))
+        for name in dict.fromkeys(policy[chosen])
+    }
+    line = [(float(name.partition(":")[2]), *place) for name, place in places.items() if name.startswith("namo:")]
+    near = _Around(axis, [place[1:] for place in line])
+    far = []
+    for name, place in places.items():
         kind, _, weight = name.partition(":")
-        if kind == "namo":
-            line.append((float(weight), *place))
-            label = f"w={float(weight):g}"
-        else:
-            label = name
+        if kind != "namo" and not near.holds(*place):
+            far.append(f"{name} ({place[0]:.2f}, {place[1]:.2f})")
+            continue
+        label = f"w={float(weight):g}" if kind == "namo" else name
         axis.plot(*place, marker="." if kind == "namo" else "x", color="0.45", zorder=2)
         axis.annotate(label, place, xytext=(4, -9), textcoords="offset points", fontsize=7, color="0.35")
     if line:
         points = np.array(sorted(line))[:, 1:]
         axis.plot(*points.T, color="0.45", linewidth=1.0, zorder=2)
+    if far:
+        text = "outside: " + ", ".join(far)
+        axis.text(0.02, 0.02, text, transform=axis.transAxes, fontsize=7, color="0.35")
 
 
-def _finish_plane(*axes: Axes) -> None:
-    """Labels, limits and lines of equal INS_0.5, once everything is drawn; the limits follow the data."""
+class _Around:
+    """What an axis shows, with some more places, and as much again about it."""
+
+    def __init__(self, axis: Axes, places: Sequence[tuple[float, float]]):
+        drawn = np.concatenate(
+            [np.asarray(line.get_xydata(), float) for line in axis.lines] + [np.reshape(places, (-1, 2))]
+        )
+        drawn = drawn[np.isfinite(drawn).all(1)]
+        self._low, self._high = drawn.min(0), drawn.max(0)
+        self._reach = np.maximum(self._high - self._low, 0.1)
+
+    def holds(self, x: float, y: float) -> bool:
+        """Whether a place lies inside."""
+        place = np.array([x, y])
+        return bool((place >= self._low - self._reach).all() and (place <= self._high + self._reach).all())
+
+
+def _finish_plane(*axes: Axes) -> float:
+    """Labels, limits and lines of equal INS_0.5, once everything is drawn; the limits follow the data.
+
+    Returns:
+        From one line to the next.
+    """
     x, y = axes[0].get_xlim(), axes[0].get_ylim()
+    more_x, more_y = 0.12 * (x[1] - x[0]), 0.12 * (y[1] - y[0])
+    step = 0.1 if x[1] - x[0] + y[1] - y[0] > 0.6 else 0.01
     for axis in axes:
-        equal_ins(axis)
-        axis.set_xlim(max(-0.02, x[0] - 0.03), min(1.03, x[1] + 0.03))
-        axis.set_ylim(max(-0.02, y[0] - 0.03), min(1.01, y[1] + 0.03))
+        equal_ins(axis, step)
+        axis.set_xlim(max(-0.02, x[0] - more_x), min(1.03, x[1] + more_x))
+        axis.set_ylim(max(-0.02, y[0] - more_y), min(1.01, y[1] + more_y))
         axis.grid(visible=False)
         axis.set_xlabel(style.P_LABEL)
         axis.set_ylabel(style.E_LABEL)
+    return step
 
 
 def _without_line(handles: list[Line2D]) -> list[Line2D]:

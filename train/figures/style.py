@@ -87,3 +87,9 @@ def name_of(algorithm: str) -> str:
 def robot_name(robot: str) -> str:
     """As papers write it."""
     return {"turtlebot": "TurtleBot", "fetch": "Fetch"}.get(robot, robot)
+
+
+def seeds_text(counts: set[int]) -> str:
+    """ "3 seeds", or "1-3 seeds" where cells differ."""
+    numbers = sorted({min(counts), max(counts)}) if counts else [0]
+    return "-".join(str(n) for n in numbers) + (" seed" if numbers == [1] else " seeds")

@@ -100,10 +100,9 @@ def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 
 def _keep_checkpoint(folder: SweepFolder, run: str, target: Path) -> None:
-    """Copies the checkpoint that was evaluated, without its environments."""
+    """Writes the policy of the checkpoint that was evaluated."""
     try:
         path, _ = checkpoint.find(folder.runs / run / "checkpoints", folder.sweep.config.evaluate.checkpoint)
     except CheckpointError:
         return
-    target.mkdir(parents=True)
-    shutil.copytree(path, target / path.name, ignore=shutil.ignore_patterns(checkpoint.ENV_STATE))
+    checkpoint.keep_policy(path, target / path.name)

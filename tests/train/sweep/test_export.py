@@ -50,7 +50,7 @@ def swept(tmp_path):
         if k_int == 0.0:
             meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, "ppo", "turtlebot", ("goal",), 3, 2)
             state = {"x": np.zeros(4)}
-            snapshot = type("S", (), {"learner": {"w": np.full(3, seed, np.float32)}, "env_state": state})()
+            snapshot = type("S", (), {"learner": {"params": {"w": np.full(3, seed, np.float32)}}, "env_state": state})()
             checkpoint.save(home / "checkpoints", snapshot, meta, 1, 1.0)
     return folder
 
@@ -67,7 +67,8 @@ def test_what_is_kept(swept, tmp_path, capsys):
         assert len(read_rows(list((out / "rows").glob("*.parquet")))) == 4 * 40
         assert sorted(path.name for path in (out / "runs").iterdir()) == [run.name for run in swept.sweep.runs]
         assert read_metrics(out / "runs" / "k_int1-seed0" / "metrics.jsonl") == [{"env_steps": 5, "episodes": 1.0}]
-        (kept,) = out.rglob("learner.msgpack")
+        (kept,) = out.rglob("policy.npz")
         assert kept.parts[-4] == "k_int0-seed1" and not list(out.rglob(checkpoint.ENV_STATE))
         path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
-        np.testing.assert_array_equal(checkpoint.load_learner(path, {"w": np.zeros(3, np.float32)})["w"], [1.0] * 3)
+        learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}})
+        np.testing.assert_array_equal(learner["params"]["w"], [1.0] * 3)

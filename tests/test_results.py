@@ -1,0 +1,61 @@
+"""The committed results: complete, traceable, small, and what docs/results.md says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from train.figures import tables
+from train.rows import read_rows
+from train.sweep import spec
+
+ROOT = Path(__file__).resolve().parents[1]
+SWEPT = ROOT / "results" / "kint"
+LIMIT_MIB = 15
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return read_rows(sorted(SWEPT.rglob("*.parquet")))
+
+
+def test_they_are_small():
+    assert sum(path.stat().st_size for path in (ROOT / "results").rglob("*") if path.is_file()) < LIMIT_MIB * 2**20
+
+
+def test_every_run_is_whole_and_says_where_it_comes_from():
+    """DuckDB reads the folder as it is: each run played the same hundred episodes in each of ten scenes."""
+    duckdb = pytest.importorskip("duckdb")
+    found = duckdb.sql(
+        f"""select run, count(*), count(distinct scene), sum(shortest_path_m), min(train_env_steps),
+        max(train_env_steps), any_value(train_device), any_value(train_commit)
+        from '{SWEPT}/rows/*.parquet' group by run"""
+    ).fetchall()
+    known = {run.name: run for run in spec.load("kint").runs}
+    assert len(found) >= 18 and {name for name, *_ in found} <= set(known)
+    for name, count, scenes, shortest_m, least, most, device, commit in found:
+        run = known[name]
+        assert (count, scenes) == (run_episodes := 1000, 10) and run_episodes == spec.load(
+            "kint"
+        ).config.evaluate.episodes
+        assert least == most >= run.config.run.num_timesteps, name
+        assert "H200" in device and len(commit) >= 7, name
+        robot = run.config.env.robot
+        same = [total for other, _, _, total, *_ in found if known[other].config.env.robot == robot]
+        assert shortest_m == pytest.approx(same[0], rel=1e-6), name
+        kept = SWEPT / "runs" / name
+        summary, versions = (json.loads((kept / f"{part}.json").read_text()) for part in ("summary", "versions"))
+        assert summary["completed"] and summary["env_steps"] == most and summary["wall_s"] > 0
+        assert versions["packages"]["mujoco-mjx"] and versions["commit"] == commit
+        assert (kept / "config.yaml").is_file() and len((kept / "metrics.jsonl").read_text().splitlines()) >= 10
+
+
+@pytest.mark.slow
+def test_the_document_has_the_tables_of_the_rows(rows):
+    written = (ROOT / "docs" / "results.md").read_text()
+    missing = [
+        line for line in tables.document(rows, "test").splitlines() if line.startswith("| ") and line not in written
+    ]
+    assert not missing, f"docs/results.md lacks {len(missing)} lines of `train.figures results/kint --tables`"

@@ -1,0 +1,99 @@
+"""What acting needs of a learner, small: a checkpoint of 9 to 18 MiB in, a file below 0.8 MiB out, and back.
+
+Optimisers, critics and targets are left out, weights are stored in half precision, and the two or three large matrices
+as 8-bit numbers with one scale an output. A policy read from such a file acts nearly as the original did; it cannot be
+trained further.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import flax.traverse_util
+import numpy as np
+
+from train.errors import CheckpointError
+from train.files import whole_file
+
+POLICY = "policy.npz"
+LARGE = 100_000
+"""Weight matrices with at least so many numbers are stored as 8-bit numbers."""
+SCALE = ":scale"
+_LEVELS = 127
+
+
+def acting_part(learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
+    """The leaves of a learner that its policy reads.
+
+    Args:
+        learner: nested dict of arrays, as `learner.msgpack` holds it.
+        algorithm: ppo, sac or ddpg.
+
+    Returns:
+        "params/policy/..." -> array.
+    """
+    flat: dict[str, Any] = flax.traverse_util.flatten_dict(dict(learner), sep="/")
+    if algorithm == "ppo":
+        return {k: v for k, v in flat.items() if k.startswith(("params/", "normalizer_params/")) and "/value/" not in k}
+    wanted = ["policy_params/", "normalizer_params/"]
+    if not any(k.startswith("policy_params/encoder/") for k in flat):  # it looks through the critics'
+        wanted.append("q_params/encoder/")
+    return {k: v for k, v in flat.items() if k.startswith(tuple(wanted))}
+
+
+def packed(leaves: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Large weights as i8 and, under `<name>:scale`, f32 scales of their last axis; others as f16; vectors as is."""
+    out: dict[str, np.ndarray] = {}
+    for name, leaf in leaves.items():
+        array = np.asarray(leaf)
+        if array.ndim < 2 or not np.issubdtype(array.dtype, np.floating):
+            out[name] = array
+            continue
+        if array.size < LARGE:
+            out[name] = array.astype(np.float16)
+            continue
+        scale = np.abs(array).max(tuple(range(array.ndim - 1))).astype(np.float32) / _LEVELS
+        scale[scale == 0] = 1.0
+        out[name] = np.rint(array / scale).astype(np.int8)
+        out[name + SCALE] = scale
+    return out
+
+
+def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Back from `packed`, to within half a scale."""
+    return {
+        name: array.astype(np.float32) * arrays[name + SCALE] if name + SCALE in arrays else array
+        for name, array in arrays.items()
+        if not name.endswith(SCALE)
+    }
+
+
+def write(source: Path, algorithm: str, target: Path) -> None:
+    """A `learner.msgpack` as a `policy.npz`."""
+    learner = flax.serialization.msgpack_restore(source.read_bytes())
+    with whole_file(target) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **packed(acting_part(learner, algorithm)))  # type: ignore[arg-type]
+
+
+def read(path: Path, template: Any) -> Any:
+    """A learner in the template's structure whose policy is the file's; what acting does not read is the template's.
+
+    Raises:
+        CheckpointError: damaged, or of another learner.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            leaves = unpacked({name: stored[name] for name in stored.files})
+    except Exception as error:  # noqa: BLE001  (zip and npy readers raise many kinds for a damaged file)
+        raise CheckpointError(f"{path}: not readable ({' '.join(str(error).split())[:200]})") from None
+    flat = flax.traverse_util.flatten_dict(flax.serialization.to_state_dict(template), sep="/", keep_empty_nodes=True)
+    unknown = sorted(set(leaves) - set(flat))
+    if unknown:
+        raise CheckpointError(
+            f"{path}: holds {unknown[0]}, which this learner has not; use the config that it was trained with"
+        )
+    nested = flax.traverse_util.unflatten_dict({**flat, **leaves}, sep="/")
+    return flax.serialization.from_state_dict(template, nested)
