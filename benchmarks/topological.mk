@@ -1,0 +1,117 @@
+# Topological navigation, everything that docs/topological.md reports at one size, as a graph of its commands:
+#
+#   make -f benchmarks/topological.mk -j 8 RUNS=runs/topological-full            on a GPU machine (SIZE=full)
+#   make -f benchmarks/topological.mk -j 2 SIZE=cpu RUNS=runs/topological-cpu    on two CPU cores
+#   make -f benchmarks/topological.mk -n ...                                     only shows the commands
+#
+# What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
+# PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes.
+
+PY ?= python
+SIZE ?= full
+RUNS ?= runs/topological-$(SIZE)
+PPO ?=
+SEEN = alder birch cedar elm hazel juniper linden maple
+UNSEEN = rowan willow
+ALL = $(SEEN) $(UNSEEN)
+
+ifeq ($(SIZE),full)
+  DATA = passage_sources=40
+  MORE_POSITIONS = positions=600 max_per_room=40 passage_sources=1
+  ROOMS = width=16 hidden=64 batch=128 learning_rate=1e-3 epochs=40
+  PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=60
+  ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=60
+  DRIVES = backend=native batch=3200
+  POLICY = projection=128
+  MAP = check=60
+  EVALUATION =
+  SECONDARY = episodes=25
+  FEATURES =
+else ifeq ($(SIZE),cpu)
+  IMAGES = width=64 height=48 supersample=2
+  DATA = $(IMAGES) max_per_room=4 passage_sources=16
+  MORE_POSITIONS = $(IMAGES) positions=300 max_per_room=8 passage_sources=1
+  ROOMS = width=16 hidden=64 batch=64 learning_rate=1e-3 epochs=10
+  PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=10
+  ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=10
+  DRIVES = $(IMAGES) backend=native drives=50 batch=400
+  POLICY = projection=128 learning_rate=3e-4 epochs=20
+  MAP = check=20
+  EVALUATION = episodes=8 limit_s=600
+  SECONDARY = episodes=4 limit_s=600
+  FEATURES = epochs=4
+else
+  $(error SIZE is '$(SIZE)', expected full or cpu)
+endif
+
+NAV = $(PY) -m topological_nav
+WITH = --localiser $(RUNS)/rooms --detector $(RUNS)/passages
+folders = $(addprefix scenes_mjcf/,$(1))
+log = $(RUNS)/log/$(notdir $@).txt
+# $(call run,COMMAND): its output goes to the log, its seconds to times.txt; the target is touched when it is done.
+run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s); \
+  if $(1) >>$(log) 2>&1; then echo "$(notdir $@) $$(( $$(date +%s) - began )) s" >>$(RUNS)/times.txt; touch $@; \
+  else code=$$?; echo "$(notdir $@) failed ($$code): $(log)"; tail -n 3 $(log); exit $$code; fi
+
+D = $(RUNS)/done
+.DEFAULT_GOAL := all
+.PHONY: all networks maps evaluation transfer
+all: networks maps $(D)/policy evaluation transfer $(D)/export
+networks: $(D)/rooms $(D)/rooms-selfsup $(D)/rooms-more $(D)/passages $(D)/alexnet
+maps: $(ALL:%=$(D)/map-%)
+evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
+transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
+
+$(D)/data:
+	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
+$(D)/data-more:
+	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-more $(MORE_POSITIONS))
+$(D)/drives:
+	$(call run,$(NAV) data --drives $(call folders,$(SEEN)) -o $(RUNS)/drives $(DRIVES))
+
+$(D)/rooms: $(D)/data
+	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms $(ROOMS))
+$(D)/rooms-selfsup: $(D)/data
+	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms-selfsup init=selfsup $(ROOMS))
+$(D)/rooms-more: $(D)/data-more
+	$(call run,$(NAV) train rooms --data $(RUNS)/data-more -o $(RUNS)/rooms-more $(ROOMS))
+$(D)/passages: $(D)/data
+	$(call run,$(NAV) train passages --data $(RUNS)/data -o $(RUNS)/passages $(PASSAGES))
+$(D)/alexnet: $(D)/data
+	$(call run,$(NAV) train passages --data $(RUNS)/data -o $(RUNS)/alexnet network=alexnet $(ALEXNET))
+
+$(D)/map-%: $(D)/rooms $(D)/passages
+	$(call run,$(NAV) map scenes_mjcf/$* $(WITH) -o $(RUNS)/maps/$*.npz $(MAP))
+$(D)/policy: $(D)/rooms $(D)/passages $(D)/drives
+	$(call run,$(NAV) train policy --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy $(POLICY))
+$(D)/policy-grid: $(D)/policy
+	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(POLICY))
+
+played = $(NAV) evaluate $(call folders,$(ALL)) --maps $(RUNS)/maps $(WITH) -o $(RUNS)/$(notdir $@)
+$(D)/evaluation: maps
+	$(call run,$(played) $(if $(PPO),--ppo $(PPO)) $(EVALUATION))
+$(D)/evaluation-policy: maps $(D)/policy
+	$(call run,$(played) --contenders dense --policy $(RUNS)/policy $(EVALUATION))
+$(D)/evaluation-ahead1: maps
+	$(call run,$(played) --contenders dense ahead_m=1 $(EVALUATION))
+
+# Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.
+$(D)/features: $(D)/rooms
+	$(call run,$(NAV) adapt features --data $(RUNS)/data --localiser $(RUNS)/rooms -o $(RUNS)/features $(FEATURES))
+$(D)/data-unseen:
+	$(call run,$(NAV) data $(call folders,$(UNSEEN)) -o $(RUNS)/data-unseen $(DATA))
+$(D)/adapted-passages: $(D)/passages $(D)/data-unseen
+	$(call run,$(NAV) adapt passages --target $(RUNS)/data-unseen --detector $(RUNS)/passages -o $(RUNS)/adapted-passages)
+ADAPTED = --localiser $(RUNS)/features --detector $(RUNS)/adapted-passages
+$(D)/unadapted-map-%: $(D)/rooms $(D)/passages $(D)/data-unseen
+	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(WITH) -o $(RUNS)/maps-unadapted/$*.npz)
+$(D)/adapted-map-%: $(D)/features $(D)/adapted-passages
+	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(ADAPTED) -o $(RUNS)/maps-adapted/$*.npz)
+driven = $(NAV) evaluate $(call folders,$(UNSEEN)) --contenders dense --domain camera -o $(RUNS)/$(notdir $@) $(SECONDARY)
+$(D)/evaluation-unadapted: $(UNSEEN:%=$(D)/unadapted-map-%)
+	$(call run,$(driven) --maps $(RUNS)/maps-unadapted $(WITH))
+$(D)/evaluation-adapted: $(UNSEEN:%=$(D)/adapted-map-%)
+	$(call run,$(driven) --maps $(RUNS)/maps-adapted $(ADAPTED))
+
+$(D)/export: $(D)/rooms $(D)/passages $(D)/policy
+	$(call run,$(NAV) export $(WITH) --policy $(RUNS)/policy --images $(RUNS)/data -o $(RUNS)/export)
