@@ -141,6 +141,30 @@ def test_learning_curves_meet_at_the_steps_all_seeds_have():
     np.testing.assert_allclose(curves.running_mean(np.array([[1.0, 2.0, 6.0, 3.0]]), 3), [[1.5, 3.0, 11 / 3, 4.5]])
 
 
+def test_goals_are_counted_by_the_steps_between_two_lines():
+    lines = [
+        {"env_steps": 1000, "episodes": 4.0, "episode/success": 0.5},
+        {"env_steps": 3000},  # none ended: unknown, and its steps are its own
+        {"env_steps": 3500, "episodes": 10.0, "episode/success": 0.9},
+    ]
+    rates = [line.get(curves.GOALS) for line in curves.with_goal_rate(lines)]
+    assert rates == [pytest.approx(2.0), None, pytest.approx(18.0)]
+    assert curves.GOALS not in lines[0]
+
+
+def test_a_row_of_panels_is_as_high_as_its_own_tallest_scene():
+    shapes = {0: (40, 80), 1: (120, 80), 2: (80, 80)}
+    made = {f"scene/{k}/traversable": np.ones(shape, bool) for k, shape in shapes.items()}
+    made |= {"learned/scene_index": np.array([0, 1, 2, 0])}
+    assert [paths._aspect(made, "learned", i) for i in range(4)] == [0.5, 1.5, 1.0, 0.5]
+
+
+def test_names_that_would_be_written_over_each_other_are_written_as_one():
+    named = [("w=1", (0.9, 1.0)), ("w=0", (0.5, 0.5)), ("w=0.5", (0.51, 0.49)), ("w=0.9", (0.5, 0.6))]
+    gathered = scores._gathered(named, np.array([1.0, 1.0]))
+    assert gathered == [("w=1", (0.9, 1.0)), ("w=0, w=0.5", (0.51, 0.49)), ("w=0.9", (0.5, 0.6))]
+
+
 def test_paths_side_by_side_are_of_the_same_episodes():
     one, other = record(0.0), record(1.0)
     other["learned/goal_xy_w"] = other["learned/goal_xy_w"] + np.array([[0, 0], [1, 1], [0, 0]])

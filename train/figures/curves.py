@@ -19,6 +19,11 @@ CURVES = (
     ("episode/ins_0.5", "INS$_{0.5}$"),
     ("episode/sum_reward", "episode reward"),
 )
+GOALS = "goals_per_1000_steps"
+CELL_CURVES = ((GOALS, "goals reached in 1,000 env steps"), *CURVES[1:])
+"""Of sweeps: their runs may end before every environment has had the time of a whole episode, and until then the
+episodes that end are those that succeed; goals reached in a number of steps count the others by their steps."""
+BOUNDS = {"episode/success": (0.0, 1.0), "episode/ins_0.5": (0.0, 1.0), GOALS: (0.0, np.inf)}
 SMOOTHED = 40
 """Curves of more points than this are drawn as running means over a twentieth of them."""
 
@@ -43,6 +48,16 @@ def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
     axes[0].legend(fontsize=8)
     figure.suptitle("training episodes (exploring policy), means over log intervals", fontsize=10)
     return figure
+
+
+def with_goal_rate(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Lines of metrics with `GOALS` where episodes ended: of the steps since the line before, the first since 0."""
+    out, before = [], 0.0
+    for line in lines:
+        steps, before = line["env_steps"] - before, line["env_steps"]
+        goals = line.get("episodes", 0.0) * line.get("episode/success", 0.0)
+        out.append({**line, GOALS: 1000.0 * goals / steps} if steps > 0 and "episodes" in line else dict(line))
+    return out
 
 
 def common_curve(runs: Sequence[Sequence[Mapping[str, Any]]], key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -79,7 +94,7 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
-    """Success, INS_0.5 and reward of training episodes over env steps: a line a cell, with its seeds' interval.
+    """Goals reached, INS_0.5 and reward of training episodes over env steps: a line a cell, with its seeds' interval.
 
     Args:
         cells: (robot, algorithm, k_int) -> lines of metrics of each of its runs.
@@ -88,13 +103,13 @@ def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping
     algorithms = style.in_order({cell[1] for cell in cells})
     k_ints = sorted({cell[2] for cell in cells})
     with style.applied():
-        size = (3.3 * len(CURVES), 2.5 * len(robots) + 0.7)
-        figure, grid = plt.subplots(len(robots), len(CURVES), figsize=size, squeeze=False, layout="constrained")
+        size = (3.3 * len(CELL_CURVES), 2.5 * len(robots) + 0.7)
+        figure, grid = plt.subplots(len(robots), len(CELL_CURVES), figsize=size, squeeze=False, layout="constrained")
         seeds = set()
         for (robot, algorithm, k_int), runs in sorted(cells.items()):
             colour, marker = style.look(style.ALGORITHMS, algorithm, algorithms)
-            for axis, (key, _) in zip(grid[robots.index(robot)], CURVES, strict=True):
-                steps, values = common_curve(runs, key)
+            for axis, (key, _) in zip(grid[robots.index(robot)], CELL_CURVES, strict=True):
+                steps, values = common_curve([with_goal_rate(lines) for lines in runs], key)
                 if not len(steps):
                     continue
                 values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
@@ -111,12 +126,14 @@ def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping
                     fillstyle=style.fill_of(k_int, k_ints),
                     linewidth=1.2,
                 )
-                bounds = (-np.inf, np.inf) if key == "episode/sum_reward" else (0.0, 1.0)
+                bounds = BOUNDS.get(key, (-np.inf, np.inf))
                 low, high = (np.clip([getattr(p, end) for p in points], *bounds) for end in ("low", "high"))
                 axis.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
         for row, robot in zip(grid, robots, strict=True):
-            for axis, (key, label) in zip(row, CURVES, strict=True):
-                if key != "episode/sum_reward":
+            for axis, (key, label) in zip(row, CELL_CURVES, strict=True):
+                if key == GOALS:
+                    axis.set_ylim(bottom=0.0)
+                elif key in BOUNDS:
                     axis.set_ylim(-0.02, 1.02)
                 axis.set_xlabel("environment steps")
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -31,13 +31,16 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
         episodes: which; the first ones where None.
     """
     policies = [str(name) for name in paths["policies"]]
-    chosen = list(episodes) if episodes is not None else range(min(most, len(paths[f"{policies[0]}/goal_xy_w"])))
+    count = len(paths[f"{policies[0]}/goal_xy_w"])
+    chosen = list(range(min(most, count))) if episodes is None else list(episodes)
     count = len(chosen)
     columns = min(count, 3)
     rows = -(-count // columns)
-    aspect = _aspect(paths)
-    size = (4.4 * columns, (4.0 * aspect + 0.9) * rows + 0.6)  # panels, their titles and labels, the legend
-    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    # A row is as high as its tallest scene, with titles and labels; below them the legend.
+    aspects = [_aspect(paths, policies[0], i) for i in chosen]
+    heights = [4.0 * max(aspects[k : k + columns]) + 0.9 for k in range(0, count, columns)]
+    size = (4.4 * columns, sum(heights) + 0.6)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", height_ratios=heights)
     for axis in grid.flat[count:]:
         axis.set_axis_off()
     for axis, i in zip(grid.flat, chosen, strict=False):
@@ -98,9 +101,9 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
     axis.set_ylabel("y [m]", fontsize=8)
 
 
-def _aspect(paths: Mapping[str, np.ndarray]) -> float:
-    shapes = [paths[name].shape for name in paths if name.endswith("/traversable")]
-    return float(np.clip(max(rows / columns for rows, columns in shapes), 0.5, 1.6))
+def _aspect(paths: Mapping[str, np.ndarray], policy: str, episode: int) -> float:
+    rows, columns = paths[f"scene/{int(paths[f'{policy}/scene_index'][episode])}/traversable"].shape
+    return float(np.clip(rows / columns, 0.5, 1.6))
 
 
 def side_by_side(records: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:

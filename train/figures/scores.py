@@ -279,7 +279,7 @@ def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> No
     }
     line = [(float(name.partition(":")[2]), *place) for name, place in places.items() if name.startswith("namo:")]
     near = _Around(axis, [place[1:] for place in line])
-    far = []
+    far, named = [], []
     for name, place in places.items():
         kind, _, weight = name.partition(":")
         if kind != "namo" and not near.holds(*place):
@@ -287,13 +287,32 @@ def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> No
             continue
         label = f"w={float(weight):g}" if kind == "namo" else name
         axis.plot(*place, marker="." if kind == "namo" else "x", color="0.45", zorder=2)
-        axis.annotate(label, place, xytext=(4, -9), textcoords="offset points", fontsize=7, color="0.35")
+        named.append((label, place))
+    for label, place in _gathered(named, near.reach):
+        long = "," in label  # to the left: on the right the axis ends
+        look = {"ha": "right" if long else "left", "fontsize": 7, "color": "0.35"}
+        axis.annotate(label, place, xytext=(-4 if long else 4, -9), textcoords="offset points", **look)
     if line:
         points = np.array(sorted(line))[:, 1:]
         axis.plot(*points.T, color="0.45", linewidth=1.0, zorder=2)
     if far:
         text = "outside: " + ", ".join(far)
         axis.text(0.02, 0.02, text, transform=axis.transAxes, fontsize=7, color="0.35")
+
+
+def _gathered(
+    named: Sequence[tuple[str, tuple[float, float]]], reach: np.ndarray
+) -> list[tuple[str, tuple[float, float]]]:
+    """Names of places so near that they would be written over each other, as one, beside the lowest of them."""
+    groups: list[list[tuple[str, tuple[float, float]]]] = []
+    for label, place in named:
+        close = (g for g in groups if (np.abs(np.subtract(place, g[0][1])) < np.array([0.12, 0.04]) * reach).all())
+        group = next(close, None)
+        if group is None:
+            groups.append([(label, place)])
+        else:
+            group.append((label, place))
+    return [(", ".join(sorted(label for label, _ in g)), min((p for _, p in g), key=lambda p: p[1])) for g in groups]
 
 
 class _Around:
@@ -305,12 +324,12 @@ class _Around:
         )
         drawn = drawn[np.isfinite(drawn).all(1)]
         self._low, self._high = drawn.min(0), drawn.max(0)
-        self._reach = np.maximum(self._high - self._low, 0.1)
+        self.reach = np.maximum(self._high - self._low, 0.1)
 
     def holds(self, x: float, y: float) -> bool:
         """Whether a place lies inside."""
         place = np.array([x, y])
-        return bool((place >= self._low - self._reach).all() and (place <= self._high + self._reach).all())
+        return bool((place >= self._low - self.reach).all() and (place <= self._high + self.reach).all())
 
 
 def _finish_plane(*axes: Axes) -> float:
