@@ -19,6 +19,7 @@ ifeq ($(SIZE),full)
   DATA = passage_sources=40
   MORE_POSITIONS = positions=600 max_per_room=40 passage_sources=1
   ROOMS = width=16 hidden=64 batch=128 learning_rate=1e-3 epochs=40
+  ROOMS_MORE = width=16 hidden=64 batch=128 learning_rate=1e-3 epochs=12
   PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=60
   ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=60
   DRIVES = backend=native batch=3200
@@ -31,9 +32,10 @@ else ifeq ($(SIZE),cpu)
   IMAGES = width=64 height=48 supersample=2
   DATA = $(IMAGES) max_per_room=4 passage_sources=16
   MORE_POSITIONS = $(IMAGES) positions=300 max_per_room=8 passage_sources=1
-  ROOMS = width=16 hidden=64 batch=64 learning_rate=1e-3 epochs=10
-  PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=10
-  ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=10
+  ROOMS = width=16 hidden=64 batch=64 learning_rate=1e-3 epochs=30
+  ROOMS_MORE = width=16 hidden=64 batch=64 learning_rate=1e-3 epochs=15
+  PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=30
+  ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=30
   DRIVES = $(IMAGES) backend=native drives=50 batch=400
   POLICY = projection=128 learning_rate=3e-4 epochs=20
   MAP = check=20
@@ -74,7 +76,7 @@ $(D)/rooms: $(D)/data
 $(D)/rooms-selfsup: $(D)/data
 	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms-selfsup init=selfsup $(ROOMS))
 $(D)/rooms-more: $(D)/data-more
-	$(call run,$(NAV) train rooms --data $(RUNS)/data-more -o $(RUNS)/rooms-more $(ROOMS))
+	$(call run,$(NAV) train rooms --data $(RUNS)/data-more -o $(RUNS)/rooms-more $(ROOMS_MORE))
 $(D)/passages: $(D)/data
 	$(call run,$(NAV) train passages --data $(RUNS)/data -o $(RUNS)/passages $(PASSAGES))
 $(D)/alexnet: $(D)/data

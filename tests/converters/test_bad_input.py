@@ -132,7 +132,9 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 FILES = ("table_0_visual.obj", "structure.png", "hull_0.obj", "scene.xml", "maps.npz", "scene.json")
 
 
-@pytest.mark.parametrize("suffix", FILES)
+@pytest.mark.parametrize(
+    "suffix", [f if f in ("structure.png", "scene.json") else pytest.param(f, marks=pytest.mark.heavy) for f in FILES]
+)
 def test_disk_full_at_any_file(pristine, tmp_path, capsys, cached, monkeypatch, suffix):
     """The write of one file fails half-way: what was there before stays, nothing else is left."""
     write_text, save, open_zip = Path.write_text, Image.Image.save, np.savez_compressed

@@ -83,6 +83,7 @@ def digest(folder: Path) -> dict[str, str]:
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
+@pytest.mark.heavy
 def test_scenes_are_made_kept_and_made_again_with_the_same_bytes(tmp_path, hull_cache, monkeypatch):
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
     (tmp_path / "recipes.yaml").write_text(TINY)

@@ -97,7 +97,9 @@ def assert_same(ours, theirs, where=""):
         np.testing.assert_allclose(ours, theirs, atol=1e-5, err_msg=where)
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+@pytest.mark.parametrize(
+    "mode", [pytest.param(AutoresetMode.SAME_STEP, marks=pytest.mark.heavy), AutoresetMode.NEXT_STEP]
+)
 def test_the_batch_equals_gymnasiums_own_vector_of_single_environments(settings, single, same_step, mode):
     """Observations, rewards, ends, infos, final observations and new episodes, over two episode ends."""
     envs = same_step if mode is AutoresetMode.SAME_STEP else vector(settings, mode)
@@ -180,6 +182,7 @@ def test_a_given_start_is_played(same_step):
     np.testing.assert_allclose(nav.robot_pos_w[1, :2], start.start_xy_w)
 
 
+@pytest.mark.heavy
 def test_arrays_stay_on_the_device_when_asked(settings):
     envs = InteractiveNavVectorEnv("turtlebot", num_envs=N, arrays="jax", **settings)
     first, _ = envs.reset(seed=7)

@@ -297,7 +297,7 @@ def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
         hold(contest, venues_of(contest))
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_in_a_real_home_true_sight_finds_most_goals(tmp_path):
     config = EvaluationConfig(backend="native", episodes=8, limit_s=600.0, batch=8)
     contest = Contest((Path(APARTMENT),), ("dense",), tmp_path, config, truth=True)

@@ -239,6 +239,7 @@ def test_a_map_of_collected_images_has_their_positions_as_nodes(made, tmp_path, 
     assert read.about["domain"]["zoom"] == 1.0
 
 
+@pytest.mark.heavy
 def test_commands_draw_and_go_on(made, alexnet, tmp_path, capsys):
     out = tmp_path / "features"
     words = ["adapt", "features", "--data", str(made.data), "--localiser", str(alexnet), "-o", str(out)]

@@ -17,12 +17,12 @@ def big_room(tmp_path_factory):
     return write_room(tmp_path_factory.mktemp("contract") / "room", (7.0, 6.0), (("chair", 2.5, 2.0, 5.0, 0.5),))
 
 
-FAST = ("fetch",)
-"""Compiled at every run; the others with the slow tests."""
+SHOWN = ("fetch", "turtlebot", "ttbot", "ant", "humanoid")
+"""Compiled at every run; the others with the heavy tests."""
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in interactive_nav.robot_names()]
+    "name", [n if n in SHOWN else pytest.param(n, marks=pytest.mark.heavy) for n in interactive_nav.robot_names()]
 )
 def test_every_robot_is_an_environment(name, big_room):
     env = interactive_nav.make(

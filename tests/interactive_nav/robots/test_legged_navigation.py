@@ -14,7 +14,10 @@ def room(tmp_path_factory):
     return write_room(tmp_path_factory.mktemp("walk") / "room", (6.0, 6.0), (("chair", 2.6, 2.6, 5.0, 0.5),))
 
 
-@pytest.mark.parametrize("name", ["ant", "humanoid", "minitaur", "quadrotor"])
+OTHERS = [pytest.param(name, marks=pytest.mark.heavy) for name in ("humanoid", "minitaur", "quadrotor")]
+
+
+@pytest.mark.parametrize("name", ["ant", *OTHERS])
 def test_the_follower_reaches_its_goal(name, room):
     env = interactive_nav.make(
         name,
