@@ -231,6 +231,9 @@ class NavigatorConfig:
     watch_s: float = 0.5
     """How often to look, within a run, whether the edge's head is passed (nearest of all, and getting farther), which
     ends the run; 0: never. Needs `glance`."""
+    metre_cost: float = 0.3
+    """Added to the cost of an edge, -log p, for each of its metres: of ways that are all but surely free the shorter is
+    taken; 0: the report's."""
     retry_cost: float = 1.0
     """Added to the cost of an edge each time that it was driven and the robot was then not found nearer to its head."""
     limit_s: float = 1800.0
@@ -253,7 +256,7 @@ class NavigatorConfig:
         require(self, "tolerance_deg", 0.1, 45.0)
         require(self, "run_s limit_s", 0.1, 1e6)
         require(self, "watch_s", 0.0, 1e6)
-        require(self, "retry_cost", 0.0, 1e6)
+        require(self, "retry_cost metre_cost", 0.0, 1e6)
         require(self, "kp ki kd", 0.0, 100.0)
         require(self, "max_turn_rad_s", 0.01, 10.0)
 

@@ -47,7 +47,7 @@ class Route:
     angles_rad: tuple[float, ...]
     """Absolute heading of each leg, one fewer than nodes."""
     cost: float
-    """Sum of the legs' -log p."""
+    """Sum of the legs' weights."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +71,8 @@ class TopologicalMap:
     """[E] f32 heading from the first node to the second, world frame."""
     about: dict[str, Any]
     """Settings, and the networks that made it."""
+    metre_cost: float = 0.0
+    """Added to the weight of an edge for each of its metres; belongs to who plans, not to the file."""
 
     @functools.cached_property
     def length_m(self) -> np.ndarray:
@@ -82,8 +84,9 @@ class TopologicalMap:
         """The edges with `weight`, `p` and `angle_rad`."""
         graph = nx.DiGraph()
         graph.add_nodes_from(range(len(self.xy_w)))
-        for (a, b), p, angle in zip(self.edges.tolist(), self.p.tolist(), self.angle_rad.tolist(), strict=True):
-            graph.add_edge(a, b, weight=edge_weight(p), p=p, angle_rad=angle)
+        rows = zip(self.edges.tolist(), self.weight.tolist(), self.p.tolist(), self.angle_rad.tolist(), strict=True)
+        for (a, b), weight, p, angle in rows:
+            graph.add_edge(a, b, weight=weight, p=p, angle_rad=angle)
         return graph
 
     def plan(self, start: int, goal: int) -> Route:
@@ -105,8 +108,8 @@ class TopologicalMap:
 
     @functools.cached_property
     def weight(self) -> np.ndarray:
-        """[E] -log p of the edges."""
-        return np.array([edge_weight(p) for p in self.p.tolist()])
+        """[E] -log p of the edges, and `metre_cost` for each metre."""
+        return np.array([edge_weight(p) for p in self.p.tolist()]) + self.metre_cost * self.length_m
 
     def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
         """The first edge of the cheapest way between two different nodes; -1 where there is none.

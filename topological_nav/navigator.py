@@ -145,7 +145,8 @@ class Navigator:
         around = made.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:
             raise SettingsError(f"images is {config.images}, expected a divisor of {around}, the map's images a node")
-        self.map, self.sight, self.policy, self.config = made, sight, policy, config
+        self.map = dataclasses.replace(made, metre_cost=config.metre_cost)
+        self.sight, self.policy, self.config = sight, policy, config
         self._tolerance = np.deg2rad(config.tolerance_deg)
         self._period = int(getattr(policy, "period", 1))
         self._near = np.eye(len(made.xy_w), dtype=bool)

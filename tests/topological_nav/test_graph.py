@@ -1,5 +1,6 @@
 """Maps by hand: weights, angles, ways, files; ways against another implementation of Dijkstra's algorithm."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -182,6 +183,7 @@ def test_the_next_edge_begins_the_cheapest_way_also_where_edges_were_refused(see
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0, 5, (9, 2))
     made = hand_map({tuple(e): rng.uniform(0.05, 0.95) for e in graph.near_pairs(xy, 2.9).tolist()}, xy)
+    made = dataclasses.replace(made, metre_cost=rng.choice([0.0, 0.2]))
     refused = rng.choice([0.0, 3.0], len(made.edges))
     for penalty in (None, np.zeros(len(made.edges)), refused):
         dense = np.zeros((9, 9))

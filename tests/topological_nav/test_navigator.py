@@ -46,7 +46,7 @@ def square(p=None, **settings):
     """A navigator on the square, 6 images a node."""
     made = hand_map(p or {}, SQUARE)
     made = dataclasses.replace(made, embeddings=np.zeros((4, 6, 2), np.float32))
-    return Navigator(made, Told(), Counting(), NavigatorConfig(**{"images": 6, **settings}))
+    return Navigator(made, Told(), Counting(), NavigatorConfig(**{"images": 6, "metre_cost": 0.0, **settings}))
 
 
 def seen(*rows):
@@ -291,6 +291,21 @@ def test_an_edge_driven_in_vain_costs_more_each_time():
     assert {tuple(e): c for e, c in zip(edges, robot.state.penalty[0], strict=True) if c} == pytest.approx(
         {(0, 1): 0.9, (0, 2): 0.3}
     )
+
+
+def test_of_ways_nearly_as_free_the_shorter_is_taken():
+    """From 0 to 2 of the square: 4 m by 1, or the diagonal of 2.83 m."""
+    ways = {(0, 1): 0.99, (1, 2): 0.99, (0, 2): 0.9}
+    for metre_cost, taken in (
+        (0.0, [0, 1]),  # 0.020 against 0.105
+        (0.05, [0, 1]),  # 0.220 against 0.247
+        (0.1, [0, 2]),  # 0.420 against 0.388
+    ):
+        navigator = square(ways, metre_cost=metre_cost)
+        assert navigator.map.edges[navigator.map.next_edge(0, 2)].tolist() == taken
+    # A wall is not driven into for being near: 4.605 + 0.283 against 0.420.
+    navigator = square({**ways, (0, 2): 0.01}, metre_cost=0.1)
+    assert navigator.map.edges[navigator.map.next_edge(0, 2)].tolist() == [0, 1]
 
 
 def test_a_success_forgets_nothing():
