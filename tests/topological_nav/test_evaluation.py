@@ -16,6 +16,7 @@ from interactive_nav.scene import load_scene
 from tests.topological_nav.test_sight import two_rooms_space
 from tests.toys import write_room
 from topological_nav import contest as contests
+from topological_nav import packaged
 from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.contest import Contest, Venue, hold, venues_of
@@ -280,7 +281,8 @@ def test_the_commands_draw_and_tell(first, toy, capsys, tmp_path):
         (["navigate", APARTMENT, "--truth", "--episode", "25"], "episode is 25, expected 0 to 24"),
     ],
 )
-def test_mistakes_are_one_line(words, told, capsys):
+def test_mistakes_are_one_line(words, told, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(packaged, "packaged_weights", lambda: tmp_path / "none")
     assert main(words) == 2
     error = capsys.readouterr().err
     assert error.startswith("topological_nav: ") and told in error and error.count("\n") == 1
