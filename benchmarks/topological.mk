@@ -37,7 +37,7 @@ else ifeq ($(SIZE),cpu)
   PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=30
   ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=30
   DRIVES = $(IMAGES) backend=native drives=50 batch=400
-  POLICY = hidden=256 projection=128 learning_rate=1e-3 epochs=30
+  POLICY = hidden=256 projection=128 learning_rate=1e-3 epochs=20
   MAP = check=20
   EVALUATION = episodes=8 limit_s=600
   SECONDARY = episodes=4 limit_s=600
