@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from topological_nav.scores import differences, markdown, summary
 from train.figures import tables
 from train.rows import read_rows
 from train.sweep import spec
@@ -59,3 +60,16 @@ def test_the_document_has_the_tables_of_the_rows(rows):
         line for line in tables.document(rows, "test").splitlines() if line.startswith("| ") and line not in written
     ]
     assert not missing, f"docs/results.md lacks {len(missing)} lines of `train.figures results/kint --tables`"
+
+
+@pytest.mark.parametrize(("rows", "table"), [("rows", "summary.md"), ("rows-policy", "summary-policy.md")])
+def test_the_topological_tables_are_those_of_their_rows(rows, table):
+    folder = ROOT / "results" / "topological" / "cpu"
+    played = read_rows(sorted((folder / rows).glob("*.parquet")))
+    assert markdown(summary(played), differences(played)) == (folder / table).read_text()
+    # docs/topological.md has the navigator's rows of the first, and of both what they say of all scenes together.
+    told, lines = (ROOT / "docs" / "topological.md").read_text(), (folder / table).read_text().splitlines()
+    everywhere = next(line.split(" | ") for line in lines if line.startswith("| dense | all"))
+    assert all(everywhere[k] in told for k in (4, 5))
+    if table == "summary.md":
+        assert [line for line in lines if line.startswith("| dense |") and line not in told] == []
