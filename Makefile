@@ -66,7 +66,7 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 	  || echo "scikit-fmm cannot be built here: the comparison of geodesics with fast marching will be skipped"
 	@touch $@
 
-# A worker that dies is not replaced: pytest-xdist 3.8 then waits for ever at the end (its issue 1378).
+# A worker that dies is not replaced: with a new one pytest-xdist 3.8 may wait for ever at the end (its issue 1378).
 PYTEST = $(PY) -m pytest -n 2 --dist loadfile --max-worker-restart 0
 
 test: sync .venv/.oracles

@@ -56,11 +56,12 @@ run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s)
   else code=$$?; echo "$(notdir $@) failed ($$code): $(log)"; tail -n 3 $(log); exit $$code; fi
 
 D = $(RUNS)/done
+MAPS = $(ALL:%=$(D)/map-%)
 .DEFAULT_GOAL := all
 .PHONY: all networks maps evaluation transfer
 all: networks maps $(D)/policy evaluation transfer $(D)/export
 networks: $(D)/rooms $(D)/rooms-selfsup $(D)/rooms-more $(D)/passages $(D)/alexnet
-maps: $(ALL:%=$(D)/map-%)
+maps: $(MAPS)
 evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
 transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
 
@@ -90,11 +91,11 @@ $(D)/policy-grid: $(D)/policy
 	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(POLICY))
 
 played = $(NAV) evaluate $(call folders,$(ALL)) --maps $(RUNS)/maps $(WITH) -o $(RUNS)/$(notdir $@)
-$(D)/evaluation: maps
+$(D)/evaluation: $(MAPS)
 	$(call run,$(played) $(if $(PPO),--ppo $(PPO)) $(EVALUATION))
-$(D)/evaluation-policy: maps $(D)/policy
+$(D)/evaluation-policy: $(MAPS) $(D)/policy
 	$(call run,$(played) --contenders dense --policy $(RUNS)/policy $(EVALUATION))
-$(D)/evaluation-ahead1: maps
+$(D)/evaluation-ahead1: $(MAPS)
 	$(call run,$(played) --contenders dense ahead_m=1 $(EVALUATION))
 
 # Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.

@@ -2,8 +2,8 @@
 
 A node is a position with the embeddings of the images around it. An edge leads from a node to each one nearer than
 `edge_m`; its weight is -log p, p the probability that the way is free, so that the shortest way is the one most likely
-to be free as a whole. Edges carry their absolute angle and length: nothing else about positions is needed to drive
-along them.
+to be free as a whole; who plans may add a cost for each metre (`metre_cost`). Edges carry their absolute angle and
+length: nothing else about positions is needed to drive along them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class TopologicalMap:
     digest: str
     """Of the scene's files, as `interactive_nav.scene.Scene.digest`."""
     xy_w: np.ndarray
-    """[N, 2] f32 m: for drawing and scoring, and for the edges' lengths; planning and localising do not look at it."""
+    """[N, 2] f32 m: for drawing, scoring and the edges' lengths; nothing else of it is used to plan or to localise."""
     room: np.ndarray
     """[N] i32."""
     embeddings: np.ndarray

@@ -439,7 +439,7 @@ def played(navigator, goals, seeds, garbage=False, steps=900):
     return out
 
 
-def same(a, b, rows_a=slice(None), rows_b=slice(None)):
+def assert_same(a, b, rows_a=slice(None), rows_b=slice(None)):
     """Whether two plays are equal, row by row."""
     for one, two in zip(a, b, strict=True):
         for x, y in zip(jax.tree.leaves(one[0]), jax.tree.leaves(two[0]), strict=True):
@@ -452,12 +452,12 @@ def test_episodes_of_a_batch_know_nothing_of_each_other():
     phases = {int(p) for state, _ in together for p in state.phase}
     assert {LOCALISE, FACE, SWING, DRIVE} <= phases
     for i, (goal, seed) in enumerate(zip([1, 2, 3], [5, 6, 7], strict=True)):
-        same(together, played(navigator, [goal], [seed]), slice(i, i + 1))
+        assert_same(together, played(navigator, [goal], [seed]), slice(i, i + 1))
 
 
 def test_images_that_are_not_looked_at_may_be_anything():
     navigator = square(swings=2, images=3)
-    same(played(navigator, [1, 2], [8, 9]), played(navigator, [1, 2], [8, 9], garbage=True))
+    assert_same(played(navigator, [1, 2], [8, 9]), played(navigator, [1, 2], [8, 9], garbage=True))
 
 
 def test_a_step_leaves_its_state_as_it_was():
