@@ -5,12 +5,13 @@
 #   make -f benchmarks/topological.mk -n ...                                     only shows the commands
 #
 # What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
-# PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes.
+# PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes; RUNS/ppo is trained where it is missing.
+# GPUS="0 1 2 3" spreads the commands over these.
 
 PY ?= python
 SIZE ?= full
 RUNS ?= runs/topological-$(SIZE)
-PPO ?=
+GPUS ?=
 SEEN = alder birch cedar elm hazel juniper linden maple
 UNSEEN = rowan willow
 ALL = $(SEEN) $(UNSEEN)
@@ -23,11 +24,14 @@ ifeq ($(SIZE),full)
   PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=60
   ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=60
   DRIVES = backend=native batch=3200
-  POLICY = projection=128
+  POLICY = hidden=256 projection=128 learning_rate=3e-4 epochs=15
+  GRID = $(POLICY) epochs=8
   MAP = check=60
-  EVALUATION =
-  SECONDARY = episodes=25
+  EVALUATION = backend=native
+  SECONDARY = $(EVALUATION) episodes=25
   FEATURES =
+  PPO ?= $(RUNS)/ppo
+  PPO_STEPS = 20_000_000
 else ifeq ($(SIZE),cpu)
   IMAGES = width=64 height=48 supersample=2
   DATA = $(IMAGES) max_per_room=4 passage_sources=16
@@ -38,10 +42,13 @@ else ifeq ($(SIZE),cpu)
   ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=30
   DRIVES = $(IMAGES) backend=native drives=50 batch=400
   POLICY = hidden=256 projection=128 learning_rate=1e-3 epochs=20
+  GRID = $(POLICY)
   MAP = check=20
   EVALUATION = episodes=8 limit_s=600
   SECONDARY = episodes=4 limit_s=600
   FEATURES = epochs=4
+  PPO ?=
+  PPO_STEPS = 500_000
 else
   $(error SIZE is '$(SIZE)', expected full or cpu)
 endif
@@ -49,9 +56,12 @@ endif
 NAV = $(PY) -m topological_nav
 WITH = --localiser $(RUNS)/rooms --detector $(RUNS)/passages
 folders = $(addprefix scenes_mjcf/,$(1))
+comma := ,
+space := $() $()
 log = $(RUNS)/log/$(notdir $@).txt
+on_gpu = $(if $(GPUS),set -- $(GPUS); shift $$(( $$$$ % $(words $(GPUS)) )); export CUDA_VISIBLE_DEVICES=$$1;)
 # $(call run,COMMAND): its output goes to the log, its seconds to times.txt; the target is touched when it is done.
-run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s); \
+run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s); $(on_gpu) \
   if $(1) >>$(log) 2>&1; then echo "$(notdir $@) $$(( $$(date +%s) - began )) s" >>$(RUNS)/times.txt; touch $@; \
   else code=$$?; echo "$(notdir $@) failed ($$code): $(log)"; tail -n 3 $(log); exit $$code; fi
 
@@ -88,15 +98,30 @@ $(D)/map-%: $(D)/rooms $(D)/passages
 $(D)/policy: $(D)/rooms $(D)/passages $(D)/drives
 	$(call run,$(NAV) train policy --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy $(POLICY))
 $(D)/policy-grid: $(D)/policy
-	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(POLICY))
+	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(GRID))
 
-played = $(NAV) evaluate $(call folders,$(ALL)) --maps $(RUNS)/maps $(WITH) -o $(RUNS)/$(notdir $@)
-$(D)/evaluation: $(MAPS)
-	$(call run,$(played) $(if $(PPO),--ppo $(PPO)) $(EVALUATION))
-$(D)/evaluation-policy: $(MAPS) $(D)/policy
-	$(call run,$(played) --contenders dense --policy $(RUNS)/policy $(EVALUATION))
-$(D)/evaluation-ahead1: $(MAPS)
-	$(call run,$(played) --contenders dense ahead_m=1 $(EVALUATION))
+$(D)/ppo:
+	$(call run,$(PY) -m train --config turtlebot_ppo env.robot=ttbot "env.scenes=[$(subst $(space),$(comma),$(call folders,$(SEEN)))]" \
+	  run.num_timesteps=$(PPO_STEPS) run.out_dir=$(RUNS) run.name=ppo)
+
+# Scenes are played side by side (evaluation.alder, ...); the command for all of them then finds their rows, and adds up.
+played = $(NAV) evaluate $(1) --maps $(RUNS)/maps $(WITH) $(EVALUATION) -o $(RUNS)/$(basename $(notdir $@))
+baseline = $(call played,$(1)) --policy passage $(if $(PPO),--ppo $(PPO))
+learned = $(call played,$(1)) --contenders dense,sparse --policy $(RUNS)/policy
+ahead1 = $(call played,$(1)) --contenders dense --policy passage ahead_m=1
+each = $(patsubst %,$(D)/$(1).%,$(ALL))
+$(call each,evaluation): $(D)/evaluation.%: $(D)/map-% $(if $(filter $(RUNS)/ppo,$(PPO)),$(D)/ppo)
+	$(call run,$(call baseline,scenes_mjcf/$*))
+$(call each,evaluation-policy): $(D)/evaluation-policy.%: $(D)/map-% $(D)/policy
+	$(call run,$(call learned,scenes_mjcf/$*))
+$(call each,evaluation-ahead1): $(D)/evaluation-ahead1.%: $(D)/map-%
+	$(call run,$(call ahead1,scenes_mjcf/$*))
+$(D)/evaluation: $(call each,evaluation)
+	$(call run,$(call baseline,$(call folders,$(ALL))))
+$(D)/evaluation-policy: $(call each,evaluation-policy)
+	$(call run,$(call learned,$(call folders,$(ALL))))
+$(D)/evaluation-ahead1: $(call each,evaluation-ahead1)
+	$(call run,$(call ahead1,$(call folders,$(ALL))))
 
 # Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.
 $(D)/features: $(D)/rooms

@@ -21,6 +21,7 @@ from topological_nav.config import (
     room_config,
 )
 from topological_nav.settings import overridden
+from train.config_io import load
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
@@ -47,8 +48,9 @@ def test_all_commands_are_understood_and_made_in_order(size):
         shlex.split(line)
         for line in re.findall(r"if python -m topological_nav (.*?) >>/nowhere", listed(f"SIZE={size}"))
     ]
-    # Four datasets, five networks, ten maps, policy, five evaluations, two adaptations, four maps of them, export.
-    assert len(commands) == len({tuple(words) for words in commands}) == 4 + 5 + 10 + 1 + 5 + 2 + 4 + 1
+    # Four datasets, five networks, ten maps, policy, three evaluations of ten scenes each on its own and then summed up,
+    # two of another domain, two adaptations, four maps of them, export.
+    assert len(commands) == len({tuple(words) for words in commands}) == 4 + 5 + 10 + 1 + 3 * 11 + 2 + 2 + 4 + 1
     made: set[str] = set()
     for words in commands:
         settings = [word for word in words if re.match(r"\w+=", word)]
@@ -60,6 +62,21 @@ def test_all_commands_are_understood_and_made_in_order(size):
             if needed is not None and str(needed).startswith("/nowhere"):
                 assert any(done == str(needed) or done.startswith(f"{needed}/") for done in made), (words, name)
         made.add(out)
+
+
+def test_a_policy_told_the_goal_is_trained_where_none_is_given():
+    shown = listed("SIZE=full", "PPO=/nowhere/ppo")
+    (words,) = [shlex.split(line) for line in re.findall(r"if python -m train (.*?) >>/nowhere", shown)]
+    name, settings = words[words.index("--config") + 1], [w for w in words if re.match(r"[\w.]+=", w)]
+    config = load(name, settings)
+    assert (config.env.robot, len(config.env.scenes), config.run.name) == ("ttbot", 8, "ppo")
+    assert not re.findall(r"if python -m train ", listed("SIZE=full"))
+
+
+def test_commands_are_spread_over_gpus():
+    shown = listed("GPUS=0 1 2 3").splitlines()
+    assert all("set -- 0 1 2 3; shift $(( $$ % 4 )); export CUDA_VISIBLE_DEVICES=$1;" in line for line in shown if line)
+    assert "CUDA_VISIBLE_DEVICES" not in listed()
 
 
 def test_another_size_is_refused():
