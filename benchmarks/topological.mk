@@ -27,11 +27,11 @@ ifeq ($(SIZE),full)
   POLICY = hidden=256 projection=128 learning_rate=3e-4 epochs=15
   GRID = $(POLICY) epochs=8
   MAP = check=60
-  EVALUATION = backend=native
+  EVALUATION = backend=native limit_s=600
   SECONDARY = $(EVALUATION) episodes=25
   FEATURES =
   PPO ?= $(RUNS)/ppo
-  PPO_STEPS = 20_000_000
+  PPO_STEPS = 5_000_000
 else ifeq ($(SIZE),cpu)
   IMAGES = width=64 height=48 supersample=2
   DATA = $(IMAGES) max_per_room=4 passage_sources=16
@@ -107,7 +107,7 @@ $(D)/ppo:
 # Scenes are played side by side (evaluation.alder, ...); the command for all of them then finds their rows, and adds up.
 played = $(NAV) evaluate $(1) --maps $(RUNS)/maps $(WITH) $(EVALUATION) -o $(RUNS)/$(basename $(notdir $@))
 baseline = $(call played,$(1)) --policy passage $(if $(PPO),--ppo $(PPO))
-learned = $(call played,$(1)) --contenders dense,sparse --policy $(RUNS)/policy
+learned = $(call played,$(1)) --contenders dense --policy $(RUNS)/policy
 ahead1 = $(call played,$(1)) --contenders dense --policy passage ahead_m=1
 each = $(patsubst %,$(D)/$(1).%,$(ALL))
 $(call each,evaluation): $(D)/evaluation.%: $(D)/map-% $(if $(filter $(RUNS)/ppo,$(PPO)),$(D)/ppo)
