@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
@@ -31,6 +32,8 @@ from train.files import whole_file
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""
 Progress = Callable[[str, int, int], None]
+CPU_SUPERSAMPLE = 2
+"""Beyond it drawing is what a CPU mostly does, and the networks answer nearly the same (docs/topological.md)."""
 SAME = ("robot", "engine", "width", "height", "fov_deg", "headings")
 """What two networks' images must have in common to look through one camera."""
 
@@ -71,7 +74,7 @@ def build_map(
         SceneError, SpaceError: the scene cannot be used.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
-    data = camera_of(localiser, detector)
+    data = drawn_for(camera_of(localiser, detector), config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)
     known = recorded_rooms(scene.digest)
@@ -162,6 +165,19 @@ def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, da
     about = {"settings": to_dict(config), "made": "from the plan"}
     nothing = np.zeros((len(xy), data.headings, 0))
     return assemble(scene.name, scene.digest, xy, rooms.of(xy), nothing, config.edge_m, probability, about)
+
+
+def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
+    """How a navigator's images are drawn: as networks learned, but so many times larger before they are averaged.
+
+    Args:
+        data: what the networks learned from.
+        supersample: as asked for; None: as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
+    """
+    if supersample is None:
+        most = CPU_SUPERSAMPLE if jax.default_backend() == "cpu" else data.supersample
+        supersample = min(data.supersample, most)
+    return dataclasses.replace(data, supersample=supersample)
 
 
 def renderer_of(scene: Scene, data: DataConfig, batch: int | None = None) -> SceneRenderer:

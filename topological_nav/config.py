@@ -185,12 +185,16 @@ class MapConfig:
     """Add nodes until every free place that one can drive to is joined by free edges."""
     passable: float = 0.5
     """Edges with at least this probability count as open where connectedness is told."""
+    supersample: int | None = None
+    """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
+    most 2 (docs/topological.md says what that changes)."""
     check: int = 0
     """Free places, drawn by chance, at which to try how well the finished map localises."""
 
     def __post_init__(self) -> None:
         require(self, "clearance_m", 0.0, 10.0)
         require(self, "min_per_room", 1, 1000)
+        require(self, "supersample", 1, 16)
         require(self, "check", 0, 10**6)
         require(self, "spacing_m edge_m", 0.1, 100.0)
         require(self, "passable", 0.0, 1.0)
@@ -238,6 +242,9 @@ class NavigatorConfig:
     """Added to the cost of an edge each time that it was driven and the robot was then not found nearer to its head."""
     limit_s: float = 1800.0
     """Time after which an episode has failed."""
+    supersample: int | None = None
+    """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
+    most 2."""
     kp: float = 2.0
     """Proportional gain of turning, 1/s."""
     ki: float = 0.2
@@ -249,6 +256,7 @@ class NavigatorConfig:
 
     def __post_init__(self) -> None:
         require(self, "images swings runs", 1, 1000)
+        require(self, "supersample", 1, 16)
         require(self, "passable", 0.0, 1.0)
         require(self, "swing_deg", 1.0, 180.0)
         require(self, "ahead_m clear_m", 0.05, 100.0)

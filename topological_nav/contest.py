@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import Scene, load_scene
-from topological_nav.build import camera_of, renderer_of, true_map
+from topological_nav.build import camera_of, drawn_for, renderer_of, true_map
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data import lens_of
 from topological_nav.domains import as_seen_from, preset
@@ -58,6 +58,8 @@ from train.run_folder import RunFolder, versions
 
 CONTENDERS = ("dense", "sparse", "expert", "ppo")
 """The navigator on its map, and on the same thinned out; an expert with the plan; a learned policy told the goal."""
+NOT_ASKED = ("batch", "episodes", "supersample")
+"""Settings that decide no row, or of which it is told otherwise."""
 CPU_BATCH = 8
 CPU_IMAGES = 6
 """Images drawn a call on a CPU; fewer are padded, which costs as much."""
@@ -181,7 +183,8 @@ class Venue:
         assert self.networks is not None
         of_map = {k: v for k, v in self.map.about.get("data", {}).items() if k in ("engine", "fov_deg")}
         drawn = overlaid(self.networks.camera, of_map, "map")
-        return dataclasses.replace(drawn, fov_deg=lens_of(drawn, self.robot).fov_deg)
+        drawn = dataclasses.replace(drawn, fov_deg=lens_of(drawn, self.robot).fov_deg)
+        return drawn_for(drawn, self.contest.config.supersample)
 
     def map_of(self, contender: str) -> TopologicalMap:
         """The map that a navigator goes by."""
@@ -214,7 +217,7 @@ class Venue:
 
     def asked(self, contender: str) -> dict[str, Any]:
         """Everything that decides the rows of a contender."""
-        config = {k: v for k, v in to_dict(self.contest.config).items() if k not in ("batch", "episodes")}
+        config = {k: v for k, v in to_dict(self.contest.config).items() if k not in NOT_ASKED}
         asked = {"scene": self.scene.digest, "robot": self.contest.robot, "contender": contender, "settings": config}
         if contender == "ppo":
             assert self.contest.ppo is not None
@@ -234,6 +237,8 @@ class Venue:
                 asked["domain"] = to_dict(preset(self.contest.domain))
             if self.drawn != self.networks.camera:
                 asked["drawn"] = [self.drawn.engine, self.drawn.fov_deg]
+            if self.drawn.supersample != self.networks.camera.supersample:
+                asked["drawn"] = [self.drawn.engine, self.drawn.fov_deg, self.drawn.supersample]
         return {**asked, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
 
 

@@ -48,8 +48,8 @@ def test_all_commands_are_understood_and_made_in_order(size):
         shlex.split(line)
         for line in re.findall(r"if python -m topological_nav (.*?) >>/nowhere", listed(f"SIZE={size}"))
     ]
-    # Four datasets, five networks, ten maps, policy, three evaluations of ten scenes each on its own and then summed up,
-    # two of another domain, two adaptations, four maps of them, export.
+    # Four datasets, five networks, ten maps, policy, three evaluations of ten scenes each on its own and then summed
+    # up, two of another domain, two adaptations, four maps of them, export.
     assert len(commands) == len({tuple(words) for words in commands}) == 4 + 5 + 10 + 1 + 3 * 11 + 2 + 2 + 4 + 1
     made: set[str] = set()
     for words in commands:

@@ -12,7 +12,8 @@ from interactive_nav.robots import get_robot
 from tests.topological_nav.conftest import Made
 from topological_nav import contest as contests
 from topological_nav.__main__ import main
-from topological_nav.config import EvaluationConfig
+from topological_nav.build import drawn_for
+from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.contest import Contest, local_policy, venues_of
 from topological_nav.domains import as_seen_from, preset
 from topological_nav.errors import RunError, SettingsError
@@ -222,6 +223,19 @@ def test_images_are_drawn_by_the_maps_engine_and_lens(contest, made, tmp_path):
     assert venue.networks is not None and venue.drawn == venue.networks.camera
     assert (other.drawn.engine, other.drawn.fov_deg) == ("gl", 70.0)
     assert contests._stem(venue, "dense") != contests._stem(other, "dense")
+
+
+def test_a_cpu_draws_images_at_most_twice_as_large(contest, monkeypatch):
+    learned = DataConfig(width=128, height=96, supersample=5)
+    assert drawn_for(learned, None) == dataclasses.replace(learned, supersample=2)
+    assert drawn_for(learned, 5) == learned and drawn_for(learned, 7).supersample == 7
+    assert drawn_for(dataclasses.replace(learned, supersample=1), None).supersample == 1
+    (venue,) = venues_of(contest)
+    (finer,) = venues_of(dataclasses.replace(contest, config=dataclasses.replace(CONFIG, supersample=2)))
+    assert (venue.drawn.supersample, finer.drawn.supersample) == (1, 2)
+    assert "drawn" not in venue.asked("dense") and finer.asked("dense")["drawn"][-1] == 2
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert drawn_for(learned, None) == learned
 
 
 def test_cameras_that_cannot_be_are_refused(contest):
