@@ -24,7 +24,7 @@ ifeq ($(SIZE),full)
   PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=60
   ALEXNET = width=16 batch=64 learning_rate=5e-4 epochs=60
   DRIVES = backend=native batch=3200
-  POLICY = hidden=256 projection=128 learning_rate=3e-4 epochs=15
+  POLICY = hidden=256 projection=128 learning_rate=1e-3 epochs=15
   GRID = $(POLICY) epochs=8
   MAP = check=60
   EVALUATION = backend=native limit_s=600

@@ -346,3 +346,12 @@ def test_one_array_tells_what_the_state_holds():
     assert seen.wall.tolist() == [False, True, False]
     assert seen.broken.tolist() == [False, True, True]
     assert simulator.seen(state) is seen  # the same state is not asked twice
+
+
+@pytest.mark.heavy
+def test_the_expert_passes_where_furniture_leaves_a_quarter_of_a_metre(tmp_path):
+    """A table closes a room of maple to the expert's grid: it stood still in 18 of 60 episodes."""
+    config = EvaluationConfig(backend="native", episodes=8, batch=8, limit_s=90.0)
+    contest = Contest((Path("scenes_mjcf/maple"),), ("expert",), tmp_path, config)
+    rows = hold(contest, venues_of(contest)).to_pylist()
+    assert [r["success"] for r in rows] == [1.0] * 8 and min(r["path_m"] for r in rows) > 2.5
