@@ -69,8 +69,17 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
     Raises:
         RunFolderError: the file cannot be written.
     """
+    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    others = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
     with whole_file(path) as partial:
-        pq.write_table(table.replace_schema_metadata(notes), partial, compression="zstd")
+        pq.write_table(
+            table.replace_schema_metadata(notes),
+            partial,
+            compression="zstd",
+            compression_level=15,
+            use_dictionary=others,
+            use_byte_stream_split=floats,
+        )
 
 
 def read_notes(path: Path) -> dict[str, str]:

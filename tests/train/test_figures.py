@@ -41,8 +41,8 @@ def results(tmp_path_factory):
         (run / "summary.json").write_text(json.dumps(facts))
     for k_int in (0.0, 1.0):
         rows = run_rows("turtlebot", "ppo", k_int, 7, 0.5, (0.9, 0.9))
-        path = folder / "rows" / f"k{k_int:g}-0123abcd.parquet"
-        write_parquet(rows, path, {"asked": "x"})
+        path = folder / "rows" / f"turtlebot-ppo-k_int{k_int:g}-seed7-0123abcd.parquet"
+        write_parquet(rows, path)
         (folder / "rows" / "_paths").mkdir(exist_ok=True)
         np.savez(paths_beside(path), **record(shift_m=k_int))  # type: ignore[arg-type]
     return folder

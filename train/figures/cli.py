@@ -20,8 +20,7 @@ from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
 from train.files import whole_file
-from train.row_files import paths_beside
-from train.rows import read_notes, read_rows
+from train.rows import read_rows
 from train.run_folder import read_metrics
 from train.statistics import run_means
 
@@ -121,20 +120,23 @@ def _of_sweep(found: Results, split: str | None) -> Iterator[tuple[str, Callable
     if run_means(rows, "train") and run_means(rows, "test"):
         yield "seen_unseen", lambda: seen_and_unseen(rows)
     groups: dict[tuple[str, str, int, int], dict[float, Path]] = {}
-    records = set(found.records)
-    for table in found.tables:
-        path = paths_beside(table)
-        if path in records and read_notes(table):
-            rows_of = read_rows([table]).slice(0, 1).to_pylist()
-            if rows_of and rows_of[0]["policy"] == "learned":
-                r = rows_of[0]
-                key = (r["robot"], r["algorithm"], r["seed"], r["evaluation_seed"])
-                groups.setdefault(key, {})[r["k_int"]] = path
+    runs = {r["run"]: r for r in _a_row_a_run(rows) if r["policy"] == "learned"}
+    for path in found.records:
+        r = runs.get(path.stem[:-9])  # <run>-<8 hex>.npz
+        if r is not None and path.parent.name == "_paths":
+            groups.setdefault((r["robot"], r["algorithm"], r["seed"], r["evaluation_seed"]), {})[r["k_int"]] = path
     drawn = set()
     for key, by_k_int in sorted(groups.items()):
         if key[:2] not in drawn and len(by_k_int) == max(len(g) for k, g in groups.items() if k[:2] == key[:2]):
             drawn.add(key[:2])
             yield f"trajectories_{key[0]}_{key[1]}", lambda chosen=by_k_int: _by_k_int(chosen)
+
+
+def _a_row_a_run(rows: pa.Table) -> list[dict[str, Any]]:
+    names = ("run", "policy", "robot", "algorithm", "seed", "evaluation_seed", "k_int")
+    if not set(names) <= set(rows.column_names):
+        return []
+    return rows.select(names).group_by(list(names)).aggregate([]).to_pylist()
 
 
 def _by_k_int(by_k_int: dict[float, Path]) -> Figure:

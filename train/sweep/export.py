@@ -1,4 +1,7 @@
-"""A sweep's folder in; what is worth keeping of it out: rows, thinned curves, origins, the best checkpoints."""
+"""A sweep's folder in; what is worth keeping of it out: rows, thinned curves, origins, the best checkpoints.
+
+Rows become one file, which takes half of what a file a run does: many columns are the same in all of them.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from train import checkpoint
 from train.errors import CheckpointError, RunFolderError
 from train.files import write_text
 from train.row_files import files_of_run, paths_beside
-from train.rows import read_rows
+from train.rows import read_notes, read_rows, write_parquet
 from train.run_folder import RunFolder, read_metrics
 from train.statistics import run_means
 from train.sweep.folder import SweepFolder
@@ -24,6 +27,7 @@ CURVE_LINES = 100
 """Lines of metrics that an exported run keeps."""
 KEPT = ("env_steps", "wall_s", "env_steps_per_s", "episodes")
 FILES = ("config.yaml", "versions.json", "summary.json")
+ROWS = "episodes.parquet"
 
 
 def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], str]]:
@@ -31,7 +35,7 @@ def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], s
 
     Args:
         folder: of the sweep.
-        out: `<out>/rows` and `<out>/runs` are written.
+        out: `<out>/rows/episodes.parquet`, `<out>/rows/_paths` and `<out>/runs` are written.
 
     Returns:
         Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
@@ -42,13 +46,7 @@ def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], s
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
     try:
-        if folder.rows.is_dir():
-            names = shutil.ignore_patterns(".*")
-            shutil.copytree(folder.rows, out / "rows", dirs_exist_ok=True, ignore=names)
-            for path in (path for run in runs for path in files_of_run(out / "rows", run.name)):
-                if not (folder.rows / path.name).is_file():  # of an evaluation that was replaced since
-                    path.unlink()
-                    paths_beside(path).unlink(missing_ok=True)
+        _merge_rows(folder, out / "rows")
         for run in runs:
             source, target = RunFolder(folder.runs / run.name), out / "runs" / run.name
             target.mkdir(parents=True, exist_ok=True)
@@ -64,6 +62,35 @@ def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], s
     except OSError as error:
         raise RunFolderError(f"{out}: cannot be written ({error.strerror or error}); make room") from None
     return sum(path.stat().st_size for path in out.rglob("*") if path.is_file()), best
+
+
+def _merge_rows(folder: SweepFolder, out: Path) -> None:
+    """Rows of the sweep's runs, and those of other runs that lie in `out` already, as one file; paths beside it."""
+    new = [path for run in folder.sweep.runs for path in files_of_run(folder.rows, run.name)]
+    if not new:
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    rows = read_rows(new)
+    replaced = set(rows["run"].unique().to_pylist())
+    for path in (path for name in replaced for path in files_of_run(out, name)):  # of an export that did not merge
+        path.unlink()
+    old = sorted(out.glob("*.parquet"))
+    if old:
+        kept = read_rows(old)
+        others = pa.array([name not in replaced for name in kept["run"].to_pylist()])
+        rows = pa.concat_tables([kept.filter(others), rows], promote_options="permissive")
+    asked = {asked for path in (*old, *new) if (asked := read_notes(path).get("asked"))}
+    write_parquet(rows, out / ROWS, {"asked": " ".join(sorted(asked))} if asked else None)
+    for path in old:
+        if path.name != ROWS:
+            path.unlink()
+    for path in out.glob("_paths/*.npz"):
+        if path.stem[:-9] in replaced:
+            path.unlink()
+    for path in new:
+        if paths_beside(path).is_file():
+            (out / "_paths").mkdir(exist_ok=True)
+            shutil.copy2(paths_beside(path), out / "_paths")
 
 
 def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, ...], str]:

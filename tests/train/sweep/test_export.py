@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 
 from tests.train.sweep.test_sweep import write_sweep
 from tests.train.synthetic import run_rows
 from train import checkpoint
-from train.rows import read_rows, write_parquet
+from train.row_files import paths_beside
+from train.rows import read_notes, read_rows, write_parquet
 from train.run_folder import read_metrics
 from train.sweep import spec
 from train.sweep.__main__ import main
@@ -58,13 +60,23 @@ def swept(tmp_path):
 def test_what_is_kept(swept, tmp_path, capsys):
     out = tmp_path / "results"
     old = out / "rows" / "k_int0-seed0-01234567.parquet"
+    elsewhere = run_rows("fetch", "sac", 1.0, 3, 0.7, (0.5, 0.5))
+    write_parquet(elsewhere, out / "rows" / "elsewhere-01234567.parquet", {"asked": "there"})
+    (rows,) = swept.rows.glob("k_int1-seed0-*.parquet")
+    paths_beside(rows).parent.mkdir()
+    paths_beside(rows).write_bytes(b"where it went")
     for _ in range(2):  # again replaces
         old.parent.mkdir(parents=True, exist_ok=True)
         old.write_bytes(b"of an evaluation that the sweep no longer has")
         assert main([str(tmp_path / "small.yaml"), "--export", str(out)]) == 0
         printed = capsys.readouterr().out
         assert "checkpoint of k_int0-seed1" in printed and "k_int0-seed0" not in printed and "MiB" in printed
-        assert len(read_rows(list((out / "rows").glob("*.parquet")))) == 4 * 40
+        (merged,) = (out / "rows").glob("*.parquet")  # with what another machine had brought
+        assert len(read_rows([merged])) == 4 * 40 + 40 and read_notes(merged) == {"asked": "there"}
+        found, given = (read_rows([path]).filter(pc.field("run") == "k_int1-seed0") for path in (merged, rows))
+        assert found.select(given.column_names).to_pylist() == given.to_pylist()
+        (kept,) = (out / "rows" / "_paths").iterdir()
+        assert kept.name == paths_beside(rows).name and kept.read_bytes() == b"where it went"
         assert sorted(path.name for path in (out / "runs").iterdir()) == [run.name for run in swept.sweep.runs]
         assert read_metrics(out / "runs" / "k_int1-seed0" / "metrics.jsonl") == [{"env_steps": 5, "episodes": 1.0}]
         (kept,) = out.rglob("policy.npz")
