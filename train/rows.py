@@ -77,8 +77,8 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
             partial,
             compression="zstd",
             compression_level=15,
-            use_dictionary=others,
-            use_byte_stream_split=floats,
+            use_dictionary=others,  # type: ignore[arg-type]
+            use_byte_stream_split=floats,  # type: ignore[arg-type]
         )
 
 
