@@ -5,7 +5,7 @@
 #   make -f benchmarks/topological.mk -n ...                                     only shows the commands
 #
 # What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
-# PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes; RUNS/ppo is trained where it is missing.
+# PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes; SIZE=full trains one, RUNS/ppo.
 # GPUS="0 1 2 3" spreads the commands over these.
 
 PY ?= python

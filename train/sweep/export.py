@@ -65,13 +65,13 @@ def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], s
 
 
 def _merge_rows(folder: SweepFolder, out: Path) -> None:
-    """Rows of the sweep's runs, and those of other runs that lie in `out` already, as one file; paths beside it."""
-    new = [path for run in folder.sweep.runs for path in files_of_run(folder.rows, run.name)]
+    """The sweep's rows, and those of other runs that lie in `out` already, as one file; paths beside it."""
+    new = sorted(path for path in folder.rows.glob("*.parquet") if not path.name.startswith("."))
     if not new:
         return
     out.mkdir(parents=True, exist_ok=True)
     rows = read_rows(new)
-    replaced = set(rows["run"].unique().to_pylist())
+    replaced = {name for name in rows["run"].unique().to_pylist() if name}
     for path in (path for name in replaced for path in files_of_run(out, name)):  # of an export that did not merge
         path.unlink()
     old = sorted(out.glob("*.parquet"))
@@ -79,8 +79,8 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
         kept = read_rows(old)
         others = pa.array([name not in replaced for name in kept["run"].to_pylist()])
         rows = pa.concat_tables([kept.filter(others), rows], promote_options="permissive")
-    asked = {asked for path in (*old, *new) if (asked := read_notes(path).get("asked"))}
-    write_parquet(rows, out / ROWS, {"asked": " ".join(sorted(asked))} if asked else None)
+    asked = {one for path in (*old, *new) for one in read_notes(path).get("asked", "").splitlines()}
+    write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None)
     for path in old:
         if path.name != ROWS:
             path.unlink()

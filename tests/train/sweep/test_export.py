@@ -62,6 +62,9 @@ def test_what_is_kept(swept, tmp_path, capsys):
     old = out / "rows" / "k_int0-seed0-01234567.parquet"
     elsewhere = run_rows("fetch", "sac", 1.0, 3, 0.7, (0.5, 0.5))
     write_parquet(elsewhere, out / "rows" / "elsewhere-01234567.parquet", {"asked": "there"})
+    never = run_rows("turtlebot", "ppo", 0.0, 9, 0.7, (0.5, 0.5))
+    never = never.set_column(0, "run", [["yardsticks"] * len(never)])
+    write_parquet(never, swept.rows / "yardsticks-01234567.parquet", {"asked": "here"})
     (rows,) = swept.rows.glob("k_int1-seed0-*.parquet")
     paths_beside(rows).parent.mkdir()
     paths_beside(rows).write_bytes(b"where it went")
@@ -72,7 +75,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
         printed = capsys.readouterr().out
         assert "checkpoint of k_int0-seed1" in printed and "k_int0-seed0" not in printed and "MiB" in printed
         (merged,) = (out / "rows").glob("*.parquet")  # with what another machine had brought
-        assert len(read_rows([merged])) == 4 * 40 + 40 and read_notes(merged) == {"asked": "there"}
+        assert len(read_rows([merged])) == (4 + 2) * 40 and read_notes(merged) == {"asked": "here\nthere"}
         found, given = (read_rows([path]).filter(pc.field("run") == "k_int1-seed0") for path in (merged, rows))
         assert found.select(given.column_names).to_pylist() == given.to_pylist()
         (kept,) = (out / "rows" / "_paths").iterdir()
