@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,14 +82,14 @@ def compare(
     return rows, float(np.linalg.norm(largest[0][:-1] - largest[0][1:], axis=1).mean())
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Prints a row for every size."""
     made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     made.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
     made.add_argument("--localiser", type=Path, default=packaged_weights() / "rooms", metavar="RUN")
     made.add_argument("--detector", type=Path, default=packaged_weights() / "passages", metavar="RUN")
     made.add_argument("--places", type=int, default=36)
-    arguments = made.parse_args()
+    arguments = made.parse_args(argv)
     networks = load_trained(arguments.localiser), load_trained(arguments.detector)
     rows, typical = compare(load_scene(arguments.scene), *networks, arguments.places)
     print("| supersample | images/s | embeddings apart | p: mean difference | largest | other side of 0.5 |")
