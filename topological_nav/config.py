@@ -242,9 +242,6 @@ class NavigatorConfig:
     """Added to the cost of an edge each time that it was driven and the robot was then not found nearer to its head."""
     limit_s: float = 1800.0
     """Time after which an episode has failed."""
-    supersample: int | None = None
-    """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
-    most 2."""
     kp: float = 2.0
     """Proportional gain of turning, 1/s."""
     ki: float = 0.2
@@ -256,7 +253,6 @@ class NavigatorConfig:
 
     def __post_init__(self) -> None:
         require(self, "images swings runs", 1, 1000)
-        require(self, "supersample", 1, 16)
         require(self, "passable", 0.0, 1.0)
         require(self, "swing_deg", 1.0, 180.0)
         require(self, "ahead_m clear_m", 0.05, 100.0)
@@ -289,10 +285,14 @@ class EvaluationConfig(NavigatorConfig):
     """Episodes played at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
+    supersample: int | None = None
+    """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
+    most 2."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self, "seed", 0, 2**32 - 1)
+        require(self, "supersample", 1, 16)
         require(self, "episodes batch", 1, 10**6)
         require(self, "min_goal_m success_m clearance_m", 0.0, 1000.0)
         require(self, "thinned", 0.01, 1.0)

@@ -74,8 +74,9 @@ def test_a_policy_told_the_goal_is_trained_where_none_is_given():
 
 
 def test_commands_are_spread_over_gpus():
-    shown = listed("GPUS=0 1 2 3").splitlines()
-    assert all("set -- 0 1 2 3; shift $(( $$ % 4 )); export CUDA_VISIBLE_DEVICES=$1;" in line for line in shown if line)
+    shown = re.findall(r"^mkdir .*; if python -m .*$", listed("GPUS=0 1 2 3"), re.M)
+    assert len(shown) > 50
+    assert all("set -- 0 1 2 3; shift $(( $$ % 4 )); export CUDA_VISIBLE_DEVICES=$1;" in line for line in shown)
     assert "CUDA_VISIBLE_DEVICES" not in listed()
 
 
