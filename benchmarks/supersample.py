@@ -27,7 +27,9 @@ from topological_nav.space import free_space
 from topological_nav.training import Trained, load_trained
 
 CLEARANCE_M = 0.35
+"""Least distance of places from obstacles."""
 AHEAD_M = (1.0, 2.0)
+"""Lengths that the detector is asked about."""
 
 
 class Compared(NamedTuple):
@@ -58,6 +60,9 @@ def compare(
 
     Returns:
         A row each, the largest first; and the mean distance of the embeddings of different places.
+
+    Raises:
+        MapError: the networks learned from different cameras, or the second judges no passages.
     """
     data = camera_of(localiser, detector)
     robot = get_robot(data.robot)

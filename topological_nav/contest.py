@@ -235,10 +235,11 @@ class Venue:
                 asked["localiser"] = self.networks.localiser.stored
             if self.contest.domain != "clean":
                 asked["domain"] = to_dict(preset(self.contest.domain))
-            if self.drawn != self.networks.camera:
-                asked["drawn"] = [self.drawn.engine, self.drawn.fov_deg]
-            if self.drawn.supersample != self.networks.camera.supersample:
-                asked["drawn"] = [self.drawn.engine, self.drawn.fov_deg, self.drawn.supersample]
+            drawn, learned_from = self.drawn, self.networks.camera
+            if drawn != learned_from:
+                # The size only where it differs, so that rows of before it could be chosen are found.
+                size = [drawn.supersample] if drawn.supersample != learned_from.supersample else []
+                asked["drawn"] = [drawn.engine, drawn.fov_deg, *size]
         return {**asked, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
 
 

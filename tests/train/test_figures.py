@@ -11,7 +11,7 @@ import pytest
 
 from tests.train.synthetic import paper_like, run_rows, write_results, yardstick_rows
 from train import figures
-from train.figures import curves, paths, scores, style, tables
+from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
 from train.row_files import paths_beside
 from train.rows import write_parquet
@@ -45,6 +45,10 @@ def results(tmp_path_factory):
         write_parquet(rows, path)
         (folder / "rows" / "_paths").mkdir(exist_ok=True)
         np.savez(paths_beside(path), **record(shift_m=k_int))  # type: ignore[arg-type]
+    # One of them was evaluated in other episodes as well.
+    other = folder / "rows" / "turtlebot-ppo-k_int1-seed7-fedcba98.parquet"
+    write_parquet(run_rows("turtlebot", "ppo", 1.0, 7, 0.5, (0.9, 0.9)), other)
+    np.savez(paths_beside(other), **record(shift_m=9.0))  # type: ignore[arg-type]
     return folder
 
 
@@ -86,6 +90,14 @@ def test_every_figure_of_a_sweep_is_drawn(results, tmp_path, capsys):
     ]
     assert all(path.stat().st_size > 20_000 for path in tmp_path.iterdir())
     capsys.readouterr()
+
+
+def test_trajectories_side_by_side_are_of_the_same_episodes(results, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(cli, "_by_k_int", lambda chosen: drawn.append(chosen))
+    dict(cli.figures_of(results))["trajectories_turtlebot_ppo"]()
+    (chosen,) = drawn
+    assert [path.stem[-8:] for path in chosen.values()] == ["0123abcd"] * 2 and sorted(chosen) == [0.0, 1.0]
 
 
 def test_ins_over_alpha_shows_means_and_intervals_of_seeds():

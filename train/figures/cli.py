@@ -119,12 +119,13 @@ def _of_sweep(found: Results, split: str | None) -> Iterator[tuple[str, Callable
     yield "effort_terms", lambda: effort_terms(rows, split)
     if run_means(rows, "train") and run_means(rows, "test"):
         yield "seen_unseen", lambda: seen_and_unseen(rows)
-    groups: dict[tuple[str, str, int, int], dict[float, Path]] = {}
+    groups: dict[tuple[str, str, int, str], dict[float, Path]] = {}
     runs = {r["run"]: r for r in _a_row_a_run(rows) if r["policy"] == "learned"}
     for path in found.records:
-        r = runs.get(path.stem[:-9])  # <run>-<8 hex>.npz
+        name, _, asked = path.stem.rpartition("-")  # the same digest: the same episodes
+        r = runs.get(name)
         if r is not None and path.parent.name == "_paths":
-            groups.setdefault((r["robot"], r["algorithm"], r["seed"], r["evaluation_seed"]), {})[r["k_int"]] = path
+            groups.setdefault((r["robot"], r["algorithm"], r["seed"], asked), {})[r["k_int"]] = path
     drawn = set()
     for key, by_k_int in sorted(groups.items()):
         if key[:2] not in drawn and len(by_k_int) == max(len(g) for k, g in groups.items() if k[:2] == key[:2]):
@@ -133,7 +134,7 @@ def _of_sweep(found: Results, split: str | None) -> Iterator[tuple[str, Callable
 
 
 def _a_row_a_run(rows: pa.Table) -> list[dict[str, Any]]:
-    names = ("run", "policy", "robot", "algorithm", "seed", "evaluation_seed", "k_int")
+    names = ("run", "policy", "robot", "algorithm", "seed", "k_int")
     if not set(names) <= set(rows.column_names):
         return []
     return rows.select(names).group_by(list(names)).aggregate([]).to_pylist()

@@ -85,7 +85,7 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
         if path.name != ROWS:
             path.unlink()
     for path in out.glob("_paths/*.npz"):
-        if path.stem[:-9] in replaced:
+        if path.stem.rpartition("-")[0] in replaced:
             path.unlink()
     for path in new:
         if paths_beside(path).is_file():
