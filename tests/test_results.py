@@ -10,6 +10,7 @@ import pytest
 from topological_nav.scores import differences, markdown, summary
 from train.figures import tables
 from train.rows import read_rows
+from train.run_folder import PACKED_METRICS, read_metrics
 from train.sweep import spec
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +51,7 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
         summary, versions = (json.loads((kept / f"{part}.json").read_text()) for part in ("summary", "versions"))
         assert summary["completed"] and summary["env_steps"] == most and summary["wall_s"] > 0
         assert versions["packages"]["mujoco-mjx"] and versions["commit"] == commit
-        assert (kept / "config.yaml").is_file() and len((kept / "metrics.jsonl").read_text().splitlines()) >= 10
+        assert (kept / "config.yaml").is_file() and len(read_metrics(kept / PACKED_METRICS)) >= 10
 
 
 @pytest.mark.slow

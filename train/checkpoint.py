@@ -132,11 +132,17 @@ def is_whole(folder: Path) -> bool:
     return (folder / LEARNER).is_file() or not (folder / policy_file.POLICY).is_file()
 
 
-def keep_policy(folder: Path, target: Path) -> None:
-    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`."""
+def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> None:
+    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`.
+
+    Args:
+        folder: of the checkpoint.
+        target: made.
+        step: see `policy_file.packed`.
+    """
     meta = read_meta(folder)
     target.mkdir(parents=True)
-    policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY)
+    policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY, step)
     shutil.copy2(folder / META, target / META)
 
 

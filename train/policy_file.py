@@ -1,12 +1,13 @@
-"""What acting needs of a learner, small: a checkpoint of 9 to 18 MiB in, a file below 0.8 MiB out, and back.
+"""What acting needs of a learner, small: a checkpoint of 9 to 18 MiB in, a file of a quarter MiB out, and back.
 
-Optimisers, critics and targets are left out, weights are stored in half precision, and the two or three large matrices
-as 8-bit numbers with one scale an output. A policy read from such a file acts nearly as the original did; it cannot be
-trained further.
+Optimisers, critics and targets are left out, and large weights are rounded to multiples of a share of their spread. A
+policy read from such a file acts nearly as the original did (docs/results.md says how nearly); it cannot be trained
+further.
 """
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,10 @@ from train.errors import CheckpointError
 from train.files import whole_file
 
 POLICY = "policy.npz"
-LARGE = 100_000
-"""Weight matrices with at least so many numbers are stored as 8-bit numbers."""
+LARGE = 4_000
+"""Weight matrices with at least so many numbers are rounded; smaller ones are stored in half precision."""
+STEP = 0.5
+"""What they are rounded to, in standard deviations of an output's weights: about 3 bits a weight."""
 SCALE = ":scale"
 _LEVELS = 127
 
@@ -44,8 +47,13 @@ def acting_part(learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
     return {k: v for k, v in flat.items() if k.startswith(tuple(wanted))}
 
 
-def packed(leaves: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Large weights as i8 and, under `<name>:scale`, f32 scales of their last axis; others as f16; vectors as is."""
+def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarray]:
+    """Large weights as i8 and, under `<name>:scale`, f32 scales of their last axis; others as f16; vectors as is.
+
+    Args:
+        leaves: name -> array.
+        step: of the rounding, in standard deviations of each output's weights.
+    """
     out: dict[str, np.ndarray] = {}
     for name, leaf in leaves.items():
         array = np.asarray(leaf)
@@ -55,7 +63,8 @@ def packed(leaves: Mapping[str, Any]) -> dict[str, np.ndarray]:
         if array.size < LARGE:
             out[name] = array.astype(np.float16)
             continue
-        scale = np.abs(array).max(tuple(range(array.ndim - 1))).astype(np.float32) / _LEVELS
+        inputs = tuple(range(array.ndim - 1))
+        scale = np.maximum(step * array.std(inputs), np.abs(array).max(inputs) / _LEVELS).astype(np.float32)
         scale[scale == 0] = 1.0
         out[name] = np.rint(array / scale).astype(np.int8)
         out[name + SCALE] = scale
@@ -71,11 +80,13 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
-def write(source: Path, algorithm: str, target: Path) -> None:
-    """A `learner.msgpack` as a `policy.npz`."""
+def write(source: Path, algorithm: str, target: Path, step: float = STEP) -> None:
+    """A `learner.msgpack` as a `policy.npz`, by LZMA: a tenth less than by `np.savez_compressed`."""
     learner = flax.serialization.msgpack_restore(source.read_bytes())
-    with whole_file(target) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, **packed(acting_part(learner, algorithm)))  # type: ignore[arg-type]
+    with whole_file(target) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_LZMA) as file:
+        for name, array in packed(acting_part(learner, algorithm), step).items():
+            with file.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def read(path: Path, template: Any) -> Any:

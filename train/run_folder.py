@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.metadata
 import json
 import os
@@ -17,6 +18,7 @@ import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ import jax
 from train.config import TrainConfig
 from train.config_io import flatten, from_yaml, to_yaml
 from train.errors import RunFolderError
-from train.files import write_text
+from train.files import whole_file, write_text
 
 PACKAGES = (
     *("interactive-nav", "brax", "flax", "jax", "jaxlib", "jax-cuda13-plugin", "mujoco", "mujoco-mjx"),
@@ -38,6 +40,8 @@ MAY_CHANGE = (
 )
 """Settings that a run may be continued with at other values: they do not change what an update does."""
 HEADROOM_MB = 64.0
+METRICS, PACKED_METRICS = "metrics.jsonl", "metrics.jsonl.gz"
+"""Of a run, and of one that was exported."""
 
 FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
 """Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
@@ -49,7 +53,7 @@ class RunFolder:
     def __init__(self, path: Path):
         self.path = path
         self.config = path / "config.yaml"
-        self.metrics = path / "metrics.jsonl"
+        self.metrics = path / METRICS
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
 
@@ -121,14 +125,24 @@ class RunFolder:
     def cut_metrics(self, env_steps: int) -> None:
         """Drops the lines after a checkpoint that a run continues from: their steps are taken again."""
         if self.metrics.is_file():
-            kept = [line for line in read_metrics(self.metrics) if line["env_steps"] <= env_steps]
-            write_text(self.metrics, "".join(json.dumps(line) + "\n" for line in kept))
+            write_metrics(self.metrics, [line for line in read_metrics(self.metrics) if line["env_steps"] <= env_steps])
+
+
+def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
+    """Writes a metrics.jsonl, or, where the name ends in .gz, a packed one."""
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    if path.suffix == ".gz":
+        with whole_file(path) as partial:
+            partial.write_bytes(gzip.compress(text.encode(), mtime=0))
+    else:
+        write_text(path, text)
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl; an unfinished last line (a killed run) is left out."""
+    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out."""
+    everything = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
     lines = []
-    for text in path.read_text().splitlines():
+    for text in everything.decode().splitlines():
         try:
             lines.append(json.loads(text))
         except ValueError:

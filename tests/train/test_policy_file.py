@@ -72,7 +72,7 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
     config, learner = learner_of(env, algorithm, share)
     before = actions(env, config, learner)
     path = saved(tmp_path / "whole", algorithm, learner)
-    checkpoint.keep_policy(path, tmp_path / "kept" / path.name)
+    checkpoint.keep_policy(path, tmp_path / "kept" / path.name, step=0.03)
     kept, _ = checkpoint.find(tmp_path / "kept", "best")
     assert not checkpoint.is_whole(kept) and checkpoint.is_whole(path)
     assert sum(p.stat().st_size for p in kept.iterdir()) < 0.5 * sum(p.stat().st_size for p in path.iterdir())
@@ -96,25 +96,33 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
         assert np.abs(actions(env, config, other) - before).max() > 1e-6, name
 
 
-@given(st.integers(1, 500), st.integers(1, 400), st.floats(1e-3, 1e3))
-def test_within_half_a_step_of_the_largest_weight(outputs, inputs, size):
+@given(st.integers(1, 100), st.integers(1, 100), st.floats(1e-3, 1e3), st.floats(0.01, 2.0))
+def test_within_half_a_step(outputs, inputs, size, step):
     weights = (np.random.default_rng(inputs).normal(size=(inputs, outputs)) * size).astype(np.float32)
-    stored = policy_file.packed({"a/kernel": weights, "a/bias": weights[0]})
+    stored = policy_file.packed({"a/kernel": weights, "a/bias": weights[0]}, step)
     back = policy_file.unpacked(stored)
     np.testing.assert_array_equal(back["a/bias"], weights[0])
     if weights.size < policy_file.LARGE:
         np.testing.assert_array_equal(back["a/kernel"], weights.astype(np.float16))
     else:
         assert stored["a/kernel"].dtype == np.int8
-        half = np.abs(weights).max(0) / 127 / 2
+        half = np.maximum(step * weights.std(0), np.abs(weights).max(0) / 127) / 2
         assert (np.abs(back["a/kernel"] - weights) <= half * (1 + 1e-5) + 1e-30).all()
 
 
 def test_an_output_without_weights_stays_zero():
-    weights = np.zeros((60_000, 2), np.float32)
-    weights[:, 1] = np.linspace(-2.0, 2.0, 60_000)
-    back = policy_file.unpacked(policy_file.packed({"w": weights}))["w"]
-    assert not back[:, 0].any() and back[-1, 1] == 2.0 and back[0, 1] == -2.0
+    weights = np.zeros((4_000, 2), np.float32)
+    weights[:, 1] = np.tile([2.0, -2.0, 1.0, -1.0], 1_000)  # a deviation of the root of 2.5
+    back = policy_file.unpacked(policy_file.packed({"w": weights}, 1.0))["w"]
+    assert not back[:, 0].any()
+    np.testing.assert_allclose(back[:4, 1], np.array([1, -1, 1, -1]) * 2.5**0.5, rtol=1e-6)
+
+
+def test_a_weight_beyond_the_range_of_eight_bits_widens_the_steps():
+    weights = np.zeros((5_000, 1), np.float32)
+    weights[7] = 5.0  # 70 deviations
+    stored = policy_file.packed({"w": weights}, 0.1)
+    assert stored["w"].max() == 127 and policy_file.unpacked(stored)["w"][7] == pytest.approx(5.0)
 
 
 def test_foreign_and_damaged_files_are_told(tmp_path):

@@ -21,7 +21,7 @@ from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha,
 from train.figures.tables import document
 from train.files import whole_file
 from train.rows import read_rows
-from train.run_folder import read_metrics
+from train.run_folder import METRICS, PACKED_METRICS, read_metrics
 from train.statistics import run_means
 
 import matplotlib.pyplot as plt  # isort: skip
@@ -40,7 +40,8 @@ class Results:
 
     def __init__(self, root: Path):
         self.root = root
-        self.curves = {log.parent: lines for log in sorted(root.rglob("metrics.jsonl")) if (lines := read_metrics(log))}
+        logs = sorted([*root.rglob(METRICS), *root.rglob(PACKED_METRICS)])
+        self.curves = {log.parent: lines for log in logs if (lines := read_metrics(log))}
         records = [path for path in sorted(root.rglob("*.npz")) if "checkpoints" not in path.parts]
         self.records = [path for path in records if not path.parent.name.startswith("diverged-")]
         self.tables = [p for p in sorted(root.rglob("*.parquet")) if not p.name.startswith(".")]

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from train.errors import ConfigError, TrainError
+from train.policy_file import STEP
 from train.run_folder import claim
 from train.signals import stop_signals
 from train.sweep import spec
@@ -36,6 +37,13 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--config", metavar="NAME|PATH", help="the same, as `python -m train` takes it")
     made.add_argument("--status", action="store_true", help="print how far every run is, and do nothing")
     made.add_argument("--export", metavar="DIR", help="copy rows, curves and the best run's checkpoint of each cell")
+    made.add_argument(
+        "--policy-step",
+        type=float,
+        default=STEP,
+        metavar="X",
+        help=f"with --export: round the checkpoint's weights to X standard deviations (default {STEP:g})",
+    )
     made.add_argument("--resume", action="store_true", help="only continue: refuse a sweep that was never begun")
     made.add_argument("--only", choices=STAGES, help="train without evaluating, or evaluate what is trained")
     made.add_argument("--redo", action="store_true", help="evaluate again what is evaluated")
@@ -73,6 +81,8 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
             raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
         if arguments.time_limit is not None and arguments.time_limit <= 0:
             raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
+        if not 0 < arguments.policy_step <= 4:
+            raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")
         if arguments.unfinished and arguments.only != "evaluate":
             raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
         sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
@@ -85,7 +95,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         if arguments.export:
             from train.sweep.export import export
 
-            size, best = export(folder, Path(arguments.export))
+            size, best = export(folder, Path(arguments.export), arguments.policy_step)
             for name in best.values():
                 console.print(f"checkpoint of {name}", highlight=False)
             console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)

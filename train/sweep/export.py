@@ -5,7 +5,6 @@ Rows become one file, which takes half of what a file a run does: many columns a
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,27 +14,28 @@ import pyarrow as pa
 
 from train import checkpoint
 from train.errors import CheckpointError, RunFolderError
-from train.files import write_text
+from train.policy_file import STEP
 from train.row_files import files_of_run, paths_beside
 from train.rows import read_notes, read_rows, write_parquet
-from train.run_folder import RunFolder, read_metrics
+from train.run_folder import METRICS, PACKED_METRICS, RunFolder, read_metrics, write_metrics
 from train.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
 
-CURVE_LINES = 100
+CURVE_LINES = 60
 """Lines of metrics that an exported run keeps."""
 KEPT = ("env_steps", "wall_s", "env_steps_per_s", "episodes")
 FILES = ("config.yaml", "versions.json", "summary.json")
 ROWS = "episodes.parquet"
 
 
-def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], str]]:
+def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dict[tuple[Any, ...], str]]:
     """Copies a sweep's results; what is there already of the same runs is replaced.
 
     Args:
         folder: of the sweep.
         out: `<out>/rows/episodes.parquet`, `<out>/rows/_paths` and `<out>/runs` are written.
+        step: to which the kept policies' weights are rounded, see `train.policy_file`.
 
     Returns:
         Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
@@ -54,11 +54,12 @@ def export(folder: SweepFolder, out: Path) -> tuple[int, dict[tuple[Any, ...], s
                 if (source.path / name).is_file():
                     shutil.copy2(source.path / name, target / name)
             lines = thinned(read_metrics(source.metrics), CURVE_LINES)
-            write_text(target / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+            write_metrics(target / PACKED_METRICS, lines)
+            (target / METRICS).unlink(missing_ok=True)
             shutil.rmtree(target / "checkpoints", ignore_errors=True)
         best = best_runs(folder, runs)
         for name in best.values():
-            _keep_checkpoint(folder, name, out / "runs" / name / "checkpoints")
+            _keep_checkpoint(folder, name, out / "runs" / name / "checkpoints", step)
     except OSError as error:
         raise RunFolderError(f"{out}: cannot be written ({error.strerror or error}); make room") from None
     return sum(path.stat().st_size for path in out.rglob("*") if path.is_file()), best
@@ -126,10 +127,10 @@ def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     return out
 
 
-def _keep_checkpoint(folder: SweepFolder, run: str, target: Path) -> None:
+def _keep_checkpoint(folder: SweepFolder, run: str, target: Path, step: float) -> None:
     """Writes the policy of the checkpoint that was evaluated."""
     try:
         path, _ = checkpoint.find(folder.runs / run / "checkpoints", folder.sweep.config.evaluate.checkpoint)
     except CheckpointError:
         return
-    checkpoint.keep_policy(path, target / path.name)
+    checkpoint.keep_policy(path, target / path.name, step)

@@ -13,7 +13,7 @@ from tests.train.synthetic import run_rows
 from train import checkpoint
 from train.row_files import paths_beside
 from train.rows import read_notes, read_rows, write_parquet
-from train.run_folder import read_metrics
+from train.run_folder import PACKED_METRICS, read_metrics
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.export import thinned
@@ -81,7 +81,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
         (kept,) = (out / "rows" / "_paths").iterdir()
         assert kept.name == paths_beside(rows).name and kept.read_bytes() == b"where it went"
         assert sorted(path.name for path in (out / "runs").iterdir()) == [run.name for run in swept.sweep.runs]
-        assert read_metrics(out / "runs" / "k_int1-seed0" / "metrics.jsonl") == [{"env_steps": 5, "episodes": 1.0}]
+        assert read_metrics(out / "runs" / "k_int1-seed0" / PACKED_METRICS) == [{"env_steps": 5, "episodes": 1.0}]
         (kept,) = out.rglob("policy.npz")
         assert kept.parts[-4] == "k_int0-seed1" and not list(out.rglob(checkpoint.ENV_STATE))
         path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
