@@ -133,8 +133,9 @@ class SceneRenderer:
     def _gl_painter(self) -> Painter:
         from topological_nav.gl import GlPainter
 
-        painter = GlPainter(self._model, self._data, self._large, _SHOWN)
-        return lambda pos, axes: shrink(painter.draw(pos, axes), self._by)
+        painter, by = GlPainter(self._model, self._data, self._large, _SHOWN), self._by
+        # Without `self`: a context holds some 100 MiB, and goes with its renderer, not when cycles are collected.
+        return lambda pos, axes: shrink(painter.draw(pos, axes), by)
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
