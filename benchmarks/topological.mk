@@ -7,16 +7,19 @@
 # What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
 # PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes; SIZE=full trains one, RUNS/ppo.
 # GPUS="0 1 2 3" spreads the commands over these.
+# Not part of `all`: `renderer` (MuJoCo's renderer as the target; needs EGL or OSMesa), `scan` (SCAN=FOLDER, a converted room).
 
 PY ?= python
 SIZE ?= full
 RUNS ?= runs/topological-$(SIZE)
 GPUS ?=
+SCAN ?=
 SEEN = alder birch cedar elm hazel juniper linden maple
 UNSEEN = rowan willow
 ALL = $(SEEN) $(UNSEEN)
 
 ifeq ($(SIZE),full)
+  IMAGES =
   DATA = passage_sources=40
   MORE_POSITIONS = positions=600 max_per_room=40 passage_sources=1
   ROOMS = width=16 hidden=64 batch=128 learning_rate=1e-3 epochs=40
@@ -68,12 +71,14 @@ run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s)
 D = $(RUNS)/done
 MAPS = $(ALL:%=$(D)/map-%)
 .DEFAULT_GOAL := all
-.PHONY: all networks maps evaluation transfer
+.PHONY: all networks maps evaluation transfer renderer scan
 all: networks maps $(D)/policy evaluation transfer $(D)/export
 networks: $(D)/rooms $(D)/rooms-selfsup $(D)/rooms-more $(D)/passages $(D)/alexnet
 maps: $(MAPS)
 evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
 transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
+renderer: $(D)/features-gl $(D)/adapted-passages-gl $(D)/evaluation-unadapted-gl $(D)/evaluation-adapted-gl
+scan: $(D)/features-scan $(D)/adapted-passages-scan $(D)/unadapted-map-scan $(D)/adapted-map-scan
 
 $(D)/data:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
@@ -124,7 +129,7 @@ $(D)/evaluation-ahead1: $(call each,evaluation-ahead1)
 	$(call run,$(call ahead1,$(call folders,$(ALL))))
 
 # Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.
-$(D)/features: $(D)/rooms
+$(D)/features: $(D)/data $(D)/rooms
 	$(call run,$(NAV) adapt features --data $(RUNS)/data --localiser $(RUNS)/rooms -o $(RUNS)/features $(FEATURES))
 $(D)/data-unseen:
 	$(call run,$(NAV) data $(call folders,$(UNSEEN)) -o $(RUNS)/data-unseen $(DATA))
@@ -135,11 +140,47 @@ $(D)/unadapted-map-%: $(D)/rooms $(D)/passages $(D)/data-unseen
 	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(WITH) -o $(RUNS)/maps-unadapted/$*.npz)
 $(D)/adapted-map-%: $(D)/features $(D)/adapted-passages
 	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(ADAPTED) -o $(RUNS)/maps-adapted/$*.npz)
-driven = $(NAV) evaluate $(call folders,$(UNSEEN)) --contenders dense --domain camera -o $(RUNS)/$(notdir $@) $(SECONDARY)
+driven = $(NAV) evaluate $(call folders,$(UNSEEN)) --contenders dense$(1) -o $(RUNS)/$(notdir $@) $(SECONDARY)
 $(D)/evaluation-unadapted: $(UNSEEN:%=$(D)/unadapted-map-%)
-	$(call run,$(driven) --maps $(RUNS)/maps-unadapted $(WITH))
+	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-unadapted $(WITH))
 $(D)/evaluation-adapted: $(UNSEEN:%=$(D)/adapted-map-%)
-	$(call run,$(driven) --maps $(RUNS)/maps-adapted $(ADAPTED))
+	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-adapted $(ADAPTED))
+
+# Targets that are datasets of their own, seen as they are: another renderer (gl), and a scanned room (scan). The dataset
+# is the one that a target depends on; $(D)/data is named beside $(D)/rooms, because networks may come from elsewhere (-o).
+seen = $(patsubst $(D)/%,--target $(RUNS)/%,$(filter $(D)/data-%,$^)) domain=clean
+ADAPTED_TO = --localiser $(RUNS)/features-$(1) --detector $(RUNS)/adapted-passages-$(1)
+$(D)/features-gl $(D)/features-scan: $(D)/features-%: $(D)/data $(D)/rooms $(D)/data-%
+	$(call run,$(NAV) adapt features --data $(RUNS)/data --localiser $(RUNS)/rooms -o $(RUNS)/features-$* $(seen) $(FEATURES))
+$(D)/adapted-passages-gl: $(D)/data-gl-unseen
+$(D)/adapted-passages-scan: $(D)/data-scan-passages
+$(D)/adapted-passages-gl $(D)/adapted-passages-scan: $(D)/passages
+	$(call run,$(NAV) adapt passages --detector $(RUNS)/passages -o $(RUNS)/$(notdir $@) $(seen))
+
+$(D)/data-gl:
+	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-gl $(DATA) engine=gl)
+$(D)/data-gl-unseen:
+	$(call run,$(NAV) data $(call folders,$(UNSEEN)) -o $(RUNS)/data-gl-unseen $(DATA) engine=gl)
+$(UNSEEN:%=$(D)/unadapted-map-gl-%): $(D)/unadapted-map-gl-%: $(D)/rooms $(D)/passages $(D)/data-gl-unseen
+	$(call run,$(NAV) adapt map scenes_mjcf/$* $(WITH) -o $(RUNS)/maps-unadapted-gl/$*.npz $(seen))
+$(UNSEEN:%=$(D)/adapted-map-gl-%): $(D)/adapted-map-gl-%: $(D)/features-gl $(D)/adapted-passages-gl $(D)/data-gl-unseen
+	$(call run,$(NAV) adapt map scenes_mjcf/$* $(call ADAPTED_TO,gl) -o $(RUNS)/maps-adapted-gl/$*.npz $(seen))
+$(D)/evaluation-unadapted-gl: $(UNSEEN:%=$(D)/unadapted-map-gl-%)
+	$(call run,$(driven) --maps $(RUNS)/maps-unadapted-gl $(WITH))
+$(D)/evaluation-adapted-gl: $(UNSEEN:%=$(D)/adapted-map-gl-%)
+	$(call run,$(driven) --maps $(RUNS)/maps-adapted-gl $(call ADAPTED_TO,gl))
+
+# One room, too small for many ways of 2 m: passages are balanced and scored at 1 m.
+scanned = $(or $(SCAN),$(error SCAN is not given, expected the folder of a converted scene: SCAN=FOLDER))
+$(D)/data-scan:
+	$(call run,$(NAV) data $(scanned) -o $(RUNS)/data-scan $(IMAGES) num_rooms=1 max_per_room=40 passage_sources=60)
+$(D)/data-scan-passages:
+	$(call run,$(NAV) data $(scanned) -o $(RUNS)/data-scan-passages $(IMAGES) num_rooms=1 max_per_room=2 \
+	  passage_sources=80 passage_length_m=1.0 test_share=0.3)
+$(D)/unadapted-map-scan: $(D)/rooms $(D)/passages $(D)/data-scan
+	$(call run,$(NAV) adapt map $(scanned) $(WITH) -o $(RUNS)/maps-unadapted-scan/scan.npz $(seen))
+$(D)/adapted-map-scan: $(D)/features-scan $(D)/adapted-passages-scan $(D)/data-scan
+	$(call run,$(NAV) adapt map $(scanned) $(call ADAPTED_TO,scan) -o $(RUNS)/maps-adapted-scan/scan.npz $(seen))
 
 $(D)/export: $(D)/rooms $(D)/passages $(D)/policy
 	$(call run,$(NAV) export $(WITH) --policy $(RUNS)/policy --images $(RUNS)/data -o $(RUNS)/export)

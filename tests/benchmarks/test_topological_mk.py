@@ -1,9 +1,11 @@
 """Every command of benchmarks/topological.mk is one that the command line takes, in an order that can work."""
 
+import dataclasses
 import re
 import shlex
 import shutil
 import subprocess
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
@@ -42,26 +44,94 @@ def settings_of(arguments):
     ]()
 
 
+def commands_of(shown: str) -> list[list[str]]:
+    """Words of each command of `topological_nav`; those over two lines as one."""
+    joined = shown.replace("\\\n", " ")
+    return [shlex.split(line) for line in re.findall(r"if python -m topological_nav (.*?) >>/nowhere", joined)]
+
+
+def understood(words: list[str], made: Collection[str]):
+    """Arguments and settings of a command; what it reads in RUNS is made before."""
+    settings = [word for word in words if re.match(r"\w+=", word)]
+    arguments = parser().parse_args([word for word in words if word not in settings])
+    for name in ("localiser", "detector", "data", "target", "maps"):
+        needed = getattr(arguments, name, None)
+        if needed is not None and str(needed).startswith("/nowhere"):
+            assert any(done == str(needed) or done.startswith(f"{needed}/") for done in made), (words, name)
+    return arguments, overridden(settings_of(arguments), settings)
+
+
 @pytest.mark.parametrize("size", ["full", "cpu"])
 def test_all_commands_are_understood_and_made_in_order(size):
-    commands = [
-        shlex.split(line)
-        for line in re.findall(r"if python -m topological_nav (.*?) >>/nowhere", listed(f"SIZE={size}"))
-    ]
+    commands = commands_of(listed(f"SIZE={size}"))
     # Four datasets, five networks, ten maps, policy, three evaluations of ten scenes each on its own and then summed
     # up, two of another domain, two adaptations, four maps of them, export.
     assert len(commands) == len({tuple(words) for words in commands}) == 4 + 5 + 10 + 1 + 3 * 11 + 2 + 2 + 4 + 1
     made: set[str] = set()
     for words in commands:
-        settings = [word for word in words if re.match(r"\w+=", word)]
-        arguments = parser().parse_args([word for word in words if word not in settings])
-        overridden(settings_of(arguments), settings)
-        out = str(arguments.out)
-        for name in ("localiser", "detector", "data", "target", "maps"):
-            needed = getattr(arguments, name, None)
-            if needed is not None and str(needed).startswith("/nowhere"):
-                assert any(done == str(needed) or done.startswith(f"{needed}/") for done in made), (words, name)
-        made.add(out)
+        made.add(str(understood(words, made)[0].out))
+
+
+def with_given_networks(*words: str):
+    """Output in RUNS -> arguments and settings of its command, where the source's networks lie in RUNS already."""
+    made, done = {"/nowhere/rooms", "/nowhere/passages"}, {}
+    for command in commands_of(listed(*words, "-o", "/nowhere/done/rooms", "-o", "/nowhere/done/passages")):
+        arguments, settings = understood(command, made)
+        made.add(str(arguments.out))
+        done[str(arguments.out).removeprefix("/nowhere/")] = arguments, settings
+    return done
+
+
+@pytest.mark.parametrize("size", ["full", "cpu"])
+def test_another_renderer_is_a_target_without_training_again(size):
+    done = with_given_networks(f"SIZE={size}", "renderer")
+    maps = [f"maps-{which}-gl/{scene}.npz" for which in ("unadapted", "adapted") for scene in ("rowan", "willow")]
+    adapted = ["features-gl", "adapted-passages-gl", *maps]
+    driven = ["evaluation-unadapted-gl", "evaluation-adapted-gl"]
+    assert sorted(done) == sorted(["data", "data-gl", "data-gl-unseen", *adapted, *driven])
+    assert [done[name][1].engine for name in ("data", "data-gl", "data-gl-unseen")] == ["warp", "gl", "gl"]
+    # The same positions and passages, drawn by another engine.
+    assert dataclasses.replace(done["data-gl"][1], engine="warp") == done["data"][1]
+    assert done["data-gl"][0].scenes == done["data"][0].scenes
+    assert {done[name][1].domain for name in adapted} == {"clean"}
+    targets = {name: str(done[name][0].target).removeprefix("/nowhere/") for name in adapted}
+    assert targets == dict.fromkeys(adapted, "data-gl-unseen") | {"features-gl": "data-gl"}
+    for name, (localiser, detector) in {
+        "unadapted": ("rooms", "passages"),
+        "adapted": ("features-gl", "adapted-passages-gl"),
+    }.items():
+        arguments, _ = done[f"evaluation-{name}-gl"]
+        assert (arguments.contenders, arguments.domain) == ("dense", "clean")
+        assert str(arguments.maps) == f"/nowhere/maps-{name}-gl"
+        of_map, _ = done[f"maps-{name}-gl/willow.npz"]
+        for used in (arguments, of_map):
+            assert (str(used.localiser), str(used.detector)) == (f"/nowhere/{localiser}", f"/nowhere/{detector}")
+
+
+@pytest.mark.parametrize("size", ["full", "cpu"])
+def test_a_scanned_room_is_a_target_where_it_is_given(size):
+    done = with_given_networks(f"SIZE={size}", "scan", "SCAN=/elsewhere/room")
+    maps = ["maps-unadapted-scan/scan.npz", "maps-adapted-scan/scan.npz"]
+    adapted = ["features-scan", "adapted-passages-scan", *maps]
+    assert sorted(done) == sorted(["data", "data-scan", "data-scan-passages", *adapted])
+    kept = ("num_rooms", "max_per_room", "passage_sources", "passage_length_m", "test_share")
+    assert [tuple(getattr(done[name][1], k) for k in kept) for name in ("data-scan", "data-scan-passages")] == [
+        (1, 40, 60, 2.0, 0.2),
+        (1, 2, 80, 1.0, 0.3),
+    ]
+    assert {done[name][1].domain for name in adapted} == {"clean"}
+    targets = {name: str(done[name][0].target).removeprefix("/nowhere/") for name in adapted}
+    assert targets == dict.fromkeys(adapted, "data-scan") | {"adapted-passages-scan": "data-scan-passages"}
+    folders = [done[name][0].scenes for name in ("data-scan", "data-scan-passages")]
+    assert folders == [["/elsewhere/room"]] * 2 and {done[name][0].scene for name in maps} == {"/elsewhere/room"}
+    assert str(done[maps[1]][0].localiser) == "/nowhere/features-scan"
+
+
+def test_without_a_scan_it_says_how_to_name_one():
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        listed("scan")
+    assert "SCAN is not given, expected the folder of a converted scene: SCAN=FOLDER" in refused.value.stderr
+    assert "scan" not in listed()
 
 
 def test_a_policy_told_the_goal_is_trained_where_none_is_given():

@@ -48,7 +48,7 @@ poses = np.asarray(camera.pos_w), np.asarray(camera.axes_w)
 np.savez(sys.argv[1], depth=painter.draw(*poses, depth=True), colour=painter.draw(*poses))
 """
 ROOMS = """
-import sys, numpy as np
+import gc, sys, weakref, numpy as np
 from pathlib import Path
 from interactive_nav.rendering.base import Lens
 from interactive_nav.robots import get_robot
@@ -58,7 +58,10 @@ asked = np.load(sys.argv[2])
 lens = Lens(int(asked["width"]), int(asked["height"]), float(asked["fov_deg"]))
 renderer = SceneRenderer(load_scene(Path(sys.argv[3])), lens, int(asked["finer"]), engine="gl", batch=4)
 pose = camera_pose(get_robot("ttbot"), asked["places"], asked["headings"], np.full(len(asked["places"]), -0.1))
-np.savez(sys.argv[1], images=renderer.draw(pose))
+images, held = renderer.draw(pose), weakref.ref(renderer)
+gc.disable()
+del renderer
+np.savez(sys.argv[1], images=images, held=held() is not None)
 """
 
 
@@ -93,14 +96,23 @@ def test_a_box_is_as_far_and_as_large_as_by_hand(gl_here, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def both(gl_here, painted, tmp_path_factory):
-    """The painted rooms by both engines, from above the panels."""
+def by_gl(gl_here, painted, tmp_path_factory):
+    """The painted rooms, from above the panels, and whether the renderer outlives its last use."""
     folder = tmp_path_factory.mktemp("gl")
     lens = {"width": LENS.width, "height": LENS.height, "fov_deg": LENS.fov_deg}
     np.savez(folder / "asked.npz", places=PLACES, headings=HEADINGS, finer=FINER, **lens)
-    by_gl = drawn(ROOMS, folder, folder / "asked.npz", painted)["images"]
+    return drawn(ROOMS, folder, folder / "asked.npz", painted)
+
+
+@pytest.fixture(scope="module")
+def both(by_gl, painted):
+    """The same by both engines."""
     pose = camera_pose(get_robot("ttbot"), PLACES, HEADINGS, np.full(4, -0.1))
-    return by_gl, SceneRenderer(load_scene(painted), LENS, FINER, engine="warp", batch=4).draw(pose)
+    return by_gl["images"], SceneRenderer(load_scene(painted), LENS, FINER, engine="warp", batch=4).draw(pose)
+
+
+def test_a_context_goes_with_its_renderer(by_gl):
+    assert not by_gl["held"]
 
 
 def kinds(images):

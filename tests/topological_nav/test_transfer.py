@@ -257,6 +257,39 @@ def test_commands_draw_and_go_on(made, alexnet, tmp_path, capsys):
         assert picture.shape[0] > 400 and picture.std() > 10
 
 
+def adapted_from(out, source):
+    """Whether a folder holds a run of its own, in full precision, that began with the source."""
+    about, kinds = load_trained(out).about, {leaf.dtype for leaf in jax.tree.leaves(load_trained(out).variables)}
+    begun = about["adapted_from"] == load_trained(source).about["digest"] != about["digest"]
+    return begun and "export" not in about and kinds == {jnp.dtype("float32")}
+
+
+def test_an_exported_detector_is_fine_tuned_and_makes_maps_like_the_runs(made, exported, tmp_path):
+    """Weights in half precision, no optimiser state."""
+    out, rooms, passages = tmp_path / "passages", exported / "rooms", exported / "passages"
+    config = AdaptConfig(domain="clean", fine_tune=40, test=10**6, fine_tune_epochs=1)
+    results = transfer.passage_configurations(passages, made.data, out, config)
+    assert results is not None and adapted_from(out, made.passages)
+    own = json.loads((made.passages / "results.json").read_text())
+    assert results["C"]["macro_f1"] == pytest.approx(own["groups"]["all"]["macro_f1"], abs=0.02)
+    of = [
+        transfer.collected_map(made.scene, made.data, *networks, config).map
+        for networks in ((rooms, passages), (made.rooms, made.passages), (rooms, out))
+    ]
+    assert of[0].p == pytest.approx(of[1].p, abs=0.02)
+    assert of[0].embeddings == pytest.approx(of[1].embeddings, abs=0.02)
+    assert of[2].p != pytest.approx(of[0].p, abs=1e-3)
+
+
+@pytest.mark.heavy
+def test_an_exported_embedding_is_adapted(made, exported, tmp_path):
+    config = AdaptConfig(domain="clean", epochs=1, hidden=8)
+    results = adaptation.adapt_features(exported / "rooms", made.data, made.data, tmp_path / "features", config)
+    assert results is not None and adapted_from(tmp_path / "features", made.rooms)
+    own = localisation(load_trained(exported / "rooms"), load_rooms(made.data))["mean"]
+    assert results["source"] == results["before"] and results["before"]["mean"] == pytest.approx(own)
+
+
 def test_what_does_not_fit_is_refused(made, adapted, painted, tmp_path, capsys):
     with pytest.raises(SettingsError, match="domain is 'fog', expected one of clean"):
         AdaptConfig(domain="fog")
