@@ -100,6 +100,10 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
 def test_within_half_a_step(outputs, inputs, size, step):
     weights = (np.random.default_rng(inputs).normal(size=(inputs, outputs)) * size).astype(np.float32)
     stored = policy_file.packed({"a/kernel": weights, "a/bias": weights[0]}, step)
+    assert set(policy_file.coded(stored)) == set(stored) | ({"a/kernel:shape"} if "a/kernel:scale" in stored else set())
+    again = policy_file.decoded(policy_file.coded(stored))
+    assert again.keys() == stored.keys()
+    assert all(again[name].dtype == array.dtype and (again[name] == array).all() for name, array in stored.items())
     back = policy_file.unpacked(stored)
     np.testing.assert_array_equal(back["a/bias"], weights[0])
     if weights.size < policy_file.LARGE:
