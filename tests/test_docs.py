@@ -1,7 +1,7 @@
 """The documentation says what is so: its Python runs, its commands parse, its options exist, its links lead somewhere.
 
-Python blocks of one page run in order in one namespace, in a folder that holds the checked-in scenes. A block is left
-out only where an HTML comment right before it says why: `<!-- not run: reason -->`.
+Python blocks of one page run in order in one namespace, in a folder that holds the checked-in scenes and results. A
+block is left out only where an HTML comment right before it says why: `<!-- not run: reason -->`.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def commands(text: str) -> list[tuple[str, list[str]]]:
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """A folder to run in: the scenes, and nothing else of the checkout."""
-    (tmp_path / "scenes_mjcf").symlink_to(ROOT / "scenes_mjcf")
+    for name in ("scenes_mjcf", "results"):
+        (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
 
 

@@ -15,6 +15,7 @@ from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
 from train.row_files import paths_beside
 from train.rows import write_parquet
+from train.statistics import claims
 
 
 def xy(line) -> np.ndarray:
@@ -229,3 +230,37 @@ def test_looks_keep_apart():
 
 def test_markdown_tables_by_hand():
     assert tables.markdown(("a", "b"), [(1, "x")]) == "| a | b |\n| --- | --- |\n| 1 | x |\n"
+
+
+def episodes_of(policy: str, success: list[float], **more: object) -> pa.Table:
+    """Rows of one policy in the same tasks."""
+    count = len(success)
+    columns = {"policy": policy, "robot": "fetch", "scene": "rowan", "k_int": 1.0, **more}
+    return pa.table({"episode": list(range(count)), "success": success, **{n: [v] * count for n, v in columns.items()}})
+
+
+def test_success_where_touching_is_needed_by_hand():
+    avoider = episodes_of("avoider", [1.0, 0.0, 1.0])
+    learned = episodes_of("learned", [1.0, 0.0, 0.0, 1.0])  # the avoider never played the last one
+    assert "| Fetch | 1 | 0.500 (2) | 0.000 (1) |" in tables.need_lines(pa.concat_tables([learned, avoider]))
+    assert tables.need_lines(learned) == "" and tables.need_lines(pa.table({"policy": ["learned"]})) == ""
+    elsewhere = episodes_of("avoider", [1.0, 0.0], scene="willow")
+    assert tables.need_lines(pa.concat_tables([learned, elsewhere])) == ""
+
+
+def test_effort_without_walls_leaves_their_episodes_out():
+    """Walls take from the dynamic term where k_int is 1: with them the claim fails, without them it holds."""
+    free = paper_like()
+    count = len(free)
+    at_walls = np.array([(k == 1.0) * (i % 2) for i, k in enumerate(free["k_int"].to_pylist())], float)
+    lost = free["effort_efficiency"].to_numpy() - 0.8 * at_walls
+    rows = free.set_column(free.column_names.index("effort_efficiency"), "effort_efficiency", pa.array(lost))
+    rows = rows.append_column("structure_steps", pa.array(at_walls))
+    claim = "k_int = 1 gains effort efficiency and loses path efficiency"
+    told = {f.compared: f.verdict for f in claims(rows, "test") if f.claim == claim and "E_eff" in f.compared}
+    assert set(told.values()) == {"does not hold: lower"}
+    assert len(tables.without_walls(rows)) == count - at_walls.sum()
+    lines = [line for line in tables.effort_lines(rows, "test").splitlines() if claim in line]
+    assert len(lines) == 2 and all(line.endswith("| holds |") and "P_eff" not in line for line in lines)
+    assert tables.effort_lines(free, "test") == ""  # rows that do not tell
+    assert "## Effort without walls" in tables.document(rows, "test")

@@ -20,6 +20,8 @@ from train.statistics import RunMean, cells, correlation, estimate, p_text, run_
 ALPHAS = np.linspace(0.0, 1.0, 11)
 DOTS = 3000
 """Episodes drawn at most as dots."""
+FREE, WALLS = "0.7", "#e3b778"
+"""Colours of episodes: that touched no wall, and that did."""
 SPLITS = {"train": "seen (training) scenes", "test": "unseen (test) scenes", None: "all scenes"}
 
 
@@ -152,10 +154,15 @@ def robots_plane(rows: pa.Table, split: str | None) -> Figure:
 
 
 def effort_terms(rows: pa.Table, split: str | None) -> Figure:
-    """Kinematic against dynamic term of E_eff (paper, figure 10): runs large, some of their episodes as dots."""
+    """Kinematic against dynamic term of E_eff (paper, figure 10): runs large, some of their episodes as dots.
+
+    Forces on walls count in the dynamic term, so episodes that touched one look different.
+    """
     means = run_means(rows, split)
     has = Legend(means)
     episodes = _learned(rows, split)
+    told = "structure_steps" in episodes.column_names
+    touched = episodes["structure_steps"].to_numpy() > 0 if told else np.zeros(len(episodes), bool)
     with style.applied():
         wide = len(has.robots)
         figure, grid = plt.subplots(1, wide, figsize=(3.9 * wide, 4.3), squeeze=False, layout="constrained")
@@ -163,7 +170,9 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
             chosen = np.asarray(episodes["robot"].to_pylist()) == robot
             x, y = (episodes[name].to_numpy()[chosen] for name in ("kinematic_effort", "dynamic_effort"))
             shown = np.random.default_rng(0).permutation(len(x))[:DOTS]
-            axis.scatter(x[shown], y[shown], s=3, color="0.75", linewidths=0, rasterized=True, zorder=1)
+            walls = touched[chosen][shown]
+            for at, colour, above in ((~walls, FREE, 2), (walls, WALLS, 1)):
+                axis.scatter(x[shown][at], y[shown][at], s=3, color=colour, linewidths=0, rasterized=True, zorder=above)
             runs = [run for run in means if run.robot == robot]
             for run in runs:
                 colour, marker = style.look(style.ALGORITHMS, run.algorithm, has.algorithms)
@@ -189,9 +198,10 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
             axis.set_xlim(low - 0.02, 1.02)
             axis.set_ylim(low - 0.02, 1.02)
             axis.set_aspect("equal")
-        dot: Any = Line2D([], [], color="0.75", marker=".", linestyle="", label="episode")
+        kinds = ((FREE, "episode"), (WALLS, "episode that touched a wall")) if touched.any() else ((FREE, "episode"),)
+        dots: list[Any] = [Line2D([], [], color=c, marker=".", linestyle="", label=name) for c, name in kinds]
         handles = _without_line([*has.algorithm_handles(), *has.k_int_handles()])
-        figure.legend(handles=[*handles, dot], loc="outside lower center", ncols=4 if wide == 1 else 7)
+        figure.legend(handles=[*handles, *dots], loc="outside lower center", ncols=4)
         figure.suptitle(SPLITS[split] or "", fontsize=9)
     return figure
 

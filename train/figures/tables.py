@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from train.figures import style
 from train.rows import interval
@@ -60,6 +61,44 @@ def claim_lines(rows: pa.Table, split: str | None) -> str:
     return markdown(("claim", "compared", "difference [95 % interval], p", "here"), lines)
 
 
+def without_walls(rows: pa.Table) -> pa.Table:
+    """Episodes in which the robot touched no wall; all where rows do not tell."""
+    return rows.filter(pc.field("structure_steps") == 0) if "structure_steps" in rows.column_names else rows
+
+
+def effort_lines(rows: pa.Table, split: str | None) -> str:
+    """What the claims on effort come to without walls; empty where no episode touched one."""
+    free = without_walls(rows)
+    if len(free) == len(rows):
+        return ""
+    lines = [
+        (f.claim, f.compared, f.result, f.verdict)
+        for f in claims(free, split)
+        if any(name in f"{f.claim} {f.compared}," for name in ("E_eff", "INS_0,"))
+    ]
+    return markdown(("claim", "compared", "difference [95 % interval], p", "here"), lines)
+
+
+def need_lines(rows: pa.Table) -> str:
+    """Success by whether the avoider, which touches nothing, reached the goal of the same episode; empty without it."""
+    names = ("policy", "robot", "scene", "episode", "k_int", "success")
+    if not set(names) <= set(rows.column_names):
+        return ""
+    every = list(zip(*(rows[name].to_pylist() for name in names), strict=True))
+    avoidable = {tuple(task): success > 0 for policy, *task, _, success in every if policy == "avoider"}
+    found: dict[tuple[str, float], dict[bool, list[float]]] = {}
+    for policy, *task, k_int, success in every:
+        if policy == "learned" and tuple(task) in avoidable:
+            cell = found.setdefault((task[0], k_int), {True: [], False: []})
+            cell[avoidable[tuple(task)]].append(success)
+    lines = []
+    for (robot, k_int), cell in sorted(found.items()):
+        scores = [f"{np.mean(cell[free]):.3f} ({len(cell[free]):,})" if cell[free] else "-" for free in (True, False)]
+        lines.append((style.robot_name(robot), f"{k_int:g}", *scores))
+    header = ("robot", "k_int", "success where the avoider arrived (episodes)", "where it did not")
+    return markdown(header, lines) if lines else ""
+
+
 def provenance(rows: pa.Table) -> str:
     """Env steps, wall-clock, device and commit of every run."""
     names = ("run", "train_env_steps", "checkpoint_steps", "train_wall_s", "train_device", "train_commit", "device")
@@ -100,6 +139,20 @@ def document(rows: pa.Table, split: str | None) -> str:
         "`undecided` and `no significant difference` say that these runs cannot tell, not that there is none.",
         claim_lines(rows, split),
     ]
+    if effort := effort_lines(rows, split):
+        parts += [
+            "## Effort without walls",
+            "The same comparisons over the episodes that touched no wall. The dynamic term of E_eff counts forces on "
+            "walls, the penalty counts movable objects only. Which episodes these are depends on the policy.",
+            effort,
+        ]
+    if need := need_lines(rows):
+        parts += [
+            "## Where touching is needed",
+            "All scenes and algorithms, the episodes that the avoider played too: it knows where everything stands and "
+            "touches nothing; where it does not arrive, it found no way wide enough.",
+            need,
+        ]
     if known := yardsticks(rows):
         parts += ["## Policies that never learned", "Mean over episodes [95 % interval].", known]
     if runs := provenance(rows):
