@@ -291,7 +291,7 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
 
     robots = sorted({run.robot for run in means})
     algorithms = sorted({run.algorithm for run in means})
-    for robot in [r for r in robots if r == "turtlebot"] or robots[:1]:
+    for robot in robots:
         for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
             what = f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
             compare("SAC is best overall", what, "higher", lambda r: r.ins(0.5), "algorithm", "sac", other, robot=robot)
