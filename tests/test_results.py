@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -77,3 +78,24 @@ def test_the_topological_tables_are_those_of_their_rows(size, rows, table):
         assert (size == "cpu" and who == "expert") or all(score in told for score in (success, spl, rc)), who
     if (size, table) == ("full", "summary.md"):
         assert [line for line in lines if line.startswith("| dense |") and line not in told] == []
+
+
+@pytest.mark.parametrize("name", ["ahead1", "batch", "unadapted", "adapted", "unadapted-gl", "adapted-gl"])
+def test_the_further_topological_tables_are_those_of_their_rows(name):
+    folder = ROOT / "results" / "topological" / "full"
+    played = read_rows(sorted((folder / f"rows-{name}").glob("*.parquet")))
+    assert markdown(summary(played), differences(played)) == (folder / f"summary-{name}.md").read_text()
+    # docs/topological.md has the means over ten scenes, but a line for each of two: their mean's interval says nothing.
+    told, found = (ROOT / "docs" / "topological.md").read_text(), summary(played)
+    scenes = [line for line in found if line.group not in ("seen", "unseen", "all")]
+    for line in scenes if len(scenes) == 2 else found[-1:]:
+        assert " | ".join(str(line.scores[score]) for score in ("success", "spl", "rc")) in told, line
+
+
+def test_the_topological_results_name_no_folder_of_a_machine():
+    for path in (ROOT / "results" / "topological").rglob("*"):
+        if path.suffix == ".parquet":
+            columns = read_rows([path]).select(["policy", "device", "commit"]).to_pydict()
+            assert not [value for values in columns.values() for value in set(values) if value.startswith("/")], path
+        elif path.is_file():
+            assert not re.search(r"(?<![\w.-])/(tmp|root|home|work)/", path.read_text()), path
