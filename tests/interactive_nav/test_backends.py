@@ -1,4 +1,4 @@
-"""C MuJoCo, MJX-JAX and MJX-Warp step the same toy scenes alike; the two upstream limits that we work round."""
+"""C MuJoCo, MJX-JAX and MJX-Warp step the same toy scenes alike; the upstream limits that we work round."""
 
 import dataclasses
 import functools
@@ -261,6 +261,14 @@ def test_upstream_mjx_jax_still_has_no_contact_sensors_between_bodies(world):
     """MjxPhysics sums contact forces itself on `jax`. When this fails, read the sensors there too."""
     with pytest.raises(NotImplementedError, match="Contact sensor"):
         mjx.put_model(world.models[0], impl="jax")
+
+
+def test_upstream_mjx_warp_still_has_no_deterministic_mode():
+    """google-deepmind/mujoco_warp#562. When this fails, ask for it where a run is to repeat, and tell it in
+    docs/training.md."""
+    types = pytest.importorskip("mujoco.mjx.third_party.mujoco_warp._src.types")
+    names = {field.name for field in dataclasses.fields(types.Option)}
+    assert {"timestep", "solver"} <= names and not [name for name in names if "determinis" in name]
 
 
 MOTOR = """<mujoco><option timestep=".02" integrator="implicitfast"/><worldbody><body><joint name="j" axis="0 1 0"

@@ -72,6 +72,21 @@ def test_train_resume_and_evaluate(tmp_path, capsys):
     assert str(tmp_path / "absent") in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_seed_gives_the_same_policy_again(tmp_path):
+    """On C MuJoCo, with threads; another seed gives another one."""
+    room = write_room(tmp_path / "room")
+    env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=12, num_objects=2)
+    toy = toy_config(tmp_path / "runs", updates=2)
+
+    def digest(name: str, seed: int) -> str:
+        run = dataclasses.replace(toy.run, name=name, seed=seed)
+        _, folder, _ = train_run(TrainConfig(env=env, ppo=toy.ppo, run=run), Console(file=io.StringIO()))
+        return checkpoint.weights_digest(checkpoint.find(folder.checkpoints, "last")[0])
+
+    assert digest("once", 0) == digest("again", 0) != digest("other", 1)
+
+
 @pytest.mark.heavy
 @pytest.mark.slow
 def test_a_policy_that_sees_trains_and_is_scored(tmp_path, capsys):
