@@ -36,13 +36,12 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
         max(train_env_steps), any_value(train_device), any_value(train_commit)
         from '{SWEPT}/rows/*.parquet' group by run"""
     ).fetchall()
-    known = {run.name: run for run in spec.load("kint").runs}
-    assert len(found) >= 18 and {name for name, *_ in found} <= set(known)
+    sweep = spec.load("kint")
+    known = {run.name: run for run in sweep.runs}
+    assert {name for name, *_ in found} == set(known) and len(known) == 54
     for name, count, scenes, shortest_m, least, most, device, commit in found:
         run = known[name]
-        assert (count, scenes) == (run_episodes := 1000, 10) and run_episodes == spec.load(
-            "kint"
-        ).config.evaluate.episodes
+        assert (count, scenes) == (1000, 10) and count == sweep.config.evaluate.episodes
         assert least == most >= run.config.run.num_timesteps, name
         assert "H200" in device and len(commit) >= 7, name
         robot = run.config.env.robot

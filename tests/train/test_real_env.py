@@ -26,19 +26,43 @@ def best_steps(folder):
     return checkpoint.find(folder.checkpoints, "best")[1].env_steps
 
 
-@pytest.mark.slow
-def test_train_resume_and_evaluate(tmp_path, capsys):
-    room = write_room(tmp_path / "room")
-    toy = toy_config(tmp_path / "runs", updates=2)
+def train_again(root, name):
+    """Two updates in a room, 16 environments for 32 steps with a limit of 12: its config, result and folder."""
+    toy = toy_config(root / "runs", updates=2)
+    room = root / "room" if (root / "room").is_dir() else write_room(root / "room")
     env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=12, num_objects=2)
-    config = TrainConfig(env=env, ppo=toy.ppo, run=toy.run)
-    result, folder, _ = train_run(config, Console(file=io.StringIO()))
+    config = TrainConfig(env=env, ppo=toy.ppo, run=dataclasses.replace(toy.run, name=name))
+    return config, *train_run(config, Console(file=io.StringIO()))[:2]
+
+
+def digests(folder):
+    return [checkpoint.weights_digest(path) for path in sorted(folder.checkpoints.glob("[0-9]*"))]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    root = tmp_path_factory.mktemp("real")
+    config, result, folder = train_again(root, "toy")
+    return root, config, result, folder, digests(folder)
+
+
+@pytest.mark.slow
+def test_a_seed_gives_the_same_policy_again(trained):
+    """On C MuJoCo, with threads."""
+    root, *_, first = trained
+    assert digests(train_again(root, "again")[2]) == first and len(first) == 1
+
+
+@pytest.mark.slow
+def test_train_resume_and_evaluate(trained, tmp_path, capsys):
+    _, config, result, folder, first = trained
     assert result.completed
-    # 16 environments for 32 steps with a limit of 12: two time limits each, if none succeeds.
+    # Two time limits for each environment, if none succeeds.
     assert sum(line["episodes"] for line in read_metrics(folder.metrics)) >= 32
     more = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=3 * UPDATE_STEPS))
     result, folder, _ = train_run(more, Console(file=io.StringIO()))
     assert [c.env_steps for c in checkpoint.list_checkpoints(folder.checkpoints)] == [512, 768]
+    assert digests(folder)[0] == first[0] != digests(folder)[1]
     assert all(np.isfinite(value) for line in read_metrics(folder.metrics) for value in line.values())
 
     assert evaluate.main([str(folder.path), "--episodes", "6", "env.episode_steps=30"]) == 0
@@ -70,21 +94,6 @@ def test_train_resume_and_evaluate(tmp_path, capsys):
     assert "observations of the checkpoint: " in capsys.readouterr().err
     assert evaluate.main([str(folder.path), "--scenes", str(tmp_path / "absent")]) == 2
     assert str(tmp_path / "absent") in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_seed_gives_the_same_policy_again(tmp_path):
-    """On C MuJoCo, with threads; another seed gives another one."""
-    room = write_room(tmp_path / "room")
-    env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=12, num_objects=2)
-    toy = toy_config(tmp_path / "runs", updates=2)
-
-    def digest(name: str, seed: int) -> str:
-        run = dataclasses.replace(toy.run, name=name, seed=seed)
-        _, folder, _ = train_run(TrainConfig(env=env, ppo=toy.ppo, run=run), Console(file=io.StringIO()))
-        return checkpoint.weights_digest(checkpoint.find(folder.checkpoints, "last")[0])
-
-    assert digest("once", 0) == digest("again", 0) != digest("other", 1)
 
 
 @pytest.mark.heavy
