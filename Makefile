@@ -67,7 +67,8 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 	@touch $@
 
 # A worker that dies is not replaced: with a new one pytest-xdist 3.8 may wait for ever at the end (its issue 1378).
-PYTEST = $(PY) -m pytest -n 2 --dist loadfile --max-worker-restart 0
+# Files go to workers in the order of tests/conftest.py, not by how many tests they have.
+PYTEST = $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: sync .venv/.oracles
 	$(say) "Tests (two workers; the slow ones compile MJX on the CPU)"

@@ -7,6 +7,7 @@ import pytest
 from benchmarks import rendering
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_rows_tell_rate_and_place_and_failures(room, tmp_path, monkeypatch):
     out = tmp_path / "rows.jsonl"
