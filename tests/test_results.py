@@ -51,7 +51,10 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
         summary, versions = (json.loads((kept / f"{part}.json").read_text()) for part in ("summary", "versions"))
         assert summary["completed"] and summary["env_steps"] == most and summary["wall_s"] > 0
         assert versions["packages"]["mujoco-mjx"] and versions["commit"] == commit
-        assert (kept / "config.yaml").is_file() and len(read_metrics(kept / PACKED_METRICS)) >= 10
+        assert len(read_metrics(kept / PACKED_METRICS)) >= 10
+    best = [path.parents[1] for path in SWEPT.glob("runs/*/checkpoints/*")]
+    assert len({known[path.name].cell for path in best}) == len(best) == 18  # the policy of each cell, and its config
+    assert all((path / "config.yaml").is_file() for path in best)
 
 
 @pytest.mark.slow

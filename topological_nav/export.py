@@ -1,13 +1,13 @@
 """Finished runs in, a small folder out that carries them: weights in half precision, where they came from, maps.
 
-OUT/rooms/ passages/ policy/   weights.msgpack, network.json, config.yaml, versions.json, results.json
+OUT/rooms/ passages/ policy/   weights.msgpack.xz, network.json, config.yaml, versions.json, results.json
     maps/SCENE.npz             embeddings in half precision
     export.json                commit, device and digest of every run, sizes, how well the networks agree with the runs'
 
 Everything that reads a run folder reads these. Kernels and matrices are fp16; biases, scales and statistics, one number
 in a hundred, stay f32: a variance may exceed what fp16 holds. `digest` in network.json stays that of the run, so that
 maps and policies made with either belong to both: an export whose predictions differ is refused.
-`export.weights_digest` is of the file itself.
+`export.weights_digest` is of what `weights.msgpack.xz` unpacks to.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from topological_nav.graph import load_map, save_map
 from topological_nav.localise import nearest_node
 from topological_nav.packaged import ABOUT
 from topological_nav.rendering import camera_pose
-from topological_nav.runs import CONFIG, DESCRIPTION, RESULTS, WEIGHTS
+from topological_nav.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
 from topological_nav.space import free_space
 from topological_nav.training import Trained, load_trained
 from train.files import write_text
@@ -147,7 +147,7 @@ def sizes_of(folder: Path) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
         part = path.relative_to(folder).parts[0]
-        what = part if path.name == WEIGHTS or part == "maps" else "descriptions"
+        what = part if path.name == PACKED_WEIGHTS or part == "maps" else "descriptions"
         sizes[what] = sizes.get(what, 0) + path.stat().st_size
     return sizes
 
@@ -301,15 +301,13 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
     if not made["commit"] or not device:
         raise RunError(f"{run}: {VERSIONS} names no {'device' if made['commit'] else 'commit'}; say commit=HASH")
     about = json.loads((run / DESCRIPTION).read_text())
-    weights = flax.serialization.msgpack_serialize(
-        half(flax.serialization.msgpack_restore((run / WEIGHTS).read_bytes()))
-    )
+    weights = flax.serialization.msgpack_serialize(half(flax.serialization.msgpack_restore(weights_content(run))))
     about["export"] = {"precision": PRECISION, "weights_digest": hashlib.sha256(weights).hexdigest()}
     if task == "policy":
         for network, other in zip(about["networks"], ("rooms", "passages"), strict=True):
             network["run"] = f"../{other}"
     out.mkdir(parents=True)
-    (out / WEIGHTS).write_bytes(weights)
+    (out / PACKED_WEIGHTS).write_bytes(packed(weights))
     write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
     write_text(out / VERSIONS, json.dumps(made, indent=1) + "\n")
     for name in (CONFIG, RESULTS):

@@ -17,6 +17,7 @@ from topological_nav.driving import load_policy
 from topological_nav.errors import RunError
 from topological_nav.export import half, level_images, size_lines, sizes_of
 from topological_nav.graph import load_map, save_map
+from topological_nav.runs import packed, weights_content
 from topological_nav.sight import NetworkSight
 from topological_nav.training import load_trained, save_trained
 
@@ -31,18 +32,19 @@ def words(made, out, *more):
 def test_matrices_are_stored_in_half_precision_and_nothing_but_weights(made, steered, exported):
     for task, run in (("rooms", made.rooms), ("passages", made.passages), ("policy", steered)):
         before, after = (
-            jax.tree.leaves_with_path(flax.serialization.msgpack_restore((folder / "weights.msgpack").read_bytes()))
+            jax.tree.leaves_with_path(flax.serialization.msgpack_restore(weights_content(folder)))
             for folder in (run, exported / task)
         )
         assert [path for path, _ in before] == [path for path, _ in after]
         for (_, was), (_, now) in zip(before, after, strict=True):
             assert now.dtype == (np.float16 if was.ndim >= 2 else np.float32)
             np.testing.assert_array_equal(now, was.astype(now.dtype))
-        names = {"weights.msgpack", "network.json", "config.yaml", "versions.json", "results.json"}
+        names = {"weights.msgpack.xz", "network.json", "config.yaml", "versions.json", "results.json"}
         assert {path.name for path in (exported / task).iterdir()} == names
     assert {path.name for path in exported.iterdir()} == {"rooms", "passages", "policy", "maps", "export.json"}
-    halves = (exported / "passages/weights.msgpack").stat().st_size / (made.passages / "weights.msgpack").stat().st_size
-    assert 0.5 < halves < 0.51
+    whole, half = (len(weights_content(folder)) for folder in (made.passages, exported / "passages"))
+    assert 0.5 < half / whole < 0.51
+    assert (exported / "passages/weights.msgpack.xz").stat().st_size < 0.95 * half
 
 
 def test_an_exported_network_computes_with_its_rounded_weights(made, exported):
@@ -125,7 +127,7 @@ def test_what_is_too_large_is_refused_and_nothing_is_left(made, tmp_path, capsys
 
 
 def test_sizes_are_told_by_part(tmp_path):
-    for name, size in (("rooms/weights.msgpack", 3 << 20), ("rooms/config.yaml", 1 << 19), ("maps/a.npz", 1 << 20)):
+    for name, size in (("rooms/weights.msgpack.xz", 3 << 20), ("rooms/config.yaml", 1 << 19), ("maps/a.npz", 1 << 20)):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(bytes(size))
     sizes = sizes_of(tmp_path)
@@ -184,7 +186,7 @@ def test_what_does_not_belong_is_refused(made, tmp_path, capsys):
 
 def test_weights_that_were_not_exported_with_it_are_refused(made, exported, tmp_path):
     shutil.copytree(exported / "rooms", tmp_path / "rooms")
-    shutil.copyfile(made.rooms / "weights.msgpack", tmp_path / "rooms" / "weights.msgpack")
+    (tmp_path / "rooms" / "weights.msgpack.xz").write_bytes(packed((made.rooms / "weights.msgpack").read_bytes()))
     with pytest.raises(RunError, match=r"is not the file that was exported with its network.json"):
         load_trained(tmp_path / "rooms")
 

@@ -22,7 +22,7 @@ from train.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
 
-CURVE_LINES = 60
+CURVE_LINES = 30
 """Lines of metrics that an exported run keeps."""
 KEPT = ("env_steps", "wall_s", "env_steps_per_s", "episodes")
 FILES = ("config.yaml", "versions.json", "summary.json")
