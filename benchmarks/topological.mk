@@ -7,7 +7,8 @@
 # What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
 # PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes; SIZE=full trains one, RUNS/ppo.
 # GPUS="0 1 2 3" spreads the commands over these.
-# Not part of `all`: `renderer` (MuJoCo's renderer as the target; needs EGL or OSMesa), `scan` (SCAN=FOLDER, a converted room).
+# Not part of `all`: `renderer` (MuJoCo's renderer as the target; needs EGL or OSMesa), `scan` (SCAN=FOLDER, a converted room),
+# `transfer-policy` and `renderer-policy` (the learned policy on the targets' maps), `batch` (thousands of episodes at once).
 
 PY ?= python
 SIZE ?= full
@@ -32,6 +33,7 @@ ifeq ($(SIZE),full)
   MAP = check=60
   EVALUATION = backend=native limit_s=600
   SECONDARY = $(EVALUATION) episodes=25
+  BATCH = backend=warp episodes=4000 batch=4000 limit_s=300 supersample=2
   FEATURES =
   PPO ?= $(RUNS)/ppo
   PPO_STEPS = 5_000_000
@@ -49,6 +51,7 @@ else ifeq ($(SIZE),cpu)
   MAP = check=20
   EVALUATION = episodes=8 limit_s=600
   SECONDARY = episodes=4 limit_s=600
+  BATCH = backend=native episodes=16 batch=16 limit_s=60
   FEATURES = epochs=4
   PPO ?=
   PPO_STEPS = 500_000
@@ -71,13 +74,16 @@ run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s)
 D = $(RUNS)/done
 MAPS = $(ALL:%=$(D)/map-%)
 .DEFAULT_GOAL := all
-.PHONY: all networks maps evaluation transfer renderer scan
+.PHONY: all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch
 all: networks maps $(D)/policy evaluation transfer $(D)/export
 networks: $(D)/rooms $(D)/rooms-selfsup $(D)/rooms-more $(D)/passages $(D)/alexnet
 maps: $(MAPS)
 evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
 transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
+transfer-policy: $(D)/evaluation-unadapted-policy $(D)/evaluation-adapted-policy
+batch: $(D)/evaluation-batch.cedar $(D)/evaluation-batch.rowan
 renderer: $(D)/features-gl $(D)/adapted-passages-gl $(D)/evaluation-unadapted-gl $(D)/evaluation-adapted-gl
+renderer-policy: $(D)/evaluation-unadapted-gl-policy $(D)/evaluation-adapted-gl-policy
 scan: $(D)/features-scan $(D)/adapted-passages-scan $(D)/unadapted-map-scan $(D)/adapted-map-scan
 
 $(D)/data:
@@ -128,6 +134,11 @@ $(D)/evaluation-policy: $(call each,evaluation-policy)
 $(D)/evaluation-ahead1: $(call each,evaluation-ahead1)
 	$(call run,$(call ahead1,$(call folders,$(ALL))))
 
+# All episodes of a scene at once.
+$(ALL:%=$(D)/evaluation-batch.%): $(D)/evaluation-batch.%: $(D)/map-% $(D)/policy
+	$(call run,$(NAV) evaluate scenes_mjcf/$* --maps $(RUNS)/maps $(WITH) --policy $(RUNS)/policy --contenders dense $(BATCH) \
+	  -o $(RUNS)/evaluation-batch)
+
 # Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.
 $(D)/features: $(D)/data $(D)/rooms
 	$(call run,$(NAV) adapt features --data $(RUNS)/data --localiser $(RUNS)/rooms -o $(RUNS)/features $(FEATURES))
@@ -140,11 +151,16 @@ $(D)/unadapted-map-%: $(D)/rooms $(D)/passages $(D)/data-unseen
 	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(WITH) -o $(RUNS)/maps-unadapted/$*.npz)
 $(D)/adapted-map-%: $(D)/features $(D)/adapted-passages
 	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(ADAPTED) -o $(RUNS)/maps-adapted/$*.npz)
+DRIVER = --policy $(RUNS)/policy
 driven = $(NAV) evaluate $(call folders,$(UNSEEN)) --contenders dense$(1) -o $(RUNS)/$(notdir $@) $(SECONDARY)
 $(D)/evaluation-unadapted: $(UNSEEN:%=$(D)/unadapted-map-%)
 	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-unadapted $(WITH))
 $(D)/evaluation-adapted: $(UNSEEN:%=$(D)/adapted-map-%)
 	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-adapted $(ADAPTED))
+$(D)/evaluation-unadapted-policy: $(UNSEEN:%=$(D)/unadapted-map-%) $(D)/policy
+	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-unadapted $(WITH) $(DRIVER))
+$(D)/evaluation-adapted-policy: $(UNSEEN:%=$(D)/adapted-map-%) $(D)/policy
+	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-adapted $(ADAPTED) $(DRIVER))
 
 # Targets that are datasets of their own, seen as they are: another renderer (gl), and a scanned room (scan). The dataset
 # is the one that a target depends on; $(D)/data is named beside $(D)/rooms, because networks may come from elsewhere (-o).
@@ -169,6 +185,10 @@ $(D)/evaluation-unadapted-gl: $(UNSEEN:%=$(D)/unadapted-map-gl-%)
 	$(call run,$(driven) --maps $(RUNS)/maps-unadapted-gl $(WITH))
 $(D)/evaluation-adapted-gl: $(UNSEEN:%=$(D)/adapted-map-gl-%)
 	$(call run,$(driven) --maps $(RUNS)/maps-adapted-gl $(call ADAPTED_TO,gl))
+$(D)/evaluation-unadapted-gl-policy: $(UNSEEN:%=$(D)/unadapted-map-gl-%) $(D)/policy
+	$(call run,$(driven) --maps $(RUNS)/maps-unadapted-gl $(WITH) $(DRIVER))
+$(D)/evaluation-adapted-gl-policy: $(UNSEEN:%=$(D)/adapted-map-gl-%) $(D)/policy
+	$(call run,$(driven) --maps $(RUNS)/maps-adapted-gl $(call ADAPTED_TO,gl) $(DRIVER))
 
 # One room, too small for many ways of 2 m: passages are balanced and scored at 1 m.
 scanned = $(or $(SCAN),$(error SCAN is not given, expected the folder of a converted scene: SCAN=FOLDER))

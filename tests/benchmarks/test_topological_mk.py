@@ -108,6 +108,37 @@ def test_another_renderer_is_a_target_without_training_again(size):
             assert (str(used.localiser), str(used.detector)) == (f"/nowhere/{localiser}", f"/nowhere/{detector}")
 
 
+@pytest.mark.parametrize(
+    ("target", "suffix", "domain", "adapted"),
+    [
+        ("transfer-policy", "", "camera", ("features", "adapted-passages")),
+        ("renderer-policy", "-gl", "clean", ("features-gl", "adapted-passages-gl")),
+    ],
+)
+def test_the_learned_policy_drives_where_the_baseline_did(target, suffix, domain, adapted):
+    networks = ("-o", "/nowhere/done/policy")
+    done = with_given_networks("SIZE=full", target, *networks)
+    before = with_given_networks("SIZE=full", "transfer" if not suffix else "renderer", *networks)
+    assert done.keys() - before.keys() == {f"evaluation-{w}{suffix}-policy" for w in ("unadapted", "adapted")}
+    for which, seeing in (("unadapted", ("rooms", "passages")), ("adapted", adapted)):
+        arguments, settings = done[f"evaluation-{which}{suffix}-policy"]
+        baseline, same = before[f"evaluation-{which}{suffix}"]
+        assert settings == same and arguments.scenes == baseline.scenes and arguments.contenders == "dense"
+        assert (arguments.domain, arguments.maps) == (domain, baseline.maps) == (baseline.domain, arguments.maps)
+        for used in (arguments, baseline):
+            assert (str(used.localiser), str(used.detector)) == tuple(f"/nowhere/{name}" for name in seeing)
+        assert (arguments.policy, baseline.policy) == ("/nowhere/policy", None)
+
+
+def test_thousands_of_episodes_are_one_batch():
+    maps = [word for scene in ("cedar", "rowan") for word in ("-o", f"/nowhere/done/map-{scene}")]
+    commands = commands_of(listed("SIZE=full", "batch", *maps, "-o", "/nowhere/done/policy"))
+    for words, scene in zip(commands, ("cedar", "rowan"), strict=True):
+        arguments, settings = understood(words, {"/nowhere/rooms", "/nowhere/passages", "/nowhere/maps"})
+        assert [Path(one).name for one in arguments.scenes] == [scene]
+        assert (settings.backend, settings.episodes, settings.batch) == ("warp", 4000, 4000)
+
+
 @pytest.mark.parametrize("size", ["full", "cpu"])
 def test_a_scanned_room_is_a_target_where_it_is_given(size):
     done = with_given_networks(f"SIZE={size}", "scan", "SCAN=/elsewhere/room")
