@@ -55,7 +55,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
     x, y, z = camera.pos_m
     pos = np.stack([xy[..., 0] + cos * x - sin * y, xy[..., 1] + sin * x + cos * y, np.full(shape, z)], -1)
     forward = np.stack([np.cos(pitch) * cos, np.cos(pitch) * sin, np.sin(pitch)], -1)
-    return look_along(np.asarray(pos, np.float32), np.asarray(forward, np.float32))  # type: ignore[arg-type]
+    return look_along(np.asarray(pos, np.float32), np.asarray(forward, np.float32))
 
 
 class SceneRenderer:

@@ -137,56 +137,74 @@ class _SceneGrid:
         self.friction = model.geom_friction[first, 0]
 
 
-def plan_path(free: np.ndarray, cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-    """The cheapest path between two cells, by Dijkstra over 16 moves.
+class PathGrid:
+    """Ways over one grid by Dijkstra over 16 moves; the graph is made once.
 
     Args:
         free: [rows, columns] bool.
         cost: [rows, columns] at least 1, per metre.
-        start: (row, column), the nearest free cell stands for it.
-        goal: likewise.
-
-    Returns:
-        [p, 2] (row, column), both ends included; [0, 2] where there is none.
     """
-    if not free.any():
-        return np.zeros((0, 2), np.int64)
-    _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
-    begin, end = nearest[:, start[0], start[1]], nearest[:, goal[0], goal[1]]
-    rows, columns = free.shape
-    index = np.arange(rows * columns).reshape(rows, columns)
-    sources, targets, weights = [], [], []
-    for dr, dc in MOVES:
-        r0, r1, c0, c1 = 0, rows - dr, max(0, -dc), columns - max(0, dc)
-        a = (slice(r0, r1), slice(c0, c1))
-        b = (slice(dr, rows), slice(c0 + dc, c1 + dc))
-        ok = free[a] & free[b]
-        mean = 0.5 * (cost[a] + cost[b])
-        through = np.zeros(mean.shape)
-        if abs(dr) + abs(dc) > 1:
-            # The two cells in the middle of a knight's move, the two beside a diagonal.
-            sign = 1 if dc > 0 else -1
-            middles = {(1, 1): [(0, sign), (1, 0)], (1, 2): [(0, sign), (1, sign)], (2, 1): [(1, 0), (1, sign)]}
-            for mr, mc in middles[dr, abs(dc)]:
-                m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
-                ok = ok & free[m]
-                through = through + cost[m]
-        if abs(dr) + abs(dc) == 3:
-            mean = 0.5 * mean + 0.25 * through
-        sources.append(index[a][ok])
-        targets.append(index[b][ok])
-        weights.append(CELL_M * math.hypot(dr, dc) * mean[ok])
-    graph = scipy.sparse.csr_matrix(
-        (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets))), shape=(rows * columns,) * 2
-    )
-    source, target = index[begin[0], begin[1]], index[end[0], end[1]]
-    _, previous = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=target, return_predecessors=True)
-    path = [source]
-    while path[-1] != target:
-        if previous[path[-1]] < 0:
+
+    def __init__(self, free: np.ndarray, cost: np.ndarray):
+        self._shape = rows, columns = free.shape
+        self._any = bool(free.any())
+        if not self._any:
+            return
+        _, self._nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
+        self._index = index = np.arange(rows * columns).reshape(rows, columns)
+        sources, targets, weights = [], [], []
+        for dr, dc in MOVES:
+            r0, r1, c0, c1 = 0, rows - dr, max(0, -dc), columns - max(0, dc)
+            a = (slice(r0, r1), slice(c0, c1))
+            b = (slice(dr, rows), slice(c0 + dc, c1 + dc))
+            ok = free[a] & free[b]
+            mean = 0.5 * (cost[a] + cost[b])
+            through = np.zeros(mean.shape)
+            if abs(dr) + abs(dc) > 1:
+                # The two cells in the middle of a knight's move, the two beside a diagonal.
+                sign = 1 if dc > 0 else -1
+                middles = {(1, 1): [(0, sign), (1, 0)], (1, 2): [(0, sign), (1, sign)], (2, 1): [(1, 0), (1, sign)]}
+                for mr, mc in middles[dr, abs(dc)]:
+                    m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
+                    ok = ok & free[m]
+                    through = through + cost[m]
+            if abs(dr) + abs(dc) == 3:
+                mean = 0.5 * mean + 0.25 * through
+            sources.append(index[a][ok])
+            targets.append(index[b][ok])
+            weights.append(CELL_M * math.hypot(dr, dc) * mean[ok])
+        self._graph = scipy.sparse.csr_matrix(
+            (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets))), shape=(rows * columns,) * 2
+        )
+
+    def path(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
+        """The cheapest one between two cells.
+
+        Args:
+            start: (row, column), the nearest free cell stands for it.
+            goal: likewise.
+
+        Returns:
+            [p, 2] (row, column), both ends included; [0, 2] where there is none.
+        """
+        if not self._any:
             return np.zeros((0, 2), np.int64)
-        path.append(previous[path[-1]])
-    return np.stack(np.unravel_index(path, (rows, columns)), -1)
+        begin, end = self._nearest[:, start[0], start[1]], self._nearest[:, goal[0], goal[1]]
+        source, target = self._index[begin[0], begin[1]], self._index[end[0], end[1]]
+        _, previous = scipy.sparse.csgraph.dijkstra(
+            self._graph, directed=False, indices=target, return_predecessors=True
+        )
+        path = [source]
+        while path[-1] != target:
+            if previous[path[-1]] < 0:
+                return np.zeros((0, 2), np.int64)
+            path.append(previous[path[-1]])
+        return np.stack(np.unravel_index(path, self._shape), -1)
+
+
+def plan_path(free: np.ndarray, cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
+    """The cheapest path between two cells of a grid that is needed once; see `PathGrid`."""
+    return PathGrid(free, cost).path(start, goal)
 
 
 class Planner:

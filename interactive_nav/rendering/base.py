@@ -59,20 +59,23 @@ class CameraPose:
     """[..., 3, 3] f32, columns: forward, right, up."""
 
 
-def look_along(pos_w: jax.Array, forward_w: jax.Array) -> CameraPose:
+def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
     """A camera without roll: its right is horizontal, as if the world's z were up.
+
+    NumPy's arrays stay NumPy's: JAX would compile each operation anew for every number of cameras.
 
     Args:
         pos_w: [..., 3] m.
         forward_w: [..., 3], any length; a vertical one takes the world's -y as right.
     """
-    forward = forward_w / jnp.linalg.norm(forward_w, axis=-1, keepdims=True)
-    flat = jnp.stack([forward[..., 1], -forward[..., 0], jnp.zeros_like(forward[..., 0])], -1)
-    length = jnp.linalg.norm(flat, axis=-1, keepdims=True)
-    aside = jnp.asarray([0.0, -1.0, 0.0], forward.dtype)
-    right = jnp.where(length > 1e-6, flat / jnp.where(length > 1e-6, length, 1.0), aside)
-    up = jnp.cross(right, forward)
-    return CameraPose(pos_w, jnp.stack([forward, right, up], -1))
+    xp = jnp if isinstance(forward_w, jax.Array) else np
+    forward = forward_w / xp.linalg.norm(forward_w, axis=-1, keepdims=True)
+    flat = xp.stack([forward[..., 1], -forward[..., 0], xp.zeros_like(forward[..., 0])], -1)
+    length = xp.linalg.norm(flat, axis=-1, keepdims=True)
+    aside = xp.asarray([0.0, -1.0, 0.0], forward.dtype)
+    right = xp.where(length > 1e-6, flat / xp.where(length > 1e-6, length, 1.0), aside)
+    up = xp.cross(right, forward)
+    return CameraPose(pos_w, xp.stack([forward, right, up], -1))  # type: ignore[arg-type]
 
 
 class Renderer(abc.ABC):

@@ -1,5 +1,6 @@
 """Where the camera is, against the environment's own mount; what it sees of a painted scene."""
 
+import logging
 import math
 
 import jax
@@ -111,3 +112,12 @@ def test_each_call_takes_the_least_batch_that_serves(painted, monkeypatch):
     monkeypatch.undo()
     assert (images == SceneRenderer(scene, lens, supersample=2, batch=3).draw(pose)).all() and images.std() > 10
     assert many.draw(camera_pose(robot, np.zeros((0, 2)), np.zeros(0), np.zeros(0))).shape == (0, 12, 16, 3)
+
+
+def test_where_any_number_of_cameras_is_needs_no_compiling(caplog):
+    # By JAX's arrays each number was compiled anew, which took most of the time of a thousand episodes in a batch.
+    with jax.log_compiles(), caplog.at_level(logging.DEBUG):
+        for n in (11, 13, 17):
+            pose = camera_pose(get_robot("ttbot"), np.zeros((n, 2)), np.linspace(0, 3, n), np.zeros(n))
+            assert pose.axes_w.shape == (n, 3, 3) and pose.axes_w.dtype == np.float32
+    assert not caplog.records, caplog.text

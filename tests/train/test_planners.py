@@ -14,7 +14,7 @@ import interactive_nav
 from interactive_nav.types import EpisodeStart
 from tests.toys import write_room
 from train.errors import TrainError
-from train.planners import CELL_M, Footprints, Planner, plan_path
+from train.planners import CELL_M, Footprints, PathGrid, Planner, plan_path
 from train.policies import make_yardstick
 from train.rollout import episode_keys, run_episodes
 
@@ -26,10 +26,11 @@ def length(path):
 def test_paths_by_hand():
     free = np.ones((20, 30), bool)
     ones = np.ones(free.shape)
-    straight = plan_path(free, ones, (5, 2), (5, 22))
+    grid = PathGrid(free, ones)
+    straight = grid.path((5, 2), (5, 22))
     assert length(straight) == pytest.approx(1.0) and tuple(straight[0]) == (5, 2) and tuple(straight[-1]) == (5, 22)
     # A knight's move each: 10 of (1, 2).
-    assert length(plan_path(free, ones, (2, 2), (12, 22))) == pytest.approx(10 * CELL_M * math.sqrt(5))
+    assert length(grid.path((2, 2), (12, 22))) == pytest.approx(10 * CELL_M * math.sqrt(5))
     free[:19, 15] = False  # a wall with a gap on row 19 only
     path = plan_path(free, ones, (5, 2), (5, 28))
     assert (path[path[:, 1] == 15][:, 0] == 19).all() and (path[:, 1] == 15).any()

@@ -95,6 +95,15 @@ def test_a_camera_on_no_body_of_the_robot_is_refused():
         make_mount(model, "base", Camera("other", (0, 0, 0)))
 
 
+def test_numpys_cameras_are_jaxs():
+    rng = np.random.default_rng(3)
+    forward = np.concatenate([rng.normal(size=(50, 3)), [[0, 0, -2.0], [0, 0, 1.0]]]).astype(np.float32)
+    there = np.zeros_like(forward)
+    plain, traced = look_along(there, forward), jax.jit(look_along)(there, forward)
+    assert isinstance(plain.axes_w, np.ndarray) and plain.axes_w.dtype == np.float32
+    np.testing.assert_allclose(plain.axes_w, traced.axes_w, atol=1e-6)
+
+
 def test_looking_straight_down_has_axes():
     axes = np.asarray(look_along(jnp.zeros(3), jnp.asarray([0.0, 0.0, -2.0])).axes_w)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
