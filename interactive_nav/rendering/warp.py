@@ -18,6 +18,7 @@ from mujoco import mjx
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.rendering.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
 from interactive_nav.rendering.boxes import BoxTables, box_poses
+from interactive_nav.warp_graphs import keep_collector_out
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
 """Padding boxes lie here, below the floor, which hides them."""
@@ -30,6 +31,7 @@ class WarpRenderer(Renderer):
     name = "warp"
 
     def __init__(self, tables: BoxTables, lens: Lens):
+        keep_collector_out()
         self.lens, self._tables = lens, tables
         self._host = _box_model(tables.num_boxes, lens)
         self._model = uncommitted(mjx.put_model(self._host, impl="warp"))
@@ -133,6 +135,7 @@ class WarpColour:
             n: pictures a call.
             groups: geom groups that are drawn.
         """
+        keep_collector_out()
         model = copy.copy(model)
         model.cam_fovy[:] = lens.fov_deg
         self._host, self._lens = model, lens
