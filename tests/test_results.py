@@ -82,7 +82,11 @@ def test_the_topological_tables_are_those_of_their_rows(size, rows, table):
         assert [line for line in lines if line.startswith("| dense |") and line not in told] == []
 
 
-@pytest.mark.parametrize("name", ["ahead1", "batch", "unadapted", "adapted", "unadapted-gl", "adapted-gl"])
+@pytest.mark.parametrize(
+    "name",
+    ["ahead1", "batch"]
+    + [f"{which}{by}" for which in ("unadapted", "adapted") for by in ("", "-gl", "-policy", "-gl-policy")],
+)
 def test_the_further_topological_tables_are_those_of_their_rows(name):
     folder = ROOT / "results" / "topological" / "full"
     played = read_rows(sorted((folder / f"rows-{name}").glob("*.parquet")))
