@@ -1,60 +1,39 @@
-"""CUDA graphs that MJX-Warp captures: enough of them are kept, and Python's garbage collector stays out.
+"""Keeps Python's garbage collector out of the calls by which JAX reaches Warp.
 
-A capture runs Python for a second. Whatever the collector finds dead meanwhile, a program that JAX has compiled for
-one, is destroyed on the device at once, which no capture survives (CUDA errors 900 and 901: NVIDIA/warp#401 and #992,
-mujocolab/mjlab#821). Captures are made again whenever a buffer has moved, so this may come at any step.
+Such a call captures a CUDA graph whenever XLA has moved a buffer, and runs Python for up to a second. What the
+collector finds dead meanwhile is destroyed on the device at once, and no capture survives that: a program that JAX has
+compiled ends it (CUDA errors 900 and 901; NVIDIA/warp#401 and #992, mujocolab/mjlab#821), and an old `wp.Stream`
+takes XLA's stream, which it shares, out of Warp's books ("unknown stream").
 """
 
 from __future__ import annotations
 
 import functools
 import gc
+from collections.abc import Callable
 from typing import Any
-
-GRAPHS = 128
-"""Kept of each function. A control step makes one for each of its substeps, and all of them anew where XLA has moved a
-buffer; of Warp's own 32 a loop that draws images between its steps finds few again."""
-
-
-def keep_graphs() -> None:
-    """Makes Warp keep `GRAPHS` of every function that JAX calls from now on; once is enough."""
-    import warp as wp
-
-    if "graph_cache_max" not in getattr(wp.jax_callable, "keywords", {}):
-        wp.jax_callable = functools.partial(wp.jax_callable, graph_cache_max=GRAPHS)
 
 
 def keep_collector_out() -> None:
-    """Makes Warp's captures, `wp.ScopedCapture`, suspend the collector; once is enough."""
-    import warp as wp
+    """Suspends the collector in every callback of Warp's that is made from now on; once is enough."""
+    from warp._src.jax.ffi import FfiCallable
 
-    if not getattr(wp.ScopedCapture, "suspends_collector", False):
-        wp.ScopedCapture = suspending(wp.ScopedCapture)  # type: ignore[misc]
+    # Warp has no public place for this: `jax_callable` registers the bound method.
+    if not hasattr(FfiCallable.ffi_callback, "__wrapped__"):
+        FfiCallable.ffi_callback = without_collector(FfiCallable.ffi_callback)
 
 
-def suspending(capture: Any) -> Any:
-    """A class of context managers whose body the collector, where it is on, does not interrupt."""
+def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, not interrupted by the collector, which is found as it was left."""
 
-    class Suspending(capture):
-        suspends_collector = True
-
-        def __enter__(self) -> Any:
-            self._collects = gc.isenabled()
-            gc.disable()
-            try:
-                return super().__enter__()
-            except BaseException:
-                self._resume()
-                raise
-
-        def __exit__(self, *raised: Any) -> Any:
-            try:
-                return super().__exit__(*raised)
-            finally:
-                self._resume()
-
-        def _resume(self) -> None:
-            if self._collects:
+    @functools.wraps(function)
+    def quiet(*args: Any, **kwargs: Any) -> Any:
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            if collects:
                 gc.enable()
 
-    return Suspending
+    return quiet

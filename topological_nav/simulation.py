@@ -96,8 +96,9 @@ class Simulator:
         """
         self.env = env
         self._reset = jax.jit(jax.vmap(env.reset_to))
-        self._advance = jax.jit(jax.vmap(env.advance))
-        self._step = jax.jit(jax.vmap(env.step))
+        # A step writes where the state lay: for buffers that have moved MJX-Warp captures its graphs anew.
+        self._advance = jax.jit(jax.vmap(env.advance), donate_argnums=0)
+        self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
         self._packed = jax.jit(_packed)
         self._last: tuple[Any, Seen] | None = None
 
@@ -115,12 +116,12 @@ class Simulator:
         return self._reset(episode_starts(start_xy_w, yaw_rad, goal_xy_w, objects), keys)
 
     def drive(self, state: Any, linear: np.ndarray, angular: np.ndarray) -> Any:
-        """One control step under base velocities [B] m/s and [B] rad/s."""
+        """One control step under base velocities [B] m/s and [B] rad/s; the state given is used up."""
         robot: RobotSpec = self.env.robot
         return self._advance(state, np.asarray(robot.drive(linear, angular, np), np.float32))
 
     def act(self, state: Any, action: Any) -> Any:
-        """One control step under the environment's own actions [B, A], observed."""
+        """One control step under the environment's own actions [B, A], observed; the state given is used up."""
         return self._step(state, action)
 
     def seen(self, state: Any) -> Seen:

@@ -26,7 +26,7 @@ from interactive_nav.physics.base import (
 )
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.warp_graphs import keep_collector_out, keep_graphs
+from interactive_nav.warp_graphs import keep_collector_out
 from interactive_nav.world import Layout, World
 
 # Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,
@@ -48,7 +48,6 @@ class MjxPhysics(Physics):
         self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
         if impl == "warp":
             keep_collector_out()
-            keep_graphs()
         if impl == "warp" and not (self.contacts_per_env and self.constraints_per_env):
             measured = measure_buffers(world, self.window)
             self.contacts_per_env = self.contacts_per_env or measured[0]
