@@ -67,59 +67,68 @@ def paint(folder: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def painted(tmp_path_factory) -> Path:
+def painted(shared) -> Path:
     """Two rooms of 3 x 4 m joined by a gap of 1 m, a cube in each."""
-    folder = write_room(
-        tmp_path_factory.mktemp("topological") / "painted",
-        (6.0, 4.0),
-        (("chair", 1.4, -0.5, 5.0, 0.5), ("table", -1.5, 0.5, 10.0, 0.4)),
-        partition=True,
-    )
-    paint(folder)
-    return folder
+
+    def fill(base: Path) -> None:
+        blocks = (("chair", 1.4, -0.5, 5.0, 0.5), ("table", -1.5, 0.5, 10.0, 0.4))
+        paint(write_room(base / "painted", (6.0, 4.0), blocks, partition=True))
+
+    return shared("topological", fill) / "painted"
 
 
 @pytest.fixture(scope="session")
-def made(painted, tmp_path_factory) -> Made:
+def made(painted, shared) -> Made:
     """Everything the commands make of the painted scene."""
-    base = tmp_path_factory.mktemp("made")
-    here = Made(painted, base / "data", base / "rooms", base / "passages", base / "map.npz")
-    assert main(["data", str(painted), "-o", str(here.data), *WORDS]) == 0
-    learn = ["--data", str(here.data)]
-    assert main(["train", "rooms", *learn, "-o", str(here.rooms), "epochs=6", "batch=32", *TRAINED]) == 0
-    words = ["network=alexnet", "epochs=80", "batch=16", "width=8", "learning_rate=1e-3"]
-    assert main(["train", "passages", *learn, "-o", str(here.passages), *words]) == 0
-    runs = ["--localiser", str(here.rooms), "--detector", str(here.passages)]
-    assert main(["map", str(painted), *runs, "-o", str(here.map), "--route", "0", "1"]) == 0
-    return here
+
+    def here(base: Path) -> Made:
+        return Made(painted, base / "data", base / "rooms", base / "passages", base / "map.npz")
+
+    def fill(base: Path) -> None:
+        out = here(base)
+        assert main(["data", str(painted), "-o", str(out.data), *WORDS]) == 0
+        learn = ["--data", str(out.data)]
+        assert main(["train", "rooms", *learn, "-o", str(out.rooms), "epochs=6", "batch=32", *TRAINED]) == 0
+        words = ["network=alexnet", "epochs=80", "batch=16", "width=8", "learning_rate=1e-3"]
+        assert main(["train", "passages", *learn, "-o", str(out.passages), *words]) == 0
+        runs = ["--localiser", str(out.rooms), "--detector", str(out.passages)]
+        assert main(["map", str(painted), *runs, "-o", str(out.map), "--route", "0", "1"]) == 0
+
+    return here(shared("made", fill))
 
 
 @pytest.fixture(scope="session")
-def driven(painted, tmp_path_factory) -> Path:
+def driven(painted, shared) -> Path:
     """Ten drives through the painted scene, in two batches."""
-    out = tmp_path_factory.mktemp("driven") / "drives"
-    assert main(["data", "--drives", str(painted), "-o", str(out), *DRIVEN]) == 0
-    return out
+
+    def fill(base: Path) -> None:
+        assert main(["data", "--drives", str(painted), "-o", str(base / "drives"), *DRIVEN]) == 0
+
+    return shared("driven", fill) / "drives"
 
 
 @pytest.fixture(scope="session")
-def steered(made, driven, tmp_path_factory) -> Path:
+def steered(made, driven, shared) -> Path:
     """A local policy that learned a little of those drives."""
-    out = tmp_path_factory.mktemp("steered") / "policy"
-    runs = ["--data", str(driven), "--localiser", str(made.rooms), "--detector", str(made.passages)]
-    words = ("hidden=16", "projection=8", "forward_hidden=8", "steps=20", "overlap_s=1.5", "batch=8", "epochs=3")
-    words = [*words, "learning_rate=1e-2", "straight_kept=1", "mirror=false"]
-    assert main(["train", "policy", *runs, "-o", str(out), *words]) == 0
-    return out
+
+    def fill(base: Path) -> None:
+        runs = ["--data", str(driven), "--localiser", str(made.rooms), "--detector", str(made.passages)]
+        words = ("hidden=16", "projection=8", "forward_hidden=8", "steps=20", "overlap_s=1.5", "batch=8", "epochs=3")
+        words = [*words, "learning_rate=1e-2", "straight_kept=1", "mirror=false"]
+        assert main(["train", "policy", *runs, "-o", str(base / "policy"), *words]) == 0
+
+    return shared("steered", fill) / "policy"
 
 
 @pytest.fixture(scope="session")
-def exported(made, steered, tmp_path_factory) -> Path:
+def exported(made, steered, shared) -> Path:
     """All of it in half precision, with the map, as a package would carry it."""
-    base = tmp_path_factory.mktemp("exported")
-    (base / "maps").mkdir()
-    shutil.copyfile(made.map, base / "maps" / "painted.npz")
-    runs = ["--localiser", str(made.rooms), "--detector", str(made.passages), "--policy", str(steered)]
-    what = ["--maps", str(base / "maps"), "--images", str(made.data)]
-    assert main(["export", *runs, *what, "-o", str(base / "weights"), "commit=toy"]) == 0
-    return base / "weights"
+
+    def fill(base: Path) -> None:
+        (base / "maps").mkdir()
+        shutil.copyfile(made.map, base / "maps" / "painted.npz")
+        runs = ["--localiser", str(made.rooms), "--detector", str(made.passages), "--policy", str(steered)]
+        what = ["--maps", str(base / "maps"), "--images", str(made.data)]
+        assert main(["export", *runs, *what, "-o", str(base / "weights"), "commit=toy"]) == 0
+
+    return shared("exported", fill) / "weights"
