@@ -180,9 +180,9 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
     return dataclasses.replace(data, supersample=supersample)
 
 
-def renderer_of(scene: Scene, data: DataConfig, batch: int | None = None) -> SceneRenderer:
-    """What draws a scene as a dataset's images were drawn, so many a call (None: see `SceneRenderer`)."""
-    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, batch)
+def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
+    """What draws a scene as a dataset's images were drawn."""
+    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
 
 
 def camera_of(localiser: Trained, detector: Trained) -> DataConfig:

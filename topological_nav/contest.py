@@ -61,8 +61,6 @@ CONTENDERS = ("dense", "sparse", "expert", "ppo")
 NOT_ASKED = ("batch", "episodes", "supersample")
 """Settings that decide no row, or of which it is told otherwise."""
 CPU_BATCH = 8
-CPU_IMAGES = 6
-"""Images drawn a call on a CPU; fewer are padded, which costs as much."""
 Tell = Callable[[str, int, int], None]
 
 
@@ -172,8 +170,7 @@ class Venue:
         """What the navigator's sight understands."""
         if self.networks is None:
             return pose_camera
-        batch = CPU_IMAGES if jax.default_backend() == "cpu" else None
-        plain = scene_camera(renderer_of(self.scene, self.drawn, batch), self.robot)
+        plain = scene_camera(renderer_of(self.scene, self.drawn), self.robot)
         domain = preset(self.contest.domain)
         return lambda xy, yaw: as_seen_from(plain(xy, yaw), domain, xy, yaw)
 

@@ -20,8 +20,8 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
 from topological_nav.errors import TopologicalError
 
-BATCH = 18
-"""Images a call on a CPU unless asked otherwise: the headings of one position and pitch."""
+CPU_BATCH = (1, 2, 6, 18)
+"""Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""
 DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
 """Least and most images a call on an accelerator, and the most pixels drawn for them."""
 Painter = Callable[[np.ndarray, np.ndarray], Any]
@@ -69,8 +69,7 @@ class SceneRenderer:
             lens: of the images returned.
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
-            batch: images a call of the engine; fewer are padded. None: `BATCH` on a CPU; on an accelerator powers of
-                two up to what `DEVICE_PIXELS` allows, of which each call takes the least that serves.
+            batch: images a call of the engine; fewer are padded. None: see `batch_sizes` and `calls`.
         """
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
@@ -98,8 +97,7 @@ class SceneRenderer:
                 at, images = drawn.pop(0)
                 out[at : at + len(images)] = np.asarray(images)[: count - at]
 
-        while first < count:
-            size = next((n for n in self._sizes if n >= count - first), self._sizes[-1])
+        for size in calls(count, self._sizes):
             # Padded by the last camera: Warp draws batches of fixed sizes only.
             rows = np.minimum(np.arange(first, first + size), count - 1)
             drawn.append((first, self._painter(size)(pos[rows], axes[rows])))
@@ -139,17 +137,30 @@ class SceneRenderer:
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
-    """Images a call of the engine, ascending.
+    """Images a call of the engine, ascending; each is compiled when it is first needed.
 
     Args:
         lens: of the images as they are drawn.
-        platform: `jax.default_backend()`.
+        platform: `jax.default_backend()`. On an accelerator: powers of two up to what `DEVICE_PIXELS` allows.
     """
     if platform == "cpu":
-        return (BATCH,)
+        return CPU_BATCH
     least, most = DEVICE_BATCH
     most = min(most, max(least, DEVICE_PIXELS // (lens.width * lens.height)))
     return tuple(1 << n for n in range(least.bit_length() - 1, most.bit_length()))
+
+
+def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
+    """Sizes of the calls that draw `count` images: none in vain where there are calls of one, else as few calls as can
+    be, the last one the least that serves."""
+    made: list[int] = []
+    while count > 0:
+        if sizes[0] == 1:
+            made.append(max(n for n in sizes if n <= count))
+        else:
+            made.append(next((n for n in sizes if n >= count), sizes[-1]))
+        count -= made[-1]
+    return made
 
 
 def shrink(images: Any, by: int) -> Any:

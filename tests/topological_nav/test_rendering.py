@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from interactive_nav.rendering.base import Lens
 from interactive_nav.rendering.mount import make_mount
@@ -15,7 +17,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from topological_nav import rendering
 from topological_nav.errors import TopologicalError
-from topological_nav.rendering import BATCH, SceneRenderer, batch_sizes, camera_pose, shrink
+from topological_nav.rendering import CPU_BATCH, SceneRenderer, batch_sizes, calls, camera_pose, shrink
 
 
 def test_the_camera_stands_where_the_robots_mount_has_it():
@@ -57,7 +59,7 @@ def test_shrinking_takes_means_over_squares():
 
 def test_walls_have_their_colours_and_batches_of_any_size_their_order(painted):
     renderer = SceneRenderer(load_scene(painted), Lens(16, 12, 60.0))
-    robot, n = get_robot("ttbot"), BATCH + 3
+    robot, n = get_robot("ttbot"), CPU_BATCH[-1] + 3
     # Turning between the red walls on the left (looking along -x) and the green ones on the right.
     heading = np.where(np.arange(n) % 2 == 0, np.pi, 0.0)
     place = np.where((np.arange(n) % 2 == 0)[:, None], [-1.5, 0.0], [1.5, 0.0])
@@ -89,10 +91,21 @@ def test_shrinking_on_a_device_gives_the_same_levels(by):
 
 
 def test_batches_grow_on_an_accelerator_as_far_as_memory_allows():
-    assert batch_sizes(Lens(640, 480, 60.0), "cpu") == (BATCH,)
+    assert batch_sizes(Lens(640, 480, 60.0), "cpu") == CPU_BATCH
     assert batch_sizes(Lens(640, 480, 60.0), "gpu") == (8, 16, 32, 64, 128, 256)
     assert batch_sizes(Lens(64, 48, 60.0), "gpu")[-1] == 2048
     assert batch_sizes(Lens(4096, 4096, 60.0), "gpu") == (8,)
+
+
+@given(count=st.integers(0, 200))
+def test_a_cpu_draws_no_image_in_vain(count):
+    assert sum(calls(count, CPU_BATCH)) == count and set(calls(count, CPU_BATCH)) <= set(CPU_BATCH)
+
+
+def test_calls_by_hand():
+    assert calls(47, (1, 2, 6, 18)) == [18, 18, 6, 2, 2, 1]
+    assert calls(0, (1,)) == [] and calls(3, (1,)) == [1, 1, 1]
+    assert calls(19, (2, 4, 8)) == [8, 8, 4] and calls(3, (5,)) == [5] and calls(9, (8, 16)) == [16]
 
 
 def test_each_call_takes_the_least_batch_that_serves(painted, monkeypatch):
