@@ -10,8 +10,32 @@ from __future__ import annotations
 
 import functools
 import gc
+import threading
 from collections.abc import Callable
 from typing import Any
+
+
+class _Suspended:
+    """Keeps the collector off while anybody is inside, and leaves it as the first found it: devices have threads."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._collects = threading.Lock(), 0, False
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._collects = gc.isenabled()
+                gc.disable()
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside and self._collects:
+                gc.enable()
+
+
+_SUSPENDED = _Suspended()
 
 
 def keep_collector_out() -> None:
@@ -28,12 +52,7 @@ def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def quiet(*args: Any, **kwargs: Any) -> Any:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
+        with _SUSPENDED:
             return function(*args, **kwargs)
-        finally:
-            if collects:
-                gc.enable()
 
     return quiet

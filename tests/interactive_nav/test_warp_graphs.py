@@ -3,6 +3,7 @@
 import gc
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -35,6 +36,32 @@ def test_who_had_switched_it_off_finds_it_off():
         gc.enable()
     assert without_collector(lambda: (inner(), gc.isenabled()))() == (False, False)
     assert gc.isenabled()
+
+
+def test_it_stays_away_until_the_last_of_several_threads_is_out():
+    first_in, second_in, first_out = threading.Event(), threading.Event(), threading.Event()
+    seen = []
+
+    def short():
+        first_in.set()
+        assert second_in.wait(10)
+
+    def long():
+        second_in.set()
+        assert first_out.wait(10)
+        seen.append(gc.isenabled())
+
+    def first():
+        without_collector(short)()
+        first_out.set()
+
+    threads = [threading.Thread(target=first), threading.Thread(target=without_collector(long))]
+    threads[0].start()
+    assert first_in.wait(10)
+    threads[1].start()
+    for thread in threads:
+        thread.join(10)
+    assert seen == [False] and gc.isenabled()
 
 
 CALLED = """
