@@ -516,15 +516,19 @@ def _bar():
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("starting", total=None)
-        began, told = time.perf_counter(), [0]
+        task, tenths = bar.add_task("starting", total=None), 0
+        # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
+        first: tuple[float, int] | None = None
 
         def tell(what: str, done: int, total: int) -> None:
+            nonlocal tenths, first
+            first = first or (time.perf_counter(), done)
             bar.update(task, description=what, completed=done, total=total)
-            if not console.is_terminal and done * 10 // max(total, 1) > told[0]:
-                told[0] = done * 10 // total
-                left = (time.perf_counter() - began) * (total - done) / max(done, 1)
-                console.print(f"{what}: {done:,} of {total:,}, {left:.0f} s left", highlight=False, soft_wrap=True)
+            if not console.is_terminal and done * 10 // max(total, 1) > tenths:
+                tenths, (began, before), left = done * 10 // total, first, ""
+                if done > before:
+                    left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
+                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
 
         yield tell
 

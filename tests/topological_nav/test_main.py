@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from interactive_nav.scene import load_scene
+from topological_nav import __main__ as commands
 from topological_nav import build, rooms
 from topological_nav.__main__ import main
 from topological_nav.graph import load_map
@@ -118,3 +119,17 @@ def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys, monke
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines] == ["kmeans", "gmm", "spectral"]
     assert Image.open(out).size[0] > 800
+
+
+def test_time_left_is_told_by_what_this_run_has_done_so_far(monkeypatch, capsys):
+    clock = iter((400.0, 420.0, 500.0))  # after five minutes of compiling
+    monkeypatch.setattr(commands.time, "perf_counter", lambda: next(clock))
+    with commands._bar() as tell:
+        for done in (20, 25, 30, 31, 100):
+            tell("cedar", done, 100)
+    # 20 were there before; then 10 in 20 s, so 140 s for the other 70.
+    assert capsys.readouterr().err.splitlines() == [
+        "cedar: 20 of 100",
+        "cedar: 30 of 100, 140 s left",
+        "cedar: 100 of 100, 0 s left",
+    ]
