@@ -26,6 +26,10 @@ from topological_nav.space import FreeSpace
 from train.files import whole_file
 
 WON, LOST = "tab:blue", "tab:red"
+FEW = 100
+"""Episodes of which each start and goal is drawn; of more, only those of the lost."""
+INK = 40.0
+"""Paths drawn so many times over each other make a solid colour, however many there are."""
 
 
 def map_lines(axis: Axes, made: TopologicalMap, passable: float) -> None:
@@ -67,14 +71,23 @@ def journeys_figure(
         floor_plan(axis, space)
         if made is not None:
             map_lines(axis, made, passable)
-        for number, row in rows.items():
-            colour = WON if row["success"] else LOST
-            if number in tracks:
-                axis.plot(*tracks[number].T, color=colour, linewidth=0.9, alpha=0.65, zorder=3)
-            axis.plot(row["start_x_w"], row["start_y_w"], "o", color=colour, markersize=3.5, zorder=4)
-            axis.plot(row["goal_x_w"], row["goal_y_w"], "*", color=colour, markersize=7, zorder=4)
+        for wins, colour in ((True, WON), (False, LOST)):  # what was lost lies above
+            mine = {number: row for number, row in rows.items() if bool(row["success"]) == wins}
+            alpha = max(0.01, min(0.65, INK / max(len(mine), 1)))
+            ways = [tracks[number] for number in mine if number in tracks]
+            axis.add_collection(
+                LineCollection(ways, colors=colour, linewidths=0.9, alpha=alpha, zorder=3), autolim=False
+            )
+            shown = list(mine.values()) if len(rows) <= FEW or not wins else []
+            alpha = min(1.0, 2 * FEW / max(len(shown), 1))
+            for end, marker, size in (("start", "o", 3.5), ("goal", "*", 7)):
+                xy = [[row[f"{end}_{x}_w"] for row in shown] for x in "xy"]
+                axis.plot(*xy, marker, color=colour, markersize=size, alpha=alpha, zorder=4)
         won = sum(bool(row["success"]) for row in rows.values())
-        axis.set_title(f"{scene}, {name}: {won} of {len(rows)} reached (blue; red: not)\n● start, ★ goal", fontsize=8)
+        whose = "" if len(rows) <= FEW else " of the others"
+        axis.set_title(
+            f"{scene}, {name}: {won:,} of {len(rows):,} reached (blue; red: not)\n● start, ★ goal{whose}", fontsize=8
+        )
     return figure
 
 
