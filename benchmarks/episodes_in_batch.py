@@ -29,8 +29,8 @@ from topological_nav.navigator import Navigator
 from topological_nav.packaged import packaged_weights
 from topological_nav.settings import overridden
 
-COMPILING = "/jax/core/compile/"
-"""How the names of JAX's events of tracing, lowering and compiling begin."""
+COMPILED = "/jax/core/compile/backend_compile_duration"
+"""JAX's event of a program that XLA has compiled; tracing and lowering have others, of which one may hold another."""
 REST = "navigator, scores"
 
 
@@ -77,7 +77,7 @@ class Clock:
         return call
 
     def _compiled(self, event: str, duration_secs: float, **_: Any) -> None:
-        if self._open and event.startswith(COMPILING):
+        if self._open and event == COMPILED:
             self.parts[self._open[-1][0]].compiling += duration_secs
 
 

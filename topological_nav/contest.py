@@ -61,6 +61,7 @@ CONTENDERS = ("dense", "sparse", "expert", "ppo")
 NOT_ASKED = ("batch", "episodes", "supersample")
 """Settings that decide no row, or of which it is told otherwise."""
 CPU_BATCH = 8
+"""Episodes played at a time on a CPU unless asked otherwise."""
 Tell = Callable[[str, int, int], None]
 
 

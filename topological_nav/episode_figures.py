@@ -73,7 +73,7 @@ def journeys_figure(
             map_lines(axis, made, passable)
         for wins, colour in ((True, WON), (False, LOST)):  # what was lost lies above
             mine = {number: row for number, row in rows.items() if bool(row["success"]) == wins}
-            alpha = max(0.01, min(0.65, INK / max(len(mine), 1)))
+            alpha = max(0.01, min(0.65, INK / max(len(mine), 1)))  # of less, eight bits show nothing
             ways = [tracks[number] for number in mine if number in tracks]
             axis.add_collection(
                 LineCollection(ways, colors=colour, linewidths=0.9, alpha=alpha, zorder=3), autolim=False

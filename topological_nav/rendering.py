@@ -20,7 +20,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
 from topological_nav.errors import TopologicalError
 
-CPU_BATCH = (1, 2, 6, 18)
+CPU_IMAGES = (1, 2, 6, 18)
 """Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""
 DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
 """Least and most images a call on an accelerator, and the most pixels drawn for them."""
@@ -144,7 +144,7 @@ def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
         platform: `jax.default_backend()`. On an accelerator: powers of two up to what `DEVICE_PIXELS` allows.
     """
     if platform == "cpu":
-        return CPU_BATCH
+        return CPU_IMAGES
     least, most = DEVICE_BATCH
     most = min(most, max(least, DEVICE_PIXELS // (lens.width * lens.height)))
     return tuple(1 << n for n in range(least.bit_length() - 1, most.bit_length()))

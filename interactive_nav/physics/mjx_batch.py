@@ -26,7 +26,7 @@ from interactive_nav.physics.base import (
 )
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.warp_graphs import keep_collector_out
+from interactive_nav.warp_callbacks import keep_collector_out
 from interactive_nav.world import Layout, World
 
 # Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,

@@ -18,7 +18,7 @@ from mujoco import mjx
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.rendering.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
 from interactive_nav.rendering.boxes import BoxTables, box_poses
-from interactive_nav.warp_graphs import keep_collector_out
+from interactive_nav.warp_callbacks import keep_collector_out
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
 """Padding boxes lie here, below the floor, which hides them."""

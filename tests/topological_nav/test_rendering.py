@@ -17,7 +17,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from topological_nav import rendering
 from topological_nav.errors import TopologicalError
-from topological_nav.rendering import CPU_BATCH, SceneRenderer, batch_sizes, calls, camera_pose, shrink
+from topological_nav.rendering import CPU_IMAGES, SceneRenderer, batch_sizes, calls, camera_pose, shrink
 
 
 def test_the_camera_stands_where_the_robots_mount_has_it():
@@ -59,7 +59,7 @@ def test_shrinking_takes_means_over_squares():
 
 def test_walls_have_their_colours_and_batches_of_any_size_their_order(painted):
     renderer = SceneRenderer(load_scene(painted), Lens(16, 12, 60.0))
-    robot, n = get_robot("ttbot"), CPU_BATCH[-1] + 3
+    robot, n = get_robot("ttbot"), CPU_IMAGES[-1] + 3
     # Turning between the red walls on the left (looking along -x) and the green ones on the right.
     heading = np.where(np.arange(n) % 2 == 0, np.pi, 0.0)
     place = np.where((np.arange(n) % 2 == 0)[:, None], [-1.5, 0.0], [1.5, 0.0])
@@ -91,7 +91,7 @@ def test_shrinking_on_a_device_gives_the_same_levels(by):
 
 
 def test_batches_grow_on_an_accelerator_as_far_as_memory_allows():
-    assert batch_sizes(Lens(640, 480, 60.0), "cpu") == CPU_BATCH
+    assert batch_sizes(Lens(640, 480, 60.0), "cpu") == CPU_IMAGES
     assert batch_sizes(Lens(640, 480, 60.0), "gpu") == (8, 16, 32, 64, 128, 256)
     assert batch_sizes(Lens(64, 48, 60.0), "gpu")[-1] == 2048
     assert batch_sizes(Lens(4096, 4096, 60.0), "gpu") == (8,)
@@ -99,7 +99,7 @@ def test_batches_grow_on_an_accelerator_as_far_as_memory_allows():
 
 @given(count=st.integers(0, 200))
 def test_a_cpu_draws_no_image_in_vain(count):
-    assert sum(calls(count, CPU_BATCH)) == count and set(calls(count, CPU_BATCH)) <= set(CPU_BATCH)
+    assert sum(calls(count, CPU_IMAGES)) == count and set(calls(count, CPU_IMAGES)) <= set(CPU_IMAGES)
 
 
 def test_calls_by_hand():
@@ -128,7 +128,7 @@ def test_each_call_takes_the_least_batch_that_serves(painted, monkeypatch):
 
 
 def test_where_any_number_of_cameras_is_needs_no_compiling(caplog):
-    # By JAX's arrays each number was compiled anew, which took most of the time of a thousand episodes in a batch.
+    # By JAX's arrays each number was compiled anew, which took most of the time of a batch of 4,000 episodes.
     with jax.log_compiles(), caplog.at_level(logging.DEBUG):
         for n in (11, 13, 17):
             pose = camera_pose(get_robot("ttbot"), np.zeros((n, 2)), np.linspace(0, 3, n), np.zeros(n))

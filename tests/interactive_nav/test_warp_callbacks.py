@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from interactive_nav.warp_graphs import without_collector
+from interactive_nav.warp_callbacks import without_collector
 
 wp = pytest.importorskip("warp")
 
@@ -69,7 +69,7 @@ import gc, sys
 import interactive_nav
 import jax, jax.numpy as jnp
 import warp as wp
-from interactive_nav.warp_graphs import keep_collector_out
+from interactive_nav.warp_callbacks import keep_collector_out
 
 if sys.argv[1] == "suspended":
     keep_collector_out()
@@ -96,7 +96,7 @@ def test_callbacks_of_warps_run_without_it():
 
 
 def test_upstream_warps_callbacks_still_let_the_collector_in():
-    # Fails when Warp suspends it: then `interactive_nav/warp_graphs.py` can go.
+    # Fails when Warp suspends it: then `interactive_nav/warp_callbacks.py` can go.
     done = say(CALLED, "as it comes")
     assert done.stdout.splitlines()[-1:] == ["8.0 [True] True"], done.stdout + done.stderr
 
@@ -106,7 +106,7 @@ import gc, sys
 import interactive_nav
 import jax, jax.numpy as jnp
 import warp as wp
-from interactive_nav.warp_graphs import keep_collector_out
+from interactive_nav.warp_callbacks import keep_collector_out
 
 if sys.argv[1] == "suspended":
     keep_collector_out()
