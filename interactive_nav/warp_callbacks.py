@@ -2,8 +2,10 @@
 
 Such a call captures a CUDA graph whenever XLA has moved a buffer, and runs Python for up to a second. What the
 collector finds dead meanwhile is destroyed on the device at once, and no capture survives that: a program that JAX has
-compiled ends it (CUDA errors 900 and 901; NVIDIA/warp#401 and #992, mujocolab/mjlab#821), and an old `wp.Stream`
-takes XLA's stream, which it shares, out of Warp's books ("unknown stream").
+compiled ends it (CUDA error 901; NVIDIA/warp#401 and #992, mujocolab/mjlab#821), and an old `wp.Stream`
+takes XLA's stream, which it shares, out of Warp's books (error 900, "unknown stream"). The latter happens without the
+collector too, if somebody holds the frame of an old call and drops it within a new one, as samplers of
+`sys._current_frames` do: profile from outside of the process.
 """
 
 from __future__ import annotations

@@ -86,8 +86,8 @@ print(float(total), seen, gc.isenabled())
 """
 
 
-def say(program: str, how: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", program, how], capture_output=True, text=True, timeout=300)
+def say(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=300)
 
 
 def test_callbacks_of_warps_run_without_it():
@@ -101,38 +101,59 @@ def test_upstream_warps_callbacks_still_let_the_collector_in():
     assert done.stdout.splitlines()[-1:] == ["8.0 [True] True"], done.stdout + done.stderr
 
 
-DEAD_PROGRAM = """
+DEATHS = """
 import gc, sys
 import interactive_nav
 import jax, jax.numpy as jnp
 import warp as wp
 from interactive_nav.warp_callbacks import keep_collector_out
 
-if sys.argv[1] == "suspended":
+dies, collector = sys.argv[1:]
+if collector == "suspended":
     keep_collector_out()
+gc.set_threshold(0)  # it is on, and comes only when called
+kept = []
+
+def first(a: wp.array(dtype=float), out: wp.array(dtype=float)):
+    if dies == "stream":
+        kept.append(wp.get_stream())  # as a frame does that somebody holds
+    wp.copy(out, a)
 
 def body(a: wp.array(dtype=float), out: wp.array(dtype=float)):
+    kept.clear()
     if gc.isenabled():
         gc.collect()  # as it may come at any allocation
-    wp.copy(out, a)
+    room = wp.empty(1000, dtype=float, device=wp.get_stream().device)
+    wp.copy(room, a, count=8)
+    wp.copy(out, room, count=8)
 
 class Ring:
     pass
 
-called = wp.jax_callable(body, graph_mode=wp.JaxCallableGraphMode.WARP)
-gc.disable()
-ring = Ring()
-ring.itself, ring.program = ring, jax.jit(lambda x: jnp.sin(x) @ x.T)
-ring.program(jnp.ones((64, 64))).block_until_ready()
-del ring  # dead, and found by the collector alone
-gc.enable()
-print(float(jax.jit(lambda x: called(x)[0])(jnp.ones(8)).sum()))
+plain = wp.jax_callable(first, graph_mode=wp.JaxCallableGraphMode.NONE)
+captured = wp.jax_callable(body, graph_mode=wp.JaxCallableGraphMode.WARP)
+x = jnp.ones(8)
+jax.jit(lambda x: plain(x)[0])(x).block_until_ready()
+if dies == "program":
+    ring = Ring()
+    ring.itself, ring.program = ring, jax.jit(lambda x: jnp.sin(x) @ x.T)
+    ring.program(jnp.ones((64, 64))).block_until_ready()
+    del ring  # dead, and found by the collector alone
+print(float(jax.jit(lambda x: captured(x)[0])(x).sum()))
 """
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs an NVIDIA GPU")
-@pytest.mark.parametrize(("how", "survives"), [("suspended", True), ("as it comes", False)])
-def test_a_program_that_dies_within_a_capture_ends_it(how, survives):
-    done = say(DEAD_PROGRAM, how)
+@pytest.mark.parametrize(
+    ("dies", "collector", "survives"),
+    [
+        ("nothing", "let in", True),
+        ("program", "suspended", True),
+        ("program", "let in", False),
+        ("stream", "suspended", False),
+    ],
+)
+def test_what_dies_within_a_capture_ends_it(dies, collector, survives):
+    done = say(DEATHS, dies, collector)
     assert (done.returncode == 0 and done.stdout.splitlines()[-1:] == ["8.0"]) == survives, done.stdout + done.stderr
