@@ -36,15 +36,15 @@ REST = "navigator, scores"
 
 @dataclasses.dataclass
 class Spent:
-    """By one part of the work."""
+    """By one part of the work; times in seconds."""
 
     calls: int = 0
     seconds: float = 0.0
     """Without the parts that it called."""
     compiling: float = 0.0
-    """Of these."""
+    """Of these, by XLA."""
     longest: float = 0.0
-    """Call."""
+    """Of one call, likewise without the parts that it called."""
 
 
 class Clock:

@@ -61,7 +61,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 class SceneRenderer:
     """Draws one scene, its furniture at rest and no robot in it."""
 
-    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", batch: int | None = None):
+    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp"):
         """Loads the scene's meshes; the first picture may compile.
 
         Args:
@@ -69,7 +69,6 @@ class SceneRenderer:
             lens: of the images returned.
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
-            batch: images a call of the engine; fewer are padded. None: see `batch_sizes` and `calls`.
         """
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
@@ -79,7 +78,7 @@ class SceneRenderer:
         self._painters: dict[int, Painter] = {}
         """By images a call."""
         if engine == "warp":
-            self._sizes = (batch,) if batch else batch_sizes(self._large, jax.default_backend())
+            self._sizes = batch_sizes(self._large, jax.default_backend())
             self._painter(self._sizes[0])  # an engine that does not start says so here
         else:
             self._sizes = (1,)

@@ -97,7 +97,7 @@ def test_callbacks_of_warps_run_without_it():
 
 def test_upstream_warps_callbacks_still_let_the_collector_in():
     # Fails when Warp suspends it: then `interactive_nav/warp_callbacks.py` can go.
-    done = say(CALLED, "as it comes")
+    done = say(CALLED, "let in")
     assert done.stdout.splitlines()[-1:] == ["8.0 [True] True"], done.stdout + done.stderr
 
 

@@ -97,7 +97,7 @@ def test_a_trained_policy_starts_every_run_with_a_fresh_memory_and_keeps_it_with
 
 def test_it_is_shown_level_images_of_where_the_robot_is_and_its_words_are_commands(watched):
     venue, policy, steps, _ = watched
-    renderer = SceneRenderer(venue.scene, Lens(32, 32, venue.networks.camera.fov_deg), batch=6)
+    renderer = SceneRenderer(venue.scene, Lens(32, 32, venue.networks.camera.fov_deg))
     robot, about = get_robot("ttbot"), policy.policy.about
     acted = [i for i in range(1, len(steps)) if steps[i][4] > steps[i - 1][4]]
     for i in acted[:: max(1, len(acted) // 5)]:

@@ -6,23 +6,24 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from benchmarks.episodes_in_batch import REST, Clock, measure, table
+from benchmarks.episodes_in_batch import REST, Clock, Spent, measure, table
 from tests.topological_nav.conftest import Made
 from topological_nav.config import PASSAGE_POLICY, EvaluationConfig
 from topological_nav.contest import Contest
 
 
-def test_seconds_are_those_of_the_part_itself():
+def test_seconds_are_those_of_the_part_itself(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    def passes(seconds):
+        now[0] += seconds
+
     clock = Clock()
-    inner = clock.timed("inner", lambda: time.sleep(0.05))
-    outer = clock.timed("outer", lambda: (inner(), inner(), time.sleep(0.02)))
-    outer()
-    found = clock.parts
-    assert (found["inner"].calls, found["outer"].calls) == (2, 1)
-    assert 0.1 <= found["inner"].seconds < 0.2 and 0.02 <= found["outer"].seconds < 0.09
-    assert 0.05 <= found["inner"].longest <= found["inner"].seconds / 2 + 0.03
+    inner = clock.timed("inner", passes)
+    clock.timed("outer", lambda: (inner(2.0), passes(1.0), inner(3.0)))()
+    assert clock.parts == {"inner": Spent(2, 5.0, 0.0, 3.0), "outer": Spent(1, 1.0, 0.0, 1.0)}
 
 
 def test_compiling_belongs_to_the_part_that_asked_for_it():
@@ -55,7 +56,7 @@ def test_a_batch_is_played_and_its_parts_add_up(made: Made):
     steps = round(played.duration_s.max() / 0.1) + 1
     # A start, and of every step the drive and two looks at where the robots are, of which one is remembered.
     assert steps <= parts["physics"].calls <= 4 * steps
-    assert sum(part.seconds for part in parts.values()) == pytest.approx(seconds, rel=0.6)
+    assert all(part.seconds >= part.longest > 0 for part in parts.values())
     assert sum(part.seconds for part in parts.values()) <= seconds
     lines = table(parts)
     assert len(lines) == 2 + len(parts) and lines[0].count("|") == lines[-1].count("|") == 6

@@ -56,7 +56,7 @@ from interactive_nav.scene import load_scene
 from topological_nav.rendering import SceneRenderer, camera_pose
 asked = np.load(sys.argv[2])
 lens = Lens(int(asked["width"]), int(asked["height"]), float(asked["fov_deg"]))
-renderer = SceneRenderer(load_scene(Path(sys.argv[3])), lens, int(asked["finer"]), engine="gl", batch=4)
+renderer = SceneRenderer(load_scene(Path(sys.argv[3])), lens, int(asked["finer"]), engine="gl")
 pose = camera_pose(get_robot("ttbot"), asked["places"], asked["headings"], np.full(len(asked["places"]), -0.1))
 images, held = renderer.draw(pose), weakref.ref(renderer)
 gc.disable()
@@ -108,7 +108,7 @@ def by_gl(gl_here, painted, tmp_path_factory):
 def both(by_gl, painted):
     """The same by both engines."""
     pose = camera_pose(get_robot("ttbot"), PLACES, HEADINGS, np.full(4, -0.1))
-    return by_gl["images"], SceneRenderer(load_scene(painted), LENS, FINER, engine="warp", batch=4).draw(pose)
+    return by_gl["images"], SceneRenderer(load_scene(painted), LENS, FINER, engine="warp").draw(pose)
 
 
 def test_a_context_goes_with_its_renderer(by_gl):
