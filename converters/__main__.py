@@ -28,6 +28,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from converters.errors import StageFailed
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import CATEGORIES
 
 if TYPE_CHECKING:
@@ -408,13 +410,7 @@ def main(argv: list[str] | None = None) -> int:
         where = error.filename or getattr(arguments, "out", None) or "file system"
         print(f"error: {where}: {error.strerror or error}; nothing was written", file=sys.stderr)
         return 2
-    except (ValueError, RuntimeError) as error:
-        from converters.errors import SceneRejected, StageFailed
-        from scenes_mjcf.schema import SceneError
-
-        known = isinstance(error, (SceneRejected, StageFailed, SceneError))
-        if not known and type(error).__name__ != "GenerationError":
-            raise
+    except (UserError, StageFailed) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)
         return 2
 

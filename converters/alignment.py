@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import f as f_distribution
 
 from converters.raw import Annotation
+from interactive_nav_common.errors import UserError
 
 MIN_POINTS = 6
 """The annotators' rule (section III-B): eighteen equations for seven unknowns, so that one can be thrown out."""
@@ -40,7 +41,7 @@ SYMMETRY_PERIOD_RAD = {
 """Scan2CAD's `sym` word -> the turn about the vertical after which the model looks the same (0: any turn)."""
 
 
-class AlignmentError(ValueError):
+class AlignmentError(UserError):
     """Keypoints that do not determine the seven parameters; the message says why."""
 
 

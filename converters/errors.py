@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from interactive_nav_common.errors import UserError
 
-class SceneRejected(ValueError):
+
+class SceneRejected(UserError):
     """The input cannot become a scene (missing or broken file, no floor, unknown category, ...)."""
 
 

@@ -5,14 +5,8 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import multiprocessing
-import os
-import re
-import shutil
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -43,6 +37,7 @@ from converters.settle import Settled, settle
 from converters.storeys import split_storeys
 from converters.texture import ColourCloud, VisualMesh, bake_object, bake_structure, colour_cloud
 from converters.walls import wall_boxes
+from interactive_nav_common.files import part_folder, publish
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
 READERS = {
@@ -62,9 +57,6 @@ STAGES = {
     "gates": 3.0,
 }
 """Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
-
-STALE_S = 1.0
-"""An unfinished folder younger than this may be of a conversion that is just starting."""
 
 PARALLEL_OBJECTS = 8
 """From so many objects on, starting processes for their textures pays."""
@@ -344,139 +336,6 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds)
 
 
-@contextlib.contextmanager
-def fresh_folder(target: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder beside `target` that becomes it on success and vanishes on failure or interruption.
-
-    Raises:
-        SceneRejected: the target exists, or its parent cannot be written.
-    """
-    with contextlib.ExitStack() as stack:
-        temporary = stack.enter_context(_part_folder(target, overwrite))
-        yield temporary
-        publish({temporary: target})
-
-
-@contextlib.contextmanager
-def _part_folder(target: Path, overwrite: bool) -> Iterator[Path]:
-    """An empty folder beside `target`; gone at the end unless it was published."""
-    if target.parent.is_dir():
-        remove_stale(target)
-    if target.exists() and not overwrite:
-        raise SceneRejected(f"{target}: exists already; give another OUT or add --overwrite")
-    if target.exists() and not target.is_dir():
-        raise SceneRejected(f"{target}: is a file, expected a folder to write; give another OUT")
-    temporary = target.parent / f".{target.name}.part-{os.getpid()}"
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary.mkdir()
-        lock = _lock(temporary)
-    except OSError as error:
-        raise SceneRejected(f"{target}: cannot be written ({error.strerror}); give another OUT") from error
-    try:
-        yield temporary
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
-
-
-def _lock(folder: Path) -> int | None:
-    """Holds a folder until the descriptor is closed or the process dies, however it dies; None: another holds it.
-
-    A lock and not the process id in the folder's name: ids are used again, and mean nothing in another container.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        return None
-    except OSError:
-        os.close(descriptor)
-        raise
-    return descriptor
-
-
-def remove_stale(target: Path) -> None:
-    """Removes what a conversion into `target` left that was killed (SIGKILL, power): its unfinished folder.
-
-    Was it killed while it replaced an older `target`, that one is put back. Folders of conversions that run are locked
-    and stay.
-
-    Args:
-        target: of the conversion that is about to start.
-    """
-    running = False
-    for kind in ("part", "old"):
-        name = re.compile(re.escape(f".{target.name}.{kind}-") + r"\d+")
-        for folder in sorted(p for p in target.parent.iterdir() if name.fullmatch(p.name)):
-            with contextlib.suppress(OSError):
-                young = time.time() - folder.stat().st_mtime < STALE_S
-                lock = None if young and kind == "part" else _lock(folder)
-                if lock is None:
-                    running = True
-                    continue
-                if kind == "part":
-                    shutil.rmtree(folder, ignore_errors=True)
-                elif not running:  # else it may be in use: a running one replaces the target
-                    if target.exists():
-                        shutil.rmtree(folder, ignore_errors=True)
-                    else:
-                        folder.rename(target)
-                os.close(lock)
-
-
-def publish(folders: dict[Path, Path]) -> None:
-    """Renames finished folders to their targets, all or none; an older target is replaced.
-
-    Signals wait until it is done: a few renames take no time, and half of them would be worse.
-    """
-    with _signals_wait():
-        _publish(folders)
-
-
-@contextlib.contextmanager
-def _signals_wait() -> Iterator[None]:
-    """Holds back SIGINT and SIGTERM; one that came is raised at the end.
-
-    By handlers and not by a mask, which would hold for this thread only: libraries run others.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python runs handlers in the main thread only
-        return
-    came: list[int] = []
-    before = {s: signal.signal(s, lambda number, frame: came.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    for number in came[:1]:
-        signal.raise_signal(number)
-
-
-def _publish(folders: dict[Path, Path]) -> None:
-    moved: list[tuple[Path, Path | None]] = []
-    try:
-        for temporary, target in folders.items():
-            old = None
-            if target.exists():
-                old = target.parent / f".{target.name}.old-{os.getpid()}"
-                target.rename(old)
-            moved.append((target, old))
-            temporary.rename(target)
-    except BaseException:
-        for target, old in moved:
-            shutil.rmtree(target, ignore_errors=True)
-            if old is not None:
-                old.rename(target)
-        raise
-    for _, old in moved:
-        if old is not None:
-            shutil.rmtree(old, ignore_errors=True)
-
-
 def convert_building(
     source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
 ) -> tuple[Converted, ...]:
@@ -515,7 +374,7 @@ def _convert(
     clock = _Clock(report or (lambda stage, share: None))
     with contextlib.ExitStack() as stack:
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
-        first = stack.enter_context(_part_folder(target, config.overwrite))
+        first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
             raw = dataclasses.replace(read_source(source, config.format, config.strict), name=target.name)
             scenes = split_storeys(raw)
@@ -528,7 +387,7 @@ def _convert(
             folders = {first: target}
         else:
             targets = [target.parent / scene.name for scene in scenes]
-            folders = {stack.enter_context(_part_folder(t, config.overwrite)): t for t in targets}
+            folders = {stack.enter_context(part_folder(t, config.overwrite)): t for t in targets}
         done = []
         for scene, (folder, final) in zip(scenes, folders.items(), strict=True):
             result = convert_raw(scene, folder, config, clock, cache or cache_folder())

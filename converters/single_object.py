@@ -28,11 +28,11 @@ from converters.manifest import PACKAGES
 from converters.obj import TexturedMesh
 from converters.objects import Hull, PlacedObject, convex_hull, fit_box, rotation_of
 from converters.physical import MATERIALS, Physical
-from converters.pipeline import fresh_folder
 from converters.raw import ScanMesh
 from converters.settle import settle
 from converters.texture import VisualMesh, bake_object, colour_cloud
 from converters.urdf import RigidObject, colours_of_faces, read_surface, read_urdf
+from interactive_nav_common.files import whole_folder
 from scenes_mjcf.schema import CATEGORIES
 
 WORDS = {
@@ -183,7 +183,7 @@ def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path |
     """
     if not path.is_file():
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")
-    with fresh_folder(target, config.overwrite) as folder:
+    with whole_folder(target, config.overwrite) as folder:
         item, source = read_object(path, config)
         category = _category(config, (item.name, path.stem), path)
         low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)

@@ -20,6 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from interactive_nav_common.errors import UserError
+
 if TYPE_CHECKING:
     from interactive_nav.env import InteractiveNav
     from interactive_nav.types import EpisodeStart
@@ -47,7 +49,7 @@ class EpisodeFile:
     that found no place) and shortest_path_m; metres and radians, world frame."""
 
 
-class EpisodeFileError(ValueError):
+class EpisodeFileError(UserError):
     """An episode file that cannot be used; the message says what, where, what was expected and what to do."""
 
 

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav_common.errors import UserError
 
 FORMAT = 1
 _CHUNK_STEPS = 50
@@ -31,7 +32,7 @@ _ARRAYS = (
 )
 
 
-class ReplayError(ValueError):
+class ReplayError(UserError):
     """A file that is no replay, or one that does not fit what is there to draw it."""
 
 

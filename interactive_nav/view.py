@@ -22,13 +22,14 @@ from interactive_nav.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shape
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scene import Scene, load_scene
 from interactive_nav.tables import furniture_map
+from interactive_nav_common.errors import UserError
 
 VIEWERS = ("auto", "window", "browser")
 GAP_M = 0.03
 """Least gap between what is placed at random."""
 
 
-class ViewError(ValueError):
+class ViewError(UserError):
     """No viewer can open; the message says what to install."""
 
 

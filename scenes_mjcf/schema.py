@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from interactive_nav_common.errors import UserError
+
 SCHEMA_VERSION = 1
 CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy")
 SPLITS = ("train", "test")
 
 
-class SceneError(ValueError):
+class SceneError(UserError):
     """A scene folder that cannot be used; the message says what, where, what was expected and what to do."""
 
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 MAY_IMPORT = {
-    "scenes_mjcf": set(),
-    "converters": {"scenes_mjcf"},
-    "interactive_nav": {"scenes_mjcf"},
-    "train": {"interactive_nav", "scenes_mjcf"},
-    "topological_nav": {"interactive_nav", "train", "scenes_mjcf"},
+    "interactive_nav_common": set(),
+    "scenes_mjcf": {"interactive_nav_common"},
+    "converters": {"scenes_mjcf", "interactive_nav_common"},
+    "interactive_nav": {"scenes_mjcf", "interactive_nav_common"},
+    "train": {"interactive_nav", "scenes_mjcf", "interactive_nav_common"},
+    "topological_nav": {"interactive_nav", "train", "scenes_mjcf", "interactive_nav_common"},
 }
 
 

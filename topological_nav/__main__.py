@@ -18,6 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.schema import SceneError
 from topological_nav import adapt_commands
 from topological_nav.config import (
@@ -32,9 +33,7 @@ from topological_nav.config import (
     passage_config,
     room_config,
 )
-from topological_nav.errors import SettingsError, TopologicalError
 from topological_nav.settings import overridden, settings_help
-from train.errors import TrainError
 
 DATASET, DRIVES = RUNS / "data", RUNS / "drives"
 TASKS = {"rooms": room_config, "passages": passage_config}
@@ -169,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "export": _export,
         }
         run[arguments.command](arguments)
-    except (TopologicalError, SceneError, TrainError) as error:
+    except (UserError, SceneError) as error:
         print(f"topological_nav: {error}", file=sys.stderr)
         return 2
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
@@ -404,7 +403,7 @@ def _navigate(arguments: argparse.Namespace) -> None:
     from topological_nav.journey import drive_episode, film
 
     if arguments.video and arguments.video.suffix != ".mp4":
-        raise SettingsError(f"--video {arguments.video}: expected a name that ends in .mp4")
+        raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
     contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
@@ -425,11 +424,11 @@ def _navigate(arguments: argparse.Namespace) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
+    from interactive_nav_common.files import write_text
     from topological_nav.contest import hold, tracks_of, venues_of
     from topological_nav.episode_figures import journeys_figure
     from topological_nav.figures import save
     from topological_nav.scores import console_table, differences, markdown, summary, where
-    from train.files import write_text
 
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
@@ -498,7 +497,7 @@ def _say(line: str) -> None:
 
 @contextmanager
 def _stops() -> Iterator[list[int]]:
-    from train.signals import stop_signals
+    from interactive_nav_common.signals import stop_signals
 
     with stop_signals() as seen:
         yield seen

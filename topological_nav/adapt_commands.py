@@ -7,9 +7,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.adapt_config import AdaptConfig
 from topological_nav.config import PITCHES
-from topological_nav.errors import SettingsError
 from topological_nav.settings import overridden
 
 Asked = Callable[[], bool]
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace, should_stop: Asked) -> bool:
     """
     config = overridden(AdaptConfig(), arguments.settings)
     if (arguments.what == "map") != bool(arguments.scene):
-        raise SettingsError("adapt map takes a scene folder, adapt features and adapt passages none")
+        raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
     arguments.target = arguments.target or arguments.data
     from topological_nav.packaged import choose
 

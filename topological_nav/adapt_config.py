@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.domains import PRESETS
-from topological_nav.errors import SettingsError
 from topological_nav.settings import require
 
 
@@ -50,4 +50,4 @@ class AdaptConfig:
         require(self, "edge_m", 0.1, 100.0)
         require(self, "passable", 0.0, 1.0)
         if self.domain not in PRESETS:
-            raise SettingsError(f"domain is '{self.domain}', expected one of {', '.join(PRESETS)}")
+            raise ConfigError(f"domain is '{self.domain}', expected one of {', '.join(PRESETS)}")

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from interactive_nav_common.files import whole_file, write_text
 from topological_nav.adapt_config import AdaptConfig
 from topological_nav.config import PITCHES
 from topological_nav.data import RoomImages, load_rooms, read_header
@@ -34,7 +35,6 @@ from topological_nav.networks import Network, joined, normalised
 from topological_nav.runs import METRICS, RESULTS, claim, read_checkpoint, restored
 from topological_nav.training import Trained, load_trained, save_trained
 from train.config_io import to_dict
-from train.files import whole_file, write_text
 from train.run_folder import read_metrics, versions
 
 ROOMS_STREAM, PASSAGES_STREAM = 1, 2

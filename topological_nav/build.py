@@ -16,6 +16,7 @@ import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
+from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data import headings, lens_of
 from topological_nav.errors import MapError, SpaceError
@@ -27,7 +28,6 @@ from topological_nav.sight import NetworkSight, Sight
 from topological_nav.space import FreeSpace, free_space
 from topological_nav.training import Trained, load_trained
 from train.config_io import to_dict
-from train.files import whole_file
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""

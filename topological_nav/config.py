@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from topological_nav.errors import SettingsError
+from interactive_nav_common.errors import ConfigError
 from topological_nav.settings import require
 
 PITCHES = ("up", "level", "down")
@@ -92,17 +92,17 @@ class DataConfig(CameraConfig):
         require(self, "passage_points", 2, 10**4)
         lengths = self.passage_lengths_m
         if not lengths or min(lengths) < 0.05 or list(lengths) != sorted(set(lengths)):
-            raise SettingsError(f"passage_lengths_m is {list(lengths)}, expected ascending lengths from 0.05 m on")
+            raise ConfigError(f"passage_lengths_m is {list(lengths)}, expected ascending lengths from 0.05 m on")
         if self.passage_length_m not in lengths:
-            raise SettingsError(
+            raise ConfigError(
                 f"passage_length_m is {self.passage_length_m:g}, expected one of passage_lengths_m {list(lengths)}; "
                 "add it there"
             )
         require(self, "pitch_deg", 0.0, 80.0)
         if not 0.0 < self.test_share < 1.0:
-            raise SettingsError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
+            raise ConfigError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
         if self.headings < 3 or self.headings % 3:
-            raise SettingsError(f"headings is {self.headings}, expected a multiple of 3")
+            raise ConfigError(f"headings is {self.headings}, expected a multiple of 3")
 
     @property
     def passage_column(self) -> int:
@@ -396,7 +396,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
         require(self, "detour", 1.0, 100.0)
         require(self, "start_off_m start_clear_m", 0.0, 10.0)
         if not 0.0 < self.test_share < 1.0:
-            raise SettingsError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
+            raise ConfigError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,12 +25,14 @@ import pyarrow as pa
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import Scene, load_scene
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import whole_file
 from topological_nav.build import camera_of, drawn_for, renderer_of, true_map
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data import lens_of
 from topological_nav.domains import as_seen_from, preset
 from topological_nav.driving import LocalPolicy
-from topological_nav.errors import RunError, SettingsError
+from topological_nav.errors import RunError
 from topological_nav.evaluation import (
     Contender,
     Journeys,
@@ -52,7 +54,6 @@ from topological_nav.space import FreeSpace, free_space
 from topological_nav.training import Trained, load_trained
 from train import checkpoint
 from train.config_io import to_dict
-from train.files import whole_file
 from train.rows import read_rows, write_parquet
 from train.run_folder import RunFolder, versions
 
@@ -92,14 +93,14 @@ class Contest:
     def __post_init__(self) -> None:
         for name in self.contenders:
             if name not in CONTENDERS:
-                raise SettingsError(f"contender is '{name}', expected a choice from {', '.join(CONTENDERS)}")
+                raise ConfigError(f"contender is '{name}', expected a choice from {', '.join(CONTENDERS)}")
         if "ppo" in self.contenders and self.ppo is None:
-            raise SettingsError("contender ppo needs the run folder of a trained policy: --ppo RUN")
+            raise ConfigError("contender ppo needs the run folder of a trained policy: --ppo RUN")
         if preset(self.domain) != preset("clean") and self.truth:
-            raise SettingsError(f"--domain {self.domain} is of images, --truth has none; leave one of them out")
+            raise ConfigError(f"--domain {self.domain} is of images, --truth has none; leave one of them out")
         names = [Path(s).resolve().name for s in self.scenes]
         if len(set(names)) < len(names):
-            raise SettingsError(f"scenes are {', '.join(names)}, expected different names")
+            raise ConfigError(f"scenes are {', '.join(names)}, expected different names")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,12 +247,12 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
 
     Raises:
         RunError: no such run.
-        SettingsError: a trained policy cannot look at poses.
+        ConfigError: a trained policy cannot look at poses.
     """
     if contest.policy == PASSAGE_POLICY:
         return PassagePolicy(sight, contest.config.passable, contest.config.clear_m)
     if contest.truth:
-        raise SettingsError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
+        raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
     from topological_nav import driving
 
     assert networks is not None

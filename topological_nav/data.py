@@ -24,6 +24,7 @@ import numpy as np
 from interactive_nav.rendering.base import CameraPose, Lens
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
+from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import CameraConfig, DataConfig
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.passages import Passages, draw_passages, held_out
@@ -33,7 +34,6 @@ from topological_nav.settings import overlaid
 from topological_nav.shards import ShardWriter, read_shards
 from topological_nav.space import FreeSpace, free_space, spread
 from train.config_io import to_dict
-from train.files import whole_file, write_text
 
 FORMAT = 2
 """Of the folder; raised whenever older datasets would be read wrongly."""

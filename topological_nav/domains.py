@@ -13,7 +13,7 @@ import math
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from topological_nav.errors import SettingsError
+from interactive_nav_common.errors import ConfigError
 from topological_nav.settings import require
 
 _GAMMA = 2.2
@@ -79,10 +79,10 @@ def preset(name: str) -> DomainConfig:
     """A named camera.
 
     Raises:
-        SettingsError: there is none of that name.
+        ConfigError: there is none of that name.
     """
     if name not in PRESETS:
-        raise SettingsError(f"domain is '{name}', expected one of {', '.join(PRESETS)}")
+        raise ConfigError(f"domain is '{name}', expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 

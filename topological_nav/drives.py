@@ -24,6 +24,7 @@ import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import Scene, load_scene
+from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data import draw_sheets, lens_of, read_versioned
 from topological_nav.errors import DatasetError, SpaceError
@@ -37,7 +38,6 @@ from topological_nav.settings import overlaid
 from topological_nav.shards import ShardWriter, read_shards
 from topological_nav.space import FreeSpace, free_space
 from train.config_io import to_dict
-from train.files import whole_file, write_text
 
 FORMAT = 1
 """Of the folder; raised whenever older ones would be read wrongly."""

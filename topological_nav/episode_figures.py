@@ -20,10 +20,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
+from interactive_nav_common.files import whole_file
 from topological_nav.figures import floor_plan, room_points
 from topological_nav.graph import TopologicalMap
 from topological_nav.space import FreeSpace
-from train.files import whole_file
 
 WON, LOST = "tab:blue", "tab:red"
 FEW = 100

@@ -1,25 +1,19 @@
 """What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
 
-
-class TopologicalError(ValueError):
-    """Base of the errors that a user can cause or mend; the programs print it as one line and exit with 2."""
+from interactive_nav_common.errors import UserError
 
 
-class SettingsError(TopologicalError):
-    """A setting that does not exist, or a value that it cannot have."""
-
-
-class SpaceError(TopologicalError):
+class SpaceError(UserError):
     """A scene without the free space that was asked for."""
 
 
-class DatasetError(TopologicalError):
+class DatasetError(UserError):
     """A dataset that is missing, incomplete, or made with other settings."""
 
 
-class RunError(TopologicalError):
+class RunError(UserError):
     """A run folder that is missing, damaged, or trained with other settings."""
 
 
-class MapError(TopologicalError):
+class MapError(UserError):
     """A topological map that is damaged, of another version, or of another scene."""

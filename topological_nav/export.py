@@ -28,11 +28,13 @@ import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import write_text
 from topological_nav.build import CHUNK, camera_of, renderer_of
 from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data import headings, load_rooms
 from topological_nav.driving import TrainedPolicy, load_policy
-from topological_nav.errors import MapError, RunError, SettingsError
+from topological_nav.errors import MapError, RunError
 from topological_nav.graph import load_map, save_map
 from topological_nav.localise import nearest_node
 from topological_nav.packaged import ABOUT
@@ -40,7 +42,6 @@ from topological_nav.rendering import camera_pose
 from topological_nav.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
 from topological_nav.space import free_space
 from topological_nav.training import Trained, load_trained
-from train.files import write_text
 from train.run_folder import versions
 
 FORMAT = 1
@@ -257,7 +258,7 @@ def level_images(
         images = load_rooms(source).images[:, PITCHES.index("level")]
         return images[np.unique(np.linspace(0, len(images) - 1, places).round().astype(int))]
     if not (source / "scene.json").is_file():
-        raise SettingsError(
+        raise ConfigError(
             f"{source}: is neither a dataset nor a scene; name one whose images to compare by: --images PATH"
         )
     data, scene = camera_of(*networks), load_scene(source)

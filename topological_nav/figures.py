@@ -17,11 +17,11 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from interactive_nav_common.files import whole_file
 from topological_nav.build import Built
 from topological_nav.data import load_plan, load_rooms, read_header
 from topological_nav.graph import Route
 from topological_nav.space import FreeSpace
-from train.files import whole_file
 
 PALETTE = [*plt.get_cmap("tab20").colors[::2], *plt.get_cmap("tab20").colors[1::2]]  # type: ignore[attr-defined]
 """Colours of rooms; after twenty they repeat."""

@@ -14,8 +14,8 @@ import numpy as np
 import interactive_nav
 from interactive_nav.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
+from interactive_nav_common.errors import UserError
 from topological_nav.config import DriveConfig
-from topological_nav.errors import TopologicalError
 from topological_nav.expert import CONTROL_S, Terrain, command, scan_points
 
 SEGMENT = 25
@@ -73,10 +73,10 @@ def make_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
     """The environment of the drives: furniture at rest, no small objects, the robot commanded by velocities.
 
     Raises:
-        TopologicalError: the robot takes no velocities.
+        UserError: the robot takes no velocities.
     """
     if config.robot not in LIDAR_B:
-        raise TopologicalError(f"robot is '{config.robot}', expected one with a scanner: {', '.join(LIDAR_B)}")
+        raise UserError(f"robot is '{config.robot}', expected one with a scanner: {', '.join(LIDAR_B)}")
     return interactive_nav.make(
         config.robot,
         [str(scene) for scene in scenes],

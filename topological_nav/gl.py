@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.rendering.base import Lens
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 
 LIBRARIES = ("egl", "osmesa", "glfw")
 SKY = (237, 242, 247)
@@ -38,7 +38,7 @@ class GlPainter:
             group: of the geoms that are shown.
 
         Raises:
-            TopologicalError: no GL library starts here.
+            UserError: no GL library starts here.
         """
         self._model, self._data, self._lens = model, data, lens
         try:
@@ -49,7 +49,7 @@ class GlPainter:
                 self._context.make_current()
                 self._drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # noqa: BLE001  (GL bindings raise what they like where no GL is)
-            raise TopologicalError(
+            raise UserError(
                 f"engine 'gl' does not start here ({' '.join(repr(error).split())[:200]}); install libegl1 and "
                 "libgl1-mesa-dri, or libosmesa6 and set MUJOCO_GL=osmesa; or engine=warp"
             ) from error

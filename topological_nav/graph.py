@@ -22,12 +22,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.distance import cdist
 
+from interactive_nav_common.files import whole_file
 from topological_nav.config import MapConfig
 from topological_nav.errors import MapError
 from topological_nav.localise import nearest_node
 from topological_nav.rooms import Rooms
 from topological_nav.space import FreeSpace
-from train.files import whole_file
 
 FORMAT = 1
 """Of map files; raised whenever older ones would be read wrongly."""

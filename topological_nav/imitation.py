@@ -26,6 +26,7 @@ import numpy as np
 import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
+from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import DriveConfig, PolicyConfig
 from topological_nav.drives import Drives, drive_images, load_drives, read_drives_header
 from topological_nav.errors import RunError
@@ -53,7 +54,6 @@ from topological_nav.sequences import (
 )
 from topological_nav.training import Trained, load_trained
 from train.config_io import to_dict
-from train.files import whole_file, write_text
 from train.run_folder import versions
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.contest import Contest, venues_of
 from topological_nav.episode_figures import episode_figure, plan_picture, video_frame, write_video
-from topological_nav.errors import SettingsError
 from topological_nav.evaluation import Journeys, NavigatorPlayer, Played, play
 from topological_nav.graph import TopologicalMap
 from topological_nav.navigator import FACE, PHASES, Events, State
@@ -86,11 +86,11 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         progress: told the simulated time; may raise to stop.
 
     Raises:
-        SettingsError: the scene has no such episode.
+        ConfigError: the scene has no such episode.
     """
     (venue,) = venues_of(contest)
     if not 0 <= number < len(venue.journeys):
-        raise SettingsError(
+        raise ConfigError(
             f"episode is {number}, expected 0 to {len(venue.journeys) - 1}; episodes=N makes more of the scene"
         )
     journey = venue.journeys.take(np.array([number]))

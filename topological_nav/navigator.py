@@ -23,9 +23,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.config import NavigatorConfig
 from topological_nav.driving import LocalPolicy
-from topological_nav.errors import SettingsError
 from topological_nav.graph import TopologicalMap
 from topological_nav.learning import padded_size
 from topological_nav.sight import Sight
@@ -140,11 +140,11 @@ class Navigator:
             config: settings.
 
         Raises:
-            SettingsError: as many images a localisation as the map's nodes have no share of.
+            ConfigError: as many images a localisation as the map's nodes have no share of.
         """
         around = made.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:
-            raise SettingsError(f"images is {config.images}, expected a divisor of {around}, the map's images a node")
+            raise ConfigError(f"images is {config.images}, expected a divisor of {around}, the map's images a node")
         self.map = dataclasses.replace(made, metre_cost=config.metre_cost)
         self.sight, self.policy, self.config = sight, policy, config
         self._tolerance = np.deg2rad(config.tolerance_deg)

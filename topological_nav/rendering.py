@@ -18,7 +18,7 @@ import numpy as np
 from interactive_nav.rendering.base import CameraPose, Lens, look_along
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 
 CPU_IMAGES = (1, 2, 6, 18)
 """Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""
@@ -40,11 +40,11 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
         pitch_rad: [...], how far up the camera looks beside its mount's own pitch.
 
     Raises:
-        TopologicalError: the robot's camera is carried by another link.
+        UserError: the robot's camera is carried by another link.
     """
     camera = robot.camera
     if camera.body != robot.base_body:
-        raise TopologicalError(
+        raise UserError(
             f"the camera of '{robot.name}' sits on '{camera.body}', expected its base '{robot.base_body}'; "
             "choose a robot with a camera on its base, such as ttbot"
         )
@@ -114,7 +114,7 @@ class SceneRenderer:
         try:
             from interactive_nav.rendering.warp import WarpColour
         except ImportError as error:
-            raise TopologicalError(
+            raise UserError(
                 f"engine 'warp' does not start here ({error}); pip install 'interactive-nav[warp]', or engine=gl"
             ) from error
         painter = WarpColour(self._model, self._large, size, [_SHOWN])

@@ -22,8 +22,9 @@ from threadpoolctl import threadpool_limits
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import UserError
 from topological_nav.config import DataConfig
-from topological_nav.errors import SpaceError, TopologicalError
+from topological_nav.errors import SpaceError
 from topological_nav.plans import RECORDED
 from topological_nav.space import FreeSpace, free_space
 
@@ -206,7 +207,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from topological_nav.figures import rooms_figure, save
 
         save(rooms_figure(rows), Path(arguments.out))
-    except (TopologicalError, ValueError, OSError) as error:
+    except (UserError, ValueError, OSError) as error:
         print(f"topological_nav.rooms: {error}", file=sys.stderr)
         return 2
     for row in rows:

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from interactive_nav_common.files import whole_file, write_text
 from topological_nav.errors import RunError
 from topological_nav.learning import Learner
-from train.files import whole_file, write_text
 from train.run_folder import read_metrics
 
 CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"

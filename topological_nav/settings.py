@@ -6,9 +6,8 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-from topological_nav.errors import SettingsError
+from interactive_nav_common.errors import ConfigError
 from train import config_io
-from train.errors import ConfigError
 
 Config = TypeVar("Config")
 
@@ -17,7 +16,7 @@ def overridden(config: Config, words: Sequence[str]) -> Config:
     """The config with `name=value` words laid over it; values are read as YAML.
 
     Raises:
-        SettingsError: a word without `=`, an unknown name, or a value that the setting cannot have.
+        ConfigError: a word without `=`, an unknown name, or a value that the setting cannot have.
     """
     return _told(lambda: config_io.overlay(config, config_io.read_words(words, "seed=1"), "setting"))
 
@@ -31,7 +30,7 @@ def overlaid(config: Config, plain: Mapping[str, Any], where: str) -> Config:
         where: named in errors.
 
     Raises:
-        SettingsError: an unknown name, or a value that the setting cannot have.
+        ConfigError: an unknown name, or a value that the setting cannot have.
     """
     return _told(lambda: config_io.overlay(config, plain, where))
 
@@ -40,7 +39,7 @@ def _told(make: Callable[[], Config]) -> Config:
     try:
         return make()
     except ConfigError as error:
-        raise SettingsError(str(error)) from None
+        raise ConfigError(str(error)) from None
 
 
 def settings_help(config: Any) -> str:
@@ -60,4 +59,4 @@ def require(config: Any, names: str, low: float, high: float) -> None:
     for name in names.split():
         value = getattr(config, name)
         if value is not None and not low <= value <= high:
-            raise SettingsError(f"{name} is {value!r}, expected between {low:g} and {high:g}")
+            raise ConfigError(f"{name} is {value!r}, expected between {low:g} and {high:g}")

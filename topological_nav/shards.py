@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from interactive_nav_common.files import whole_file
 from topological_nav.errors import DatasetError
-from train.files import whole_file
 
 COLUMNS = 18
 """Images a row of a sheet."""

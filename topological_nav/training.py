@@ -26,6 +26,7 @@ import numpy as np
 import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
+from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import PITCHES, TrainConfig
 from topological_nav.data import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.errors import RunError
@@ -54,7 +55,6 @@ from topological_nav.runs import (
     run_epochs,
 )
 from train.config_io import to_dict
-from train.files import whole_file, write_text
 from train.run_folder import versions
 
 

@@ -22,6 +22,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from interactive_nav_common.files import write_text
 from topological_nav.adapt_config import AdaptConfig
 from topological_nav.adaptation import PASSAGES_STREAM, Asked, Tell, digest_of, resumable_epochs, target_rooms
 from topological_nav.build import Built
@@ -37,7 +38,6 @@ from topological_nav.runs import RESULTS, claim
 from topological_nav.space import free_space
 from topological_nav.training import Trained, length_scores, load_trained, save_trained
 from train.config_io import to_dict
-from train.files import write_text
 from train.run_folder import versions
 
 CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "D": (True, True)}

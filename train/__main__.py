@@ -10,9 +10,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from interactive_nav_common.errors import UserError
 from train import config_io
 from train.config import TrainConfig
-from train.errors import TrainError
 from train.run_folder import RunFolder
 
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from train.run import train_run
 
         _, _, stopped_by = train_run(config, Console())
-    except TrainError as error:
+    except UserError as error:
         print(f"train: {error}", file=sys.stderr)
         return 2
     return 128 + stopped_by if stopped_by else 0

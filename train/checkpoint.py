@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav_common.errors import FileError
 from train import policy_file
-from train.errors import CheckpointError, RunFolderError
+from train.errors import CheckpointError
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 
@@ -48,7 +49,7 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
     Only the newest holds the environments, and only if they take no more than the limit.
 
     Raises:
-        RunFolderError: the disk is full or not writable; older checkpoints are untouched.
+        FileError: the disk is full or not writable; older checkpoints are untouched.
     """
     final = root / f"{meta.env_steps:012d}"
     partial = root / f".partial-{meta.env_steps:012d}"
@@ -67,7 +68,7 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
         os.replace(partial, final)
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise RunFolderError(
+        raise FileError(
             f"{final}: cannot write the checkpoint ({error.strerror or error}); make room and start again: "
             f"the run continues from its last checkpoint"
         ) from None

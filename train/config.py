@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from interactive_nav.config import NavConfig
-from train.errors import ConfigError
+from interactive_nav_common.errors import ConfigError
 
 
 def _require(config: Any, names: str, low: float, high: float = math.inf) -> None:

@@ -17,9 +17,9 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
+from interactive_nav_common.errors import ConfigError
 from train.config import AUTO as AUTO_SIZES
 from train.config import TrainConfig, validate
-from train.errors import ConfigError
 
 Config = TypeVar("Config")
 PRESET_DIR = Path(__file__).parent / "configs"

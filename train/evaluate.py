@@ -20,12 +20,12 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
 from interactive_nav.episodes import load as load_episodes
+from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.files import whole_file
 from train import checkpoint, config_io
 from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig
-from train.errors import ConfigError, TrainError
-from train.files import whole_file
 from train.planners import Planner
 from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
 from train.rollout import Episodes, Player, episode_keys
@@ -309,7 +309,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
             write_paths(paths_beside(out), played, player.env)
             _tell(console, rows, config, player.env, out)
-    except TrainError as error:
+    except UserError as error:
         print(f"train.evaluate: {error}", file=sys.stderr)
         return 2
     return 0

@@ -26,9 +26,9 @@ from brax.training import networks as brax_networks
 from brax.training import types
 from brax.training.acme import running_statistics
 
+from interactive_nav_common.errors import ConfigError
 from train import networks, replay_buffer
 from train.config import NetworkConfig, OffPolicyConfig, TrainConfig
-from train.errors import ConfigError
 from train.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
 from train.replay_buffer import Replay
 

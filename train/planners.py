@@ -19,7 +19,7 @@ import scipy.sparse.csgraph
 import scipy.spatial
 
 from interactive_nav.geodesic import clearance, largest_component
-from train.errors import TrainError
+from interactive_nav_common.errors import UserError
 
 CELL_M = 0.05
 MARGIN_M = 0.02
@@ -218,14 +218,14 @@ class Planner:
             weight) costs as much as at 1. None: the avoider, which never pushes.
 
     Raises:
-        TrainError: the robot takes no base velocity, or a weight outside [0, 1].
+        UserError: the robot takes no base velocity, or a weight outside [0, 1].
     """
 
     def __init__(self, env: Any, weight: float | None):
         if weight is not None and not 0.0 <= weight <= 1.0:
-            raise TrainError(f"policy namo: weight is {weight}, expected between 0 and 1, as in namo:0.5")
+            raise UserError(f"policy namo: weight is {weight}, expected between 0 and 1, as in namo:0.5")
         if env.robot.twist is None:
-            raise TrainError(
+            raise UserError(
                 f"planners: robot '{env.robot.name}' takes no base velocity in control mode "
                 f"'{env.robot.control_mode}', expected one of its modes that does; leave them out of --policies"
             )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from interactive_nav.robots import RobotSpec
-from train.errors import TrainError
+from interactive_nav_common.errors import UserError
 from train.planners import Planner
 
 Observation = jax.Array | Mapping[str, jax.Array]
@@ -70,16 +70,16 @@ def make_follower(env: Any) -> PolicyFn:
     """The yardstick that follows the shortest path.
 
     Raises:
-        TrainError: the observation has no waypoints, or the robot's control mode takes no base velocity.
+        UserError: the observation has no waypoints, or the robot's control mode takes no base velocity.
     """
     config = env.config
     if env.robot.twist is None:
-        raise TrainError(
+        raise UserError(
             f"policy follower: robot '{env.robot.name}' takes no base velocity in control mode "
             f"'{env.robot.control_mode}', expected one of its modes that does; leave it out of --policies"
         )
     if "waypoints" not in config.observations:
-        raise TrainError(
+        raise UserError(
             f"policy follower: observations are {', '.join(config.observations)}, "
             "expected waypoints among them; leave it out of --policies"
         )
@@ -101,7 +101,7 @@ def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
     """A policy or planner that never learns, by name: random, follower, avoider or namo:W.
 
     Raises:
-        TrainError: unknown name or weight, or a robot or observations that it cannot use.
+        UserError: unknown name or weight, or a robot or observations that it cannot use.
     """
     if name in YARDSTICKS:
         return YARDSTICKS[name](env)
@@ -112,7 +112,7 @@ def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
         try:
             share = float(weight)
         except ValueError:
-            raise TrainError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
+            raise UserError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
         return Planner(env, share)
     known = ", ".join(("learned", *YARDSTICKS, *PLANNERS))
-    raise TrainError(f"--policies: got {name!r}, expected a choice from {known}")
+    raise UserError(f"--policies: got {name!r}, expected a choice from {known}")

@@ -16,8 +16,8 @@ import flax.serialization
 import flax.traverse_util
 import numpy as np
 
+from interactive_nav_common.files import whole_file
 from train.errors import CheckpointError
-from train.files import whole_file
 
 POLICY = "policy.npz"
 LARGE = 4_000

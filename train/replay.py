@@ -18,9 +18,9 @@ from typing import Any
 from rich.console import Console
 
 from interactive_nav import replay
+from interactive_nav_common.errors import ConfigError, UserError
 from train import config_io
 from train.config import EnvConfig
-from train.errors import ConfigError, TrainError
 from train.evaluate import LEARNED, load_policy
 from train.policies import YARDSTICKS
 from train.rollout import episode_keys
@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                 replay.save(played, path)
                 score = played.metrics["ins_0.5"]
                 console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)
-    except TrainError as error:
+    except UserError as error:
         print(f"train.replay: {error}", file=sys.stderr)
         return 2
     return 0

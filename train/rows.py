@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 from rich.table import Table
 from scipy import stats
 
-from train.errors import RunFolderError
-from train.files import whole_file
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import whole_file
 
 if TYPE_CHECKING:
     from train.rollout import Episodes
@@ -67,7 +67,7 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
         notes: kept in the file beside them.
 
     Raises:
-        RunFolderError: the file cannot be written.
+        FileError: the file cannot be written.
     """
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     others = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
@@ -97,18 +97,18 @@ def read_rows(paths: Sequence[Path]) -> pa.Table:
     An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name.
 
     Raises:
-        RunFolderError: a file is not readable as Parquet, or columns do not fit each other.
+        FileError: a file is not readable as Parquet, or columns do not fit each other.
     """
     tables = []
     for path in sorted(paths):
         try:
             tables.append(pq.read_table(path).replace_schema_metadata(None))
         except (OSError, pa.ArrowInvalid) as error:
-            raise RunFolderError(f"{path}: not readable as Parquet ({error}); evaluate the run again") from None
+            raise FileError(f"{path}: not readable as Parquet ({error}); evaluate the run again") from None
     try:
         rows = pa.concat_tables(tables, promote_options="permissive")
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
-        raise RunFolderError(f"rows do not fit each other ({error}); draw their folders one by one") from None
+        raise FileError(f"rows do not fit each other ({error}); draw their folders one by one") from None
     if not set(IDENTITY) <= set(rows.column_names):
         return rows
     order = rows.select(list(IDENTITY)).append_column("at", pa.array(np.arange(len(rows))))

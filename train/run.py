@@ -19,16 +19,17 @@ from tensorboardX import SummaryWriter
 
 import interactive_nav
 from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.signals import stop_signals
 from train import checkpoint, tracking
 from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
-from train.errors import CheckpointError, ConfigError, TrainError
-from train.files import write_text
+from train.errors import CheckpointError
 from train.learner import Snapshot, TrainResult, Update
 from train.progress import TrainingDisplay, describe
 from train.run_folder import FAILURES, RunFolder, claim, read_metrics, versions
-from train.signals import stop_signals
 
 
 def make_env(config: EnvConfig) -> Any:
@@ -198,7 +199,7 @@ def train_run(
         The result, the folder, and the signal that ended it early, if one did.
 
     Raises:
-        TrainError: see `train.errors`.
+        UserError: see `train.errors`.
     """
     if config.run.wandb:
         tracking.import_wandb()
@@ -207,7 +208,7 @@ def train_run(
     try:
         env = build_env(config.env)
         config = resolve(config, env.backend)
-    except TrainError:
+    except UserError:
         # Nothing half-made stays behind: `rmdir` takes only empty folders.
         with contextlib.suppress(OSError):
             folder.path.rmdir()

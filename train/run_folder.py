@@ -24,10 +24,10 @@ from typing import Any
 
 import jax
 
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import whole_file, write_text
 from train.config import TrainConfig
 from train.config_io import flatten, from_yaml, to_yaml
-from train.errors import RunFolderError
-from train.files import whole_file, write_text
 
 PACKAGES = (
     *("interactive-nav", "brax", "flax", "jax", "jaxlib", "jax-cuda13-plugin", "mujoco", "mujoco-mjx"),
@@ -61,11 +61,11 @@ class RunFolder:
         """The resolved config of the run.
 
         Raises:
-            RunFolderError: the folder is no run.
+            FileError: the folder is no run.
             ConfigError: its config does not fit this version.
         """
         if not self.config.is_file():
-            raise RunFolderError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
+            raise FileError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
         return from_yaml(self.config.read_text(), where=str(self.config))
 
     def open(self, config: TrainConfig) -> bool:
@@ -75,14 +75,14 @@ class RunFolder:
             True where the run exists already.
 
         Raises:
-            RunFolderError: the run exists with another value of a setting that decides its meaning.
+            FileError: the run exists with another value of a setting that decides its meaning.
         """
         exists = self.config.is_file()
         if exists:
             old, new = flatten(self.read_config()), flatten(config)
             for name, value in new.items():
                 if old[name] != value and name not in MAY_CHANGE:
-                    raise RunFolderError(
+                    raise FileError(
                         f"{self.path}: the run there has {name} = {old[name]!r}, this one {value!r}; "
                         "set run.name to begin another run, or remove the folder"
                     )
@@ -111,13 +111,13 @@ class RunFolder:
         """Adds one line to metrics.jsonl.
 
         Raises:
-            RunFolderError: the disk is full or no longer writable.
+            FileError: the disk is full or no longer writable.
         """
         try:
             with open(self.metrics, "a") as file:
                 file.write(json.dumps(line) + "\n")
         except OSError as error:
-            raise RunFolderError(
+            raise FileError(
                 f"{self.metrics}: cannot be written ({error.strerror or error}); make room and start again: "
                 "the run continues from its last checkpoint"
             ) from None
@@ -158,7 +158,7 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
         needed_mb: room that the run will need, beside some head room.
 
     Raises:
-        RunFolderError: it cannot be made or written, or the disk is too full.
+        FileError: it cannot be made or written, or the disk is too full.
     """
     needed_mb += HEADROOM_MB
     try:
@@ -168,11 +168,11 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
         probe.unlink()
         free_mb = shutil.disk_usage(path).free / 1e6
     except OSError as error:
-        raise RunFolderError(
+        raise FileError(
             f"{path}: cannot be written ({error.strerror or error}); expected a writable folder (run.out_dir)"
         ) from None
     if free_mb < needed_mb:
-        raise RunFolderError(
+        raise FileError(
             f"{path}: {free_mb:.0f} MB free on its disk, expected {needed_mb:.0f} MB for checkpoints; "
             "make room, or set run.out_dir or run.env_state_limit_mb"
         )

@@ -11,10 +11,10 @@ import uuid
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import write_text
 from train.config import TrainConfig
 from train.config_io import flatten
-from train.errors import ConfigError
-from train.files import write_text
 
 ID_FILE = "wandb_id"
 

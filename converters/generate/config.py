@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 from converters.generate.cad import LIBRARY, TRAIN_MODELS
+from interactive_nav_common.errors import UserError
 
 NAMES = ("models", "passage_chairs")
 """Settings that are names of CAD models, not ranges."""
 
 
-class GenerationError(ValueError):
+class GenerationError(UserError):
     """A building that cannot be generated; the message says what, where, what was expected and what to do."""
 
 

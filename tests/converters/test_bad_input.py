@@ -17,7 +17,7 @@ from PIL import Image
 from converters import decompose, pipeline
 from converters.__main__ import main
 from converters.errors import SceneRejected, StageFailed
-from converters.pipeline import ConvertConfig, convert, publish
+from converters.pipeline import ConvertConfig, convert
 from scenes_mjcf.schema import load_manifest
 from tests.converters import tiny_raw
 
@@ -201,43 +201,6 @@ def test_a_signal_in_any_stage_leaves_nothing(pristine, tmp_path, capsys, cached
         signal.signal(signal.SIGTERM, before)
     assert capsys.readouterr().err == f"{word}; nothing was written\n"
     assert list(out.parent.iterdir()) == []
-
-
-def test_publishing_is_all_or_nothing(tmp_path, monkeypatch):
-    parts, targets = [tmp_path / "p0", tmp_path / "p1"], [tmp_path / "t0", tmp_path / "t1"]
-    for k, folder in enumerate((*parts, targets[1])):
-        folder.mkdir()
-        (folder / "file").write_text(f"{k}")
-    rename = Path.rename
-
-    def failing(self, target):
-        if self == parts[1]:
-            raise FULL
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", failing)
-    with pytest.raises(OSError, match="No space left"):
-        publish(dict(zip(parts, targets, strict=True)))
-    assert not targets[0].exists() and (targets[1] / "file").read_text() == "2"
-    monkeypatch.setattr(Path, "rename", rename)
-    shutil.rmtree(parts[0], ignore_errors=True)
-    parts[0].mkdir()
-    publish(dict(zip(parts, targets, strict=True)))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["t0", "t1"] and (targets[1] / "file").read_text() == "1"
-
-
-def test_a_signal_waits_for_the_renames(tmp_path, monkeypatch):
-    (tmp_path / "part").mkdir()
-    rename = Path.rename
-
-    def signalled(self, target):
-        os.kill(os.getpid(), signal.SIGINT)
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", signalled)
-    with pytest.raises(KeyboardInterrupt):
-        publish({tmp_path / "part": tmp_path / "whole"})
-    assert [p.name for p in tmp_path.iterdir()] == ["whole"]
 
 
 def test_a_map_of_the_wrong_place_names_both_extents(gibson_raw):

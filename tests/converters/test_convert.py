@@ -17,13 +17,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from converters import pipeline
 from converters.__main__ import main
 from converters.errors import SceneRejected
 from converters.gates import LIMITS, Limit
 from converters.objects import rotation_of
 from converters.pipeline import STAGES, ConvertConfig, convert
 from converters.settle import settle
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import remove_stale
 from scenes_mjcf.schema import load_manifest, load_maps
 from tests.converters import tiny_raw
 
@@ -141,7 +142,7 @@ def test_an_existing_folder_is_kept_unless_told(pristine, tmp_path, hull_cache):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("keep")
-    with pytest.raises(SceneRejected, match="exists already; give another OUT or add --overwrite"):
+    with pytest.raises(FileError, match="exists already; give another place or add --overwrite"):
         convert(pristine / "gibson", out, SMALL, cache=hull_cache)
     assert contents(out) == {"mine.txt": b"keep"}
     convert(pristine / "gibson", out, dataclasses.replace(SMALL, overwrite=True), cache=hull_cache)
@@ -253,7 +254,7 @@ def test_the_next_conversion_clears_what_a_killed_one_left_and_not_what_runs(pri
     process = _start_conversion(pristine / "gibson", out, tmp_path / "cache")
     (running,) = out.parent.iterdir()
     os.utime(running, (0, 0))
-    pipeline.remove_stale(out)
+    remove_stale(out)
     assert running.is_dir()  # its lock is held
     process.kill()
     process.communicate(timeout=30)
@@ -265,7 +266,7 @@ def test_the_next_conversion_clears_what_a_killed_one_left_and_not_what_runs(pri
     (older / "scene.json").write_text("kept")
     os.utime(running, (0, 0))
     # Killed while it replaced a scene: that one is there again, and is not overwritten unasked.
-    with pytest.raises(SceneRejected, match="exists already"):
+    with pytest.raises(FileError, match="exists already"):
         convert(pristine / "gibson", out, ConvertConfig(), cache=hull_cache)
     assert (out / "scene.json").read_text() == "kept"
     assert sorted(p.name for p in out.parent.iterdir()) == [".output.part-1", "out"]  # another scene's stays

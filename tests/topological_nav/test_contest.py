@@ -9,6 +9,7 @@ import pytest
 
 from interactive_nav.rendering.base import Lens
 from interactive_nav.robots import get_robot
+from interactive_nav_common.errors import ConfigError
 from tests.topological_nav.conftest import Made
 from topological_nav import contest as contests
 from topological_nav.__main__ import main
@@ -16,7 +17,7 @@ from topological_nav.build import drawn_for
 from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.contest import Contest, local_policy, venues_of
 from topological_nav.domains import as_seen_from, preset
-from topological_nav.errors import RunError, SettingsError
+from topological_nav.errors import RunError
 from topological_nav.evaluation import NavigatorPlayer, play
 from topological_nav.graph import load_map, save_map
 from topological_nav.navigator import DRIVE
@@ -239,7 +240,7 @@ def test_a_cpu_draws_images_at_most_twice_as_large(contest, monkeypatch):
 
 
 def test_cameras_that_cannot_be_are_refused(contest):
-    with pytest.raises(SettingsError, match="domain is 'fog', expected one of clean, lens"):
+    with pytest.raises(ConfigError, match="domain is 'fog', expected one of clean, lens"):
         dataclasses.replace(contest, domain="fog")
-    with pytest.raises(SettingsError, match="--domain blur is of images, --truth has none"):
+    with pytest.raises(ConfigError, match="--domain blur is of images, --truth has none"):
         dataclasses.replace(contest, domain="blur", truth=True)

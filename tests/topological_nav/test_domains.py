@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.domains import PRESETS, DomainConfig, as_seen, as_seen_from, preset, smeared
-from topological_nav.errors import SettingsError
 
 
 def flat(level, count=1, height=12, width=16):
@@ -113,7 +113,7 @@ def test_chance_may_follow_from_where_an_image_was_taken():
 
 
 def test_unknown_cameras_and_impossible_ones_are_refused():
-    with pytest.raises(SettingsError, match="domain is 'fog', expected one of clean, lens, light, noise, blur, camera"):
+    with pytest.raises(ConfigError, match="domain is 'fog', expected one of clean, lens, light, noise, blur, camera"):
         preset("fog")
-    with pytest.raises(SettingsError, match="zoom is 0.5, expected between 1 and 10"):
+    with pytest.raises(ConfigError, match="zoom is 0.5, expected between 1 and 10"):
         DomainConfig(zoom=0.5)

@@ -11,11 +11,12 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import UserError
 from tests.topological_nav.conftest import DRIVEN
 from topological_nav import drives as driving
 from topological_nav.__main__ import main
 from topological_nav.config import DriveConfig
-from topological_nav.errors import DatasetError, TopologicalError
+from topological_nav.errors import DatasetError
 from topological_nav.fleet import make_env
 from topological_nav.rendering import SceneRenderer, camera_pose
 from topological_nav.settings import overridden
@@ -124,7 +125,7 @@ def test_other_settings_and_other_folders_are_refused(driven, painted, tmp_path,
 
 
 def test_a_robot_without_a_scanner_is_refused(painted):
-    with pytest.raises(TopologicalError, match="robot is 'turtlebot', expected one with a scanner: ttbot"):
+    with pytest.raises(UserError, match="robot is 'turtlebot', expected one with a scanner: ttbot"):
         make_env([painted], dataclasses.replace(CONFIG, robot="turtlebot"))
 
 

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 import interactive_nav
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import ConfigError
 from tests.topological_nav.test_sight import two_rooms_space
 from tests.toys import write_room
 from topological_nav import contest as contests
@@ -20,7 +21,7 @@ from topological_nav import packaged
 from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.contest import Contest, Venue, hold, venues_of
-from topological_nav.errors import RunError, SettingsError, SpaceError
+from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluation import Journeys, Marks, count_of, draw_journeys, learned, play
 from topological_nav.plans import RECORDED
 from topological_nav.rooms import find_rooms
@@ -294,7 +295,7 @@ def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
         hold(contest, venues_of(contest))
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "policy.json").write_text("{}")
-    with pytest.raises(SettingsError, match="looks at images, --truth has none"):
+    with pytest.raises(ConfigError, match="looks at images, --truth has none"):
         contest = dataclasses.replace(contest, policy=str(tmp_path / "there"))
         hold(contest, venues_of(contest))
 

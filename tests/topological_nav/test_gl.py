@@ -12,8 +12,8 @@ import pytest
 from interactive_nav.rendering.base import Lens
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import UserError
 from topological_nav import gl
-from topological_nav.errors import TopologicalError
 from topological_nav.gl import SKY, GlPainter
 from topological_nav.rendering import SceneRenderer, camera_pose
 
@@ -141,5 +141,5 @@ def test_without_a_gl_it_says_what_to_install(monkeypatch):
 
     monkeypatch.setattr(gl, "_context_class", none)
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    with pytest.raises(TopologicalError, match=r"no library.*here.*install libegl1 and libgl1-mesa-dri"):
+    with pytest.raises(UserError, match=r"no library.*here.*install libegl1 and libgl1-mesa-dri"):
         GlPainter(model, mujoco.MjData(model), LENS, 2)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from simple_pid import PID
 
+from interactive_nav_common.errors import ConfigError
 from tests.topological_nav.test_graph import hand_map
 from topological_nav import navigator as nav
 from topological_nav.config import NavigatorConfig
-from topological_nav.errors import SettingsError
 from topological_nav.navigator import ARRIVED, DRIVE, FACE, LEAN, LOCALISE, STOPPED, SWING, TIMED_OUT, Navigator
 
 SQUARE = ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))
@@ -477,7 +477,7 @@ def test_goals_are_found_by_their_images():
 
 
 def test_images_must_be_a_share_of_the_maps():
-    with pytest.raises(SettingsError, match="images is 4, expected a divisor of 6"):
+    with pytest.raises(ConfigError, match="images is 4, expected a divisor of 6"):
         square(images=4)
 
 

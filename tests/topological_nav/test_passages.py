@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import ConfigError
 from tests.topological_nav.test_sight import two_rooms_space
 from topological_nav.config import DataConfig
-from topological_nav.errors import SettingsError
 from topological_nav.passages import balanced, draw_passages, free_lengths, held_out, logits_at
 from topological_nav.rooms import find_rooms
 from topological_nav.space import free_space
@@ -110,10 +110,10 @@ def test_logits_between_lengths_by_hand():
 
 
 def test_lengths_that_do_not_fit_are_refused():
-    with pytest.raises(SettingsError, match="passage_length_m is 1.2, expected one of passage_lengths_m .* add it"):
+    with pytest.raises(ConfigError, match="passage_length_m is 1.2, expected one of passage_lengths_m .* add it"):
         DataConfig(passage_length_m=1.2)
     for wrong in ((), (2.0, 1.0), (1.0, 1.0, 2.0), (0.0, 2.0)):
-        with pytest.raises(SettingsError, match="expected ascending lengths from 0.05 m on"):
+        with pytest.raises(ConfigError, match="expected ascending lengths from 0.05 m on"):
             DataConfig(passage_lengths_m=wrong)
     assert DataConfig().passage_column == 3
 

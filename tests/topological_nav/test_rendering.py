@@ -15,8 +15,8 @@ from interactive_nav.rendering.base import Lens
 from interactive_nav.rendering.mount import make_mount
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import UserError
 from topological_nav import rendering
-from topological_nav.errors import TopologicalError
 from topological_nav.rendering import CPU_IMAGES, SceneRenderer, batch_sizes, calls, camera_pose, shrink
 
 
@@ -44,9 +44,7 @@ def test_pitch_turns_the_view_up_and_leaves_the_place():
 
 
 def test_a_camera_on_another_link_is_refused():
-    with pytest.raises(
-        TopologicalError, match="the camera of 'fetch' sits on .* choose a robot with a camera on its base"
-    ):
+    with pytest.raises(UserError, match="the camera of 'fetch' sits on .* choose a robot with a camera on its base"):
         camera_pose(get_robot("fetch"), np.zeros(2), np.zeros(1), np.zeros(1))
 
 

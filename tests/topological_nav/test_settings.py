@@ -2,8 +2,8 @@
 
 import pytest
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig, TrainConfig, passage_config, room_config
-from topological_nav.errors import SettingsError
 from topological_nav.settings import overlaid, overridden, settings_help
 from train.config_io import to_dict
 
@@ -28,12 +28,12 @@ def test_words_are_read_by_the_types_of_the_settings():
     ],
 )
 def test_wrong_words_are_refused(word, told):
-    with pytest.raises(SettingsError, match=told.replace("?", r"\?")):
+    with pytest.raises(ConfigError, match=told.replace("?", r"\?")):
         overridden(TrainConfig(), [word])
 
 
 def test_headings_must_leave_every_third_for_testing():
-    with pytest.raises(SettingsError, match="headings is 16, expected a multiple of 3"):
+    with pytest.raises(ConfigError, match="headings is 16, expected a multiple of 3"):
         DataConfig(headings=16)
 
 

@@ -5,9 +5,9 @@ import threading
 import numpy as np
 import pytest
 
+from interactive_nav_common.errors import UserError
 from topological_nav import shards
 from topological_nav.errors import DatasetError
-from train.errors import TrainError
 
 
 def smooth(count: int, height: int = 16, width: int = 24) -> np.ndarray:
@@ -86,5 +86,5 @@ def test_a_stop_leaves_whole_files_only(tmp_path, monkeypatch):
 
 def test_what_a_thread_could_not_write_is_said(tmp_path):
     (tmp_path / "taken").write_text("")
-    with pytest.raises(TrainError, match="cannot be written"), shards.ShardWriter(100) as writer:
+    with pytest.raises(UserError, match="cannot be written"), shards.ShardWriter(100) as writer:
         writer.put(tmp_path / "taken" / "0.npz", [smooth(2)], lambda: None)

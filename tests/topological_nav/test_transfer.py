@@ -11,11 +11,12 @@ import pytest
 from PIL import Image
 
 from interactive_nav.scene import load_scene
+from interactive_nav_common.errors import ConfigError
 from topological_nav import adaptation, transfer
 from topological_nav.__main__ import main
 from topological_nav.adapt_config import AdaptConfig
 from topological_nav.data import load_passages, load_rooms
-from topological_nav.errors import DatasetError, MapError, RunError, SettingsError
+from topological_nav.errors import DatasetError, MapError, RunError
 from topological_nav.graph import load_map
 from topological_nav.training import load_trained, localisation
 from train.run_folder import read_metrics
@@ -291,7 +292,7 @@ def test_an_exported_embedding_is_adapted(made, exported, tmp_path):
 
 
 def test_what_does_not_fit_is_refused(made, adapted, painted, tmp_path, capsys):
-    with pytest.raises(SettingsError, match="domain is 'fog', expected one of clean"):
+    with pytest.raises(ConfigError, match="domain is 'fog', expected one of clean"):
         AdaptConfig(domain="fog")
     with pytest.raises(RunError, match="was trained for 'rooms', expected a run of 'train passages'"):
         transfer.passage_configurations(made.rooms, made.data, tmp_path / "x", SHORT)

@@ -13,6 +13,7 @@ import pytest
 from brax.training import types
 from scipy.stats import kstest
 
+from interactive_nav_common.errors import ConfigError
 from tests.train.test_ppo import Recorder
 from tests.train.toy_env import ToyConfig, ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
@@ -20,7 +21,7 @@ from train import offpolicy, replay_buffer
 from train.algorithms import ALGORITHMS
 from train.config import DDPGConfig, EnvConfig, OffPolicyConfig, RunConfig, SACConfig, TrainConfig
 from train.ddpg import make_agent as make_ddpg
-from train.errors import ConfigError, DivergedError
+from train.errors import DivergedError
 from train.learner import Snapshot, Update
 from train.sac import make_agent as make_sac
 

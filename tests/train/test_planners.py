@@ -12,8 +12,8 @@ import pytest
 
 import interactive_nav
 from interactive_nav.types import EpisodeStart
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
-from train.errors import TrainError
 from train.planners import CELL_M, Footprints, PathGrid, Planner, plan_path
 from train.policies import make_yardstick
 from train.rollout import episode_keys, run_episodes
@@ -119,11 +119,11 @@ def test_footprints_cover_the_cube_below_the_robot_only(env):
 
 
 def test_names_and_weights_are_checked(env):
-    with pytest.raises(TrainError, match="got 'namo', expected a weight, as in namo:0.5"):
+    with pytest.raises(UserError, match="got 'namo', expected a weight, as in namo:0.5"):
         make_yardstick("namo", env)
-    with pytest.raises(TrainError, match="weight is 1.5, expected between 0 and 1"):
+    with pytest.raises(UserError, match="weight is 1.5, expected between 0 and 1"):
         Planner(env, 1.5)
-    with pytest.raises(TrainError, match="expected a choice from learned, random, follower, avoider, namo:W"):
+    with pytest.raises(UserError, match="expected a choice from learned, random, follower, avoider, namo:W"):
         make_yardstick("greedy", env)
     action = jax.vmap(cast(Any, make_yardstick("random", env)))(jnp.zeros((3, 29)), episode_keys(0, 3))
     assert action.shape == (3, 2)

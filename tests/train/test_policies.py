@@ -11,8 +11,8 @@ import pytest
 
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.spec import TwistMap, wheel_twist
+from interactive_nav_common.errors import UserError
 from tests.train.toy_env import ToyConfig, ToyEnv
-from train.errors import TrainError
 from train.policies import make_follower, make_random, steer
 from train.rollout import episode_keys, run_episodes
 
@@ -53,7 +53,7 @@ def test_a_slow_robot_is_not_asked_for_more_than_it_can():
 def test_follower_of_a_robot_without_a_base_velocity_is_refused():
     env = ToyEnv()
     env.robot = dataclasses.replace(env.robot, twist=None)
-    with pytest.raises(TrainError, match="takes no base velocity"):
+    with pytest.raises(UserError, match="takes no base velocity"):
         make_follower(env)
 
 
@@ -68,7 +68,7 @@ def test_follower_looks_at_the_waypoint_0_4_m_ahead():
 
 
 def test_follower_without_waypoints_is_refused():
-    with pytest.raises(TrainError, match="expected waypoints among them"):
+    with pytest.raises(UserError, match="expected waypoints among them"):
         make_follower(ToyEnv(ToyConfig(observations=("goal", "velocity"))))
 
 

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from interactive_nav_common.errors import FileError
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train import rollout
-from train.errors import RunFolderError
 from train.policies import make_follower, make_random
 from train.rollout import Player, episode_keys, run_episodes
 from train.row_files import EvaluationAsked, files_of_run
@@ -140,7 +140,7 @@ def test_rows_and_file(tmp_path):
         {"run": "r", "k_int": 0.1, "scene": "a", "split": "train", "episode": 1, "success": 0.0},
     ]
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunFolderError, match="cannot be written"):
+    with pytest.raises(FileError, match="cannot be written"):
         write_parquet(table, tmp_path / "file" / "rows.parquet")
 
 
@@ -163,7 +163,7 @@ def test_rows_of_many_files_are_one_table(tmp_path):
     assert read_notes(tmp_path / "a.parquet") == {"asked": "x"} and read_notes(tmp_path / "b.parquet") == {}
     (tmp_path / "d.parquet").write_bytes(b"PAR1 not")
     assert read_notes(tmp_path / "d.parquet") == {}
-    with pytest.raises(RunFolderError, match="d.parquet: not readable as Parquet"):
+    with pytest.raises(FileError, match="d.parquet: not readable as Parquet"):
         read_rows([tmp_path / "d.parquet"])
 
 

@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from interactive_nav_common.errors import ConfigError, FileError
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import checkpoint, run_folder
 from train.config import resolve
 from train.config_io import from_yaml
-from train.errors import CheckpointError, ConfigError, DivergedError, RunFolderError
+from train.errors import CheckpointError, DivergedError
 from train.run import check_fits, failures, mean_score, train_run
 from train.run_folder import RunFolder, claim, read_metrics
 
@@ -94,7 +95,7 @@ def test_resume_through_files_equals_uninterrupted_run(finished, tmp_path):
 def test_another_config_in_the_same_folder_is_refused(finished):
     _, folder, config, _ = finished
     other = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, learning_rate=1e-2))
-    with pytest.raises(RunFolderError, match="has ppo.learning_rate = 0.0003, this one 0.01; set run.name"):
+    with pytest.raises(FileError, match="has ppo.learning_rate = 0.0003, this one 0.01; set run.name"):
         train_run(other, quiet(), build_env=build_toy)
     assert from_yaml(folder.config.read_text()) == resolve(config, "native")
 
@@ -161,13 +162,13 @@ def test_large_environments_are_left_out_of_checkpoints(tmp_path):
 
 def test_folder_trouble_is_found_before_training(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunFolderError, match="cannot be written"):
+    with pytest.raises(FileError, match="cannot be written"):
         train_run(toy_config(tmp_path / "file"), quiet(), build_env=lambda _: pytest.fail("too late"))
     usage = type("Usage", (), {"free": 10_000_000})
     monkeypatch.setattr(run_folder.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(RunFolderError, match="10 MB free on its disk, expected 64 MB"):
+    with pytest.raises(FileError, match="10 MB free on its disk, expected 64 MB"):
         train_run(toy_config(tmp_path), quiet(), build_env=lambda _: pytest.fail("too late"))
-    with pytest.raises(RunFolderError, match="10 MB free on its disk, expected 164 MB"):
+    with pytest.raises(FileError, match="10 MB free on its disk, expected 164 MB"):
         claim(tmp_path, 100.0)
 
 
@@ -179,7 +180,7 @@ def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path, monkeypatch):
     snapshot = type("S", (), {"learner": {"w": np.zeros(3)}, "env_state": None})()
     checkpoint.save(tmp_path, snapshot, meta, 2, 1.0)
     monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(RunFolderError, match="cannot write the checkpoint \\(No space left on device\\)"):
+    with pytest.raises(FileError, match="cannot write the checkpoint \\(No space left on device\\)"):
         checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=200), 2, 1.0)
     assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [100]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["000000000100"]

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from interactive_nav_common.errors import ConfigError
 from tests.train.toy_run import build_toy, toy_config
 from train import tracking
 from train.algorithms import ALGORITHMS
-from train.errors import ConfigError
 from train.learner import Snapshot, TrainResult
 from train.run import train_run
 

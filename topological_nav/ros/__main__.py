@@ -16,14 +16,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.errors import UserError
+from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.schema import SceneError
 from topological_nav.config import RUNS, NavigatorConfig
-from topological_nav.errors import TopologicalError
 from topological_nav.ros import debian, launch
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 from topological_nav.settings import overridden, settings_help
-from train.errors import TrainError
-from train.signals import stop_signals
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
 """Driver -> its settings."""
@@ -83,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with stop_signals() as stops:
         try:
             run[arguments.command](arguments, stops)
-        except (TopologicalError, SceneError, TrainError) as error:
+        except (UserError, SceneError) as error:
             print(f"topological_nav.ros: {error}", file=sys.stderr)
             return 2
         return 128 + stops[0] if stops and arguments.command not in ("record", "master") else 0
@@ -106,7 +105,7 @@ def _journey(arguments: argparse.Namespace) -> Any:
     from topological_nav.ros.pilot import Journey
 
     if arguments.map is None:
-        raise TopologicalError("--driver topological needs a map: --map PATH")
+        raise UserError("--driver topological needs a map: --map PATH")
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
     if chosen.told:
         _tell(chosen.told)

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Literal
 
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 from topological_nav.settings import require
 
 
@@ -52,7 +52,7 @@ class SimulatorConfig:
         require(self, "lidar_range_m", 0.1, 1000.0)
         require(self, "lidar_noise odometry_noise", 0.0, 10.0)
         if len(self.start) not in (0, 3):
-            raise TopologicalError(f"start is {list(self.start)}, expected x, y and yaw, such as start=[1.0,-0.5,0]")
+            raise UserError(f"start is {list(self.start)}, expected x, y and yaw, such as start=[1.0,-0.5,0]")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ import types
 from pathlib import Path
 from typing import Any
 
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 
 DIST_PACKAGES = Path("/usr/lib/python3/dist-packages")
 PACKAGES = (
@@ -28,7 +28,7 @@ _MODULES = (
 )
 
 
-class RosError(TopologicalError):
+class RosError(UserError):
     """ROS is not there, or its master is not."""
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 from topological_nav.ros.config import HeadingConfig
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class PilotDriver:
 def checked(command: Command) -> Command:
     """The command, or an error if it is not finite."""
     if not (math.isfinite(command.linear_mps) and math.isfinite(command.angular_radps)):
-        raise TopologicalError(
+        raise UserError(
             f"the driver commands {command.linear_mps} m/s and {command.angular_radps} rad/s, expected finite numbers"
         )
     return command

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image as Pillow
 
 from interactive_nav.rendering.base import Lens
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 
 RGB = "rgb8"
 _ORDER = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
@@ -24,7 +24,7 @@ OPTICAL_QUAT = (-0.5, 0.5, -0.5, 0.5)
 """x y z w: a camera's optical frame in the frame that looks along its x axis."""
 
 
-class MessageError(TopologicalError):
+class MessageError(UserError):
     """A message that cannot be read."""
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from PIL import Image
 
 from interactive_nav.robots import get_robot
+from interactive_nav_common.errors import ConfigError
 from topological_nav.build import camera_of
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
 from topological_nav.data import lens_of
-from topological_nav.errors import SettingsError
 from topological_nav.graph import load_map
 from topological_nav.navigator import Navigator, Pilot
 from topological_nav.ros.drivers import PilotDriver
@@ -44,7 +44,7 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
 
     Raises:
         MapError, RunError: map or networks cannot be used, or do not belong together.
-        SettingsError: no goal picture, or one that cannot be read.
+        ConfigError: no goal picture, or one that cannot be read.
     """
     networks = load_trained(journey.localiser), load_trained(journey.detector)
     camera, made = camera_of(*networks), load_map(journey.map)
@@ -58,7 +58,7 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
         seeing = (journey.localiser, networks[0]), (journey.detector, networks[1])
         policy = driving.load_policy_beside(journey.policy, *seeing)
     if not journey.goals:
-        raise SettingsError("the navigator has no goal; name a picture taken there: --goal PICTURE")
+        raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in journey.goals])
     around = journey.goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
     return PilotDriver(Pilot(Navigator(made, sight, policy, config), pictures[None], around), lens)
@@ -79,4 +79,4 @@ def _picture(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except OSError as error:
-        raise SettingsError(f"{path}: is no picture that can be read ({error})") from None
+        raise ConfigError(f"{path}: is no picture that can be read ({error})") from None

@@ -19,7 +19,7 @@ import interactive_nav
 from interactive_nav.rendering.base import Lens
 from interactive_nav.rendering.camera import Camera
 from interactive_nav.sensors import LIDAR_NEAR_M
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 from topological_nav.rendering import shrink
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.space import free_space
@@ -69,7 +69,7 @@ class Simulator:
 
         Raises:
             SceneError: the scene cannot be used.
-            TopologicalError: the start is not free.
+            UserError: the start is not free.
         """
         self.config = config
         self._env = interactive_nav.make(
@@ -114,13 +114,13 @@ class Simulator:
         """Drives for one control step; commands beyond what the robot can do are cut.
 
         Raises:
-            TopologicalError: the physics broke down.
+            UserError: the physics broke down.
         """
         self._force_before = float(self._state.info["nav"].force_sum_n)
         action = self._env.robot.drive(jnp.float32(linear_mps), jnp.float32(angular_radps), jnp)
         self._state = self._step(self._state, action)
         if float(self._state.metrics["nonfinite"]) > 0:
-            raise TopologicalError("the physics broke down (non-finite state); start again, with another seed")
+            raise UserError("the physics broke down (non-finite state); start again, with another seed")
         return self.sense()
 
     def sense(self) -> Sensed:
@@ -152,6 +152,6 @@ class Simulator:
         robot = self._env.robot
         clear = float(free_space(self._env.scenes[0], robot.height_m).at(np.array([x, y])))
         if clear < robot.body_width_m / 2:
-            raise TopologicalError(
+            raise UserError(
                 f"start ({x}, {y}) is {clear:.2f} m from obstacles, expected at least {robot.body_width_m / 2} m"
             )

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from train.errors import RunFolderError, TrainError
+from interactive_nav_common.errors import FileError, UserError
+from interactive_nav_common.files import whole_file
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
 from train.figures.frontier import frontier
 from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
-from train.files import whole_file
 from train.rows import read_rows
 from train.run_folder import METRICS, PACKED_METRICS, read_metrics
 from train.statistics import run_means
@@ -35,7 +35,7 @@ class Results:
     """The files under a folder of results, by what they hold.
 
     Raises:
-        RunFolderError: there is nothing to draw, or a file cannot be read.
+        FileError: there is nothing to draw, or a file cannot be read.
     """
 
     def __init__(self, root: Path):
@@ -46,7 +46,7 @@ class Results:
         self.records = [path for path in records if not path.parent.name.startswith("diverged-")]
         self.tables = [p for p in sorted(root.rglob("*.parquet")) if not p.name.startswith(".")]
         if not self.curves and not self.records and not self.tables:
-            raise RunFolderError(
+            raise FileError(
                 f"{root}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
             )
         self.rows = read_rows(self.tables) if self.tables else pa.table({})
@@ -74,7 +74,7 @@ def figures_of(results: Path, split: str | None = "auto") -> Iterator[tuple[str,
         split: train or test scenes, None for all, auto: test where there are rows of them.
 
     Raises:
-        RunFolderError: there is nothing to draw.
+        FileError: there is nothing to draw.
     """
     found = Results(results)
     facts = {run: known for run in found.curves if (known := found.facts(run))}
@@ -181,7 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.tables:
             found = Results(Path(arguments.results))
             if not set(found.rows.column_names) >= SWEPT or not run_means(found.rows):
-                raise RunFolderError(
+                raise FileError(
                     f"{arguments.results}: no rows of learned runs; evaluate them first (python -m train.sweep FILE "
                     "--only evaluate, or python -m train.evaluate RUN_DIR)"
                 )
@@ -195,7 +195,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     figure.savefig(partial, format=arguments.format)
             plt.close(figure)
             print(path)
-    except TrainError as error:
+    except UserError as error:
         print(f"train.figures: {error}", file=sys.stderr)
         return 2
     return 0

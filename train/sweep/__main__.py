@@ -9,10 +9,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from train.errors import ConfigError, TrainError
+from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.signals import stop_signals
 from train.policy_file import STEP
 from train.run_folder import claim
-from train.signals import stop_signals
 from train.sweep import spec
 from train.sweep.devices import Machine, find_gpus
 from train.sweep.folder import SweepFolder
@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
                 ).run(stops, arguments.time_limit)
         finally:
             launcher.close()
-    except TrainError as error:
+    except UserError as error:
         print(f"train.sweep: {error}", file=sys.stderr)
         return 2
     console.print(status_table(outcome.states))

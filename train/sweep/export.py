@@ -12,8 +12,9 @@ from typing import Any
 
 import pyarrow as pa
 
+from interactive_nav_common.errors import FileError
 from train import checkpoint
-from train.errors import CheckpointError, RunFolderError
+from train.errors import CheckpointError
 from train.policy_file import STEP
 from train.row_files import files_of_run, paths_beside
 from train.rows import read_notes, read_rows, write_parquet
@@ -42,7 +43,7 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
         over its rows, on test scenes where there are any.
 
     Raises:
-        RunFolderError: it cannot be written.
+        FileError: it cannot be written.
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
     try:
@@ -61,7 +62,7 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
         for name in best.values():
             _keep_checkpoint(folder, name, out / "runs" / name / "checkpoints", step)
     except OSError as error:
-        raise RunFolderError(f"{out}: cannot be written ({error.strerror or error}); make room") from None
+        raise FileError(f"{out}: cannot be written ({error.strerror or error}); make room") from None
     return sum(path.stat().st_size for path in out.rglob("*") if path.is_file()), best
 
 

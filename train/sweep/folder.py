@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import os
 import sys
@@ -20,9 +19,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.files import write_text
+from interactive_nav_common.locks import is_locked
 from train.config_io import to_yaml
-from train.errors import RunFolderError
-from train.files import write_text
 from train.row_files import EvaluationAsked, files_of_run, paths_beside
 from train.rows import read_notes
 from train.run_folder import RunFolder
@@ -62,7 +61,7 @@ class SweepFolder:
         """Makes the folder and writes the config of each run.
 
         Raises:
-            RunFolderError: it cannot be written.
+            FileError: it cannot be written.
         """
         for run in self.sweep.runs:
             write_text(self.config(run.name), to_yaml(run.config))
@@ -163,40 +162,6 @@ def log_tail(path: Path, count: int = 6) -> list[str]:
     except OSError:
         return []
     return [line.rstrip() for line in lines if line.strip()][-count:]
-
-
-def take_lock(path: Path) -> int | None:
-    """Holds a lock as long as the file descriptor that it returns is open, here or in a child; None: it is held.
-
-    Raises:
-        RunFolderError: the file cannot be made.
-    """
-    try:
-        descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be made ({error.strerror}); expected a writable folder") from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        return None
-    except OSError as error:
-        os.close(descriptor)
-        raise RunFolderError(
-            f"{path}: its file system has no locks ({error.strerror}); set out_dir to a folder on one that does"
-        ) from None
-    return descriptor
-
-
-def is_locked(path: Path) -> bool:
-    """Whether somebody holds a lock."""
-    if not path.is_file():
-        return False
-    descriptor = take_lock(path)
-    if descriptor is None:
-        return True
-    os.close(descriptor)
-    return False
 
 
 def programs_env() -> dict[str, str]:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from train.sweep.folder import take_lock
+from interactive_nav_common.locks import take_lock
 from train.sweep.spec import LaunchConfig
 
 # The child gets SIGTERM (it saves and ends) when its parent dies, however that happens: a run that nobody watches

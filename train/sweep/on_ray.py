@@ -7,7 +7,7 @@ import logging
 import os
 from typing import Any
 
-from train.errors import ConfigError
+from interactive_nav_common.errors import ConfigError
 from train.sweep.devices import Gpu, Share, share_env
 from train.sweep.jobs import LOST, Child, Job
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import yaml
 
+from interactive_nav_common.errors import ConfigError
 from train import config_io
 from train.config import TrainConfig, validate
-from train.errors import ConfigError
 
 SWEEP_DIR = config_io.PRESET_DIR / "sweeps"
 BARE = ("algorithm", "env.robot")

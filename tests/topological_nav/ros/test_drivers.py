@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.rendering.base import Lens
-from topological_nav.errors import TopologicalError
+from interactive_nav_common.errors import UserError
 from topological_nav.ros.config import HeadingConfig
 from topological_nav.ros.drivers import Command, HeadingDriver, PilotDriver, checked
 
@@ -58,5 +58,5 @@ def test_the_navigators_pilot_is_asked_as_a_batch_of_one_and_ends_the_episode(ho
 
 def test_velocities_that_are_not_finite_are_refused():
     assert checked(Command(0.1, 0.2)) == Command(0.1, 0.2)
-    with pytest.raises(TopologicalError, match="commands nan m/s"):
+    with pytest.raises(UserError, match="commands nan m/s"):
         checked(Command(math.nan, 0.0))

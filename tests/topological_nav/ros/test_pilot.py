@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from interactive_nav_common.errors import ConfigError
 from topological_nav.config import NavigatorConfig
 from topological_nav.data import load_rooms
-from topological_nav.errors import SettingsError
 from topological_nav.graph import load_map
 from topological_nav.ros.__main__ import DRIVERS, main
 from topological_nav.ros.config import SimulatorConfig
@@ -53,10 +53,10 @@ def test_words_for_the_navigators_process_say_all_of_it(made, goal):
 
 
 def test_what_is_missing_is_told(made, tmp_path, capsys):
-    with pytest.raises(SettingsError, match="no goal; name a picture"):
+    with pytest.raises(ConfigError, match="no goal; name a picture"):
         topological_driver(Journey(made.map, made.rooms, made.passages, ()), NavigatorConfig())
     (tmp_path / "goal.png").write_text("no")
-    with pytest.raises(SettingsError, match="is no picture that can be read"):
+    with pytest.raises(ConfigError, match="is no picture that can be read"):
         journey = Journey(made.map, made.rooms, made.passages, (tmp_path / "goal.png",))
         topological_driver(journey, NavigatorConfig())
     assert main(["navigator", "--driver", "topological"]) == 2

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
-from topological_nav.errors import TopologicalError
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.ros.simulator import Simulator
 
@@ -67,12 +67,12 @@ def test_it_turns_as_fast_as_it_is_told_and_pictures_change(simulator):
 
 
 def test_a_blocked_start_is_refused(room):
-    with pytest.raises(TopologicalError, match=r"start \(1.4, -0.5\) is 0.00 m from obstacles, expected at least"):
+    with pytest.raises(UserError, match=r"start \(1.4, -0.5\) is 0.00 m from obstacles, expected at least"):
         Simulator(room, SimulatorConfig(start=(1.4, -0.5, 0.0)))
 
 
 def test_settings_are_checked():
-    with pytest.raises(TopologicalError, match="start is \\[1.0\\], expected x, y and yaw"):
+    with pytest.raises(UserError, match="start is \\[1.0\\], expected x, y and yaw"):
         SimulatorConfig(start=(1.0,))
-    with pytest.raises(TopologicalError, match="lidar_fov_deg is 361"):
+    with pytest.raises(UserError, match="lidar_fov_deg is 361"):
         SimulatorConfig(lidar_fov_deg=361.0)

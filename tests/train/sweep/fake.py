@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from train.files import whole_file
+from interactive_nav_common.files import whole_file
 from train.row_files import EvaluationAsked
 
 

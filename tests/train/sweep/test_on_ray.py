@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from interactive_nav_common.errors import ConfigError
 from tests.train.sweep.test_sweep import FAKE, ROOT, running, set_fates, write_sweep
-from train.errors import ConfigError
 from train.sweep import spec
 from train.sweep.folder import SweepFolder, last_line
 from train.sweep.on_ray import RayLauncher

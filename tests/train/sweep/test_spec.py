@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from train.errors import ConfigError
+from interactive_nav_common.errors import ConfigError
 from train.sweep import spec
 from train.sweep.__main__ import main
 

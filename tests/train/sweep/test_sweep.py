@@ -15,10 +15,11 @@ import pytest
 import yaml
 from rich.console import Console
 
+from interactive_nav_common.locks import is_locked, take_lock
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.devices import Gpu, Machine, find_gpus, parse_gpus, share_env
-from train.sweep.folder import RunState, SweepFolder, is_locked, last_line, take_lock
+from train.sweep.folder import RunState, SweepFolder, last_line
 from train.sweep.local import LocalLauncher
 from train.sweep.scheduler import Outcome, Programs, Scheduler
 from train.sweep.spec import LaunchConfig

@@ -1,0 +1,157 @@
+"""Files and folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.locks import release, take_lock
+from interactive_nav_common.signals import signals_wait
+
+STALE_S = 1.0
+"""An unfinished folder younger than this may be one whose maker has not locked it yet."""
+
+
+@contextlib.contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """Yields a temporary path beside `path` of the same ending, which replaces it once the block has written it.
+
+    Each writer has its own temporary file: of two that write one path at the same time, the last one stands.
+
+    Raises:
+        FileError: it cannot be written; what stood at `path` is untouched.
+    """
+    path = Path(path)
+    partial = path.with_name(f".partial-{secrets.token_hex(4)}-{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise FileError(f"{path}: cannot be written ({reason}); make room or choose another place") from None
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a text file (UTF-8) whole or not at all.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def whole_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
+    """An empty folder beside `target`, which becomes it once the block has filled it.
+
+    Raises:
+        FileError: `target` is there and may not be replaced, or cannot be written; nothing is changed then.
+    """
+    with part_folder(target, overwrite) as part:
+        yield part
+        publish({part: target})
+
+
+@contextlib.contextmanager
+def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
+    """An empty, locked folder beside `target`, to be filled and published; gone at the end unless it was.
+
+    Args:
+        target: of the folder, where it shall stand in the end.
+        overwrite: a folder that stands there may be replaced.
+
+    Raises:
+        FileError: `target` is there and may not be replaced, or cannot be written.
+    """
+    if target.parent.is_dir():
+        remove_stale(target)
+    if target.exists() and not overwrite:
+        raise FileError(f"{target}: exists already; give another place or add --overwrite")
+    if target.exists() and not target.is_dir():
+        raise FileError(f"{target}: is a file, expected a folder to write; give another place")
+    part = target.parent / f".{target.name}.part-{os.getpid()}-{secrets.token_hex(4)}"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir()
+        lock = take_lock(part)
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written ({error.strerror}); give another place") from None
+    try:
+        yield part
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        release(lock)
+
+
+def publish(folders: Mapping[Path, Path]) -> None:
+    """Renames finished folders to their targets, all or none; an older target is replaced.
+
+    Signals wait until it is done: a few renames take no time, and half of them would be worse.
+
+    Args:
+        folders: finished folder -> target, on one file system.
+
+    Raises:
+        FileError: one could not be renamed; what stood at the targets stands there again.
+    """
+    moved: list[tuple[Path, Path | None]] = []
+    with signals_wait():
+        try:
+            for finished, target in folders.items():
+                old = None
+                if target.exists():
+                    old = target.parent / f".{target.name}.old-{os.getpid()}-{secrets.token_hex(4)}"
+                    target.rename(old)
+                moved.append((target, old))
+                finished.rename(target)
+        except BaseException as error:
+            for target, old in moved:
+                shutil.rmtree(target, ignore_errors=True)
+                if old is not None:
+                    old.rename(target)
+            if isinstance(error, OSError):
+                place = ", ".join(str(target) for target in folders.values())
+                reason = error.strerror or error
+                raise FileError(f"{place}: cannot be written ({reason}); make room or give another place") from None
+            raise
+        for _, old in moved:
+            if old is not None:
+                shutil.rmtree(old, ignore_errors=True)
+
+
+def remove_stale(target: Path) -> None:
+    """Removes what a writer of `target` left that was killed (SIGKILL, power): its unfinished folder.
+
+    Was it killed while it replaced an older `target`, that one is put back. Folders of writers that run are locked and
+    stay.
+    """
+    running = False
+    for kind in ("part", "old"):
+        name = re.compile(re.escape(f".{target.name}.{kind}-") + r"\d+(-[0-9a-f]{8})?")
+        for folder in sorted(p for p in target.parent.iterdir() if name.fullmatch(p.name)):
+            with contextlib.suppress(OSError, FileError):
+                young = time.time() - folder.stat().st_mtime < STALE_S
+                lock = None if young and kind == "part" else take_lock(folder)
+                if lock is None:
+                    running = True
+                    continue
+                if kind == "part":
+                    shutil.rmtree(folder, ignore_errors=True)
+                elif not running:  # else it may be in use: a running one replaces the target
+                    if target.exists():
+                        shutil.rmtree(folder, ignore_errors=True)
+                    else:
+                        folder.rename(target)
+                release(lock)

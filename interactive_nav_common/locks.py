@@ -1,0 +1,112 @@
+"""Advisory locks on files and folders, freed by the system however their holder ends."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from interactive_nav_common.errors import FileError
+
+PATIENCE_S = 0.5
+"""How long a lock is tried for: whoever only looks (`is_locked`) holds it for an instant."""
+
+
+def take_lock(path: Path) -> int | None:
+    """Holds a lock as long as the file descriptor that it returns is open, here or in a child.
+
+    A lock and not a process id in a file: ids are used again, and mean nothing in another container.
+
+    Args:
+        path: of a folder that is there, or of a file, which is made and tells who holds it.
+
+    Returns:
+        The descriptor, or None where another holds the lock.
+
+    Raises:
+        FileError: the file cannot be made, or its file system has no locks.
+    """
+    is_folder = path.is_dir()
+    descriptor = _open(path, os.O_RDONLY if is_folder else os.O_CREAT | os.O_RDWR)
+    until = time.monotonic() + PATIENCE_S
+    try:
+        while not _flock(descriptor, path, fcntl.LOCK_EX):
+            if is_locked(path) or time.monotonic() > until:
+                os.close(descriptor)
+                return None
+            time.sleep(0.02)
+    except FileError:
+        os.close(descriptor)
+        raise
+    if not is_folder:
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode())
+    return descriptor
+
+
+def release(descriptor: int | None) -> None:
+    """Frees a lock; None is none."""
+    if descriptor is not None:
+        os.close(descriptor)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether somebody holds a lock for itself; asking does not take it."""
+    if not path.exists():
+        return False
+    descriptor = _open(path, os.O_RDONLY)
+    try:
+        return not _flock(descriptor, path, fcntl.LOCK_SH)
+    finally:
+        os.close(descriptor)
+
+
+def holder(path: Path) -> str:
+    """Who holds a lock file, as it says itself: `process 123 on host`."""
+    with contextlib.suppress(OSError, ValueError):
+        pid, host = path.read_text().split()
+        return f"process {pid} on {host}"
+    return "another process"
+
+
+@contextlib.contextmanager
+def locked(path: Path, busy: str) -> Iterator[None]:
+    """Holds a lock file for the block.
+
+    Args:
+        path: of the lock file.
+        busy: what to say where it is held, with `{holder}` in it.
+
+    Raises:
+        FileError: another process holds it, or it cannot be made.
+    """
+    descriptor = take_lock(path)
+    if descriptor is None:
+        raise FileError(busy.format(holder=holder(path)))
+    try:
+        yield
+    finally:
+        release(descriptor)
+
+
+def _open(path: Path, flags: int) -> int:
+    try:
+        return os.open(path, flags, 0o644)
+    except OSError as error:
+        raise FileError(f"{path}: cannot be opened ({error.strerror}); expected a writable folder") from None
+
+
+def _flock(descriptor: int, path: Path, kind: int) -> bool:
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise FileError(
+            f"{path}: its file system has no locks ({error.strerror}); choose a folder on one that does"
+        ) from None
+    return True

@@ -1,0 +1,111 @@
+"""Files and folders appear whole or not at all; an older one stays where the new one cannot be written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import part_folder, publish, remove_stale, whole_file, whole_folder, write_text
+
+
+@pytest.fixture(autouse=True)
+def interruptible():
+    """A shell starts what runs in its background with SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_publishing_is_all_or_nothing(tmp_path, monkeypatch):
+    parts, targets = [tmp_path / "p0", tmp_path / "p1"], [tmp_path / "t0", tmp_path / "t1"]
+    for k, folder in enumerate((*parts, targets[1])):
+        folder.mkdir()
+        (folder / "file").write_text(f"{k}")
+    rename = Path.rename
+
+    def failing(self, target):
+        if self == parts[1]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(FileError, match="No space left"):
+        publish(dict(zip(parts, targets, strict=True)))
+    assert not targets[0].exists() and (targets[1] / "file").read_text() == "2"
+    monkeypatch.setattr(Path, "rename", rename)
+    shutil.rmtree(parts[0], ignore_errors=True)
+    parts[0].mkdir()
+    publish(dict(zip(parts, targets, strict=True)))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["t0", "t1"] and (targets[1] / "file").read_text() == "1"
+
+
+def test_a_signal_waits_for_the_renames(tmp_path, monkeypatch):
+    (tmp_path / "part").mkdir()
+    rename = Path.rename
+
+    def signalled(self, target):
+        os.kill(os.getpid(), signal.SIGINT)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", signalled)
+    with pytest.raises(KeyboardInterrupt):
+        publish({tmp_path / "part": tmp_path / "whole"})
+    assert [p.name for p in tmp_path.iterdir()] == ["whole"]
+
+
+def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path):
+    path = tmp_path / "rows.txt"
+    write_text(path, "old")
+    with (
+        pytest.raises(FileError, match=r"rows.txt: cannot be written \\(No space left on device\\)"),
+        whole_file(path) as part,
+    ):
+        part.write_text("half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(KeyboardInterrupt), whole_file(path) as part:
+        part.write_text("half")
+        raise KeyboardInterrupt
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path):
+    path = tmp_path / "rows.txt"
+    with whole_file(path) as first, whole_file(path) as second:
+        assert first != second and first.suffix == ".txt"
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"  # the outer block ends last
+
+
+def test_a_folder_replaces_an_older_one_only_when_asked_and_whole(tmp_path):
+    target = tmp_path / "made"
+    with whole_folder(target) as folder:
+        (folder / "file").write_text("1")
+    with pytest.raises(FileError, match="made: exists already"), whole_folder(target):
+        pass
+    with pytest.raises(RuntimeError), whole_folder(target, overwrite=True) as folder:
+        (folder / "file").write_text("2")
+        raise RuntimeError
+    assert (target / "file").read_text() == "1"
+    with whole_folder(target, overwrite=True) as folder:
+        (folder / "file").write_text("3")
+    assert (target / "file").read_text() == "3" and [p.name for p in tmp_path.iterdir()] == ["made"]
+
+
+def test_what_a_killed_writer_left_goes_and_what_runs_stays(tmp_path):
+    target = tmp_path / "made"
+    with part_folder(target) as running:
+        os.utime(running, (0, 0))
+        (tmp_path / ".made.part-7").mkdir()
+        os.utime(tmp_path / ".made.part-7", (0, 0))
+        remove_stale(target)
+        assert running.is_dir() and not (tmp_path / ".made.part-7").exists()
+    (tmp_path / ".made.old-7").mkdir()
+    remove_stale(target)  # killed between two renames: the older one is put back
+    assert [p.name for p in tmp_path.iterdir()] == ["made"]

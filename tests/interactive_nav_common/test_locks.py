@@ -1,0 +1,67 @@
+"""A lock has one holder, who is named; looking does not take it; a process that ends frees it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.locks import holder, is_locked, locked, release, take_lock
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_one_holder_at_a_time(tmp_path, kind):
+    path = tmp_path / "lock"
+    if kind == "folder":
+        path.mkdir()
+    assert not is_locked(path)
+    held = take_lock(path)
+    assert held is not None and is_locked(path) and take_lock(path) is None
+    release(held)
+    again = take_lock(path)
+    assert again is not None
+    release(again)
+
+
+def test_who_looks_never_keeps_one_from_taking_it(tmp_path):
+    path, looking = tmp_path / "lock", threading.Event()
+    looking.set()
+
+    def look() -> None:
+        while looking.is_set():
+            is_locked(path)
+
+    lookers = [threading.Thread(target=look) for _ in range(2)]
+    for thread in lookers:
+        thread.start()
+    taken = []
+    for _ in range(50):
+        descriptor = take_lock(path)
+        taken.append(descriptor is not None)
+        release(descriptor)
+    looking.clear()
+    for thread in lookers:
+        thread.join()
+    assert all(taken)
+
+
+def test_the_other_process_is_named_and_frees_it_by_ending(tmp_path):
+    path = tmp_path / "lock"
+    code = (
+        "import sys, pathlib; from interactive_nav_common.locks import take_lock; take_lock(pathlib.Path(sys.argv[1]))"
+    )
+    code += "; print('held', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "held\n"
+        assert holder(path).startswith(f"process {other.pid} on ")
+        with pytest.raises(FileError, match=f"in use by process {other.pid} on"), locked(path, "in use by {holder}"):
+            pass
+        other.kill()
+    with locked(path, "in use by {holder}"):
+        assert holder(path).startswith(f"process {os.getpid()} on ")
