@@ -63,7 +63,7 @@ def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path):
     path = tmp_path / "rows.txt"
     write_text(path, "old")
     with (
-        pytest.raises(FileError, match=r"rows.txt: cannot be written \\(No space left on device\\)"),
+        pytest.raises(FileError, match=r"rows.txt: cannot be written \(No space left on device\)"),
         whole_file(path) as part,
     ):
         part.write_text("half")
