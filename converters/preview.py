@@ -6,7 +6,6 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from converters.files import read_image, read_textured_obj
 from converters.objects import PlacedObject, convex_hull
 from converters.raw import RawScene, ScanMesh
 from converters.texture import ColourCloud, colour_cloud
+from interactive_nav_common.files import whole_file
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 MARGIN_M = 0.3
@@ -287,7 +287,7 @@ def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
     figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     figure.tight_layout(rect=(0, 0.03, 1, 0.985))
-    figure.savefig(target, metadata={"Software": None})
+    figure.savefig(target, format="png", metadata={"Software": None})
     plt.close(figure)
     return _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
 
@@ -301,8 +301,8 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         source: the raw folder it was made from: scan and cut are drawn too.
 
     Raises:
-        SceneError: the folder is not a readable scene, the source is another building's, or the picture cannot
-            be written.
+        SceneError: the folder is not a readable scene, or the source is another building's.
+        FileError: the picture cannot be written.
         SceneRejected: the source is unusable.
     """
     manifest, maps = load_manifest(folder), load_maps(folder)
@@ -315,10 +315,8 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".preview-") as scratch:
-        picture = Path(scratch) / "preview.png"
+    with whole_file(target) as picture:
         palette = draw(_Scene(folder, model, data, manifest, maps), raw, picture)
         with Image.open(picture) as image:
             few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
-            few.save(picture, optimize=True)
-        picture.replace(target)
+            few.save(picture, "PNG", optimize=True)

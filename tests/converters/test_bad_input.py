@@ -173,7 +173,7 @@ def test_a_stage_cache_on_a_full_disk_costs_nothing(gibson_raw, tmp_path, monkey
     def full(*args, **kwargs):
         raise FULL
 
-    monkeypatch.setattr("converters.cache.tempfile.mkstemp", full)
+    monkeypatch.setattr("converters.cache.whole_file", full)
     convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
     assert load_manifest(tmp_path / "out").warnings == ()
 
