@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 from scipy.spatial import ConvexHull
@@ -249,11 +250,11 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
 
 
-def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
+def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes.
 
     Returns:
-        A palette that suits the picture.
+        The figure, and a palette that suits it.
     """
     left, right, bottom, top = scene.extent
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
@@ -287,9 +288,7 @@ def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
     figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     figure.tight_layout(rect=(0, 0.03, 1, 0.985))
-    figure.savefig(target, format="png", metadata={"Software": None})
-    plt.close(figure)
-    return _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
+    return figure, _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
@@ -310,13 +309,20 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     except ValueError as error:
         raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
+    for item in manifest.objects:
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name) < 0:
+            raise SceneError(
+                f"{folder / 'scene.xml'}: no body named '{item.name}', which scene.json lists; convert the scene again"
+            )
     if not target.parent.is_dir():
         raise SceneError(f"{target.parent}: no such folder; give another -o")
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    figure, palette = draw(_Scene(folder, model, data, manifest, maps), raw)
     with whole_file(target) as picture:
-        palette = draw(_Scene(folder, model, data, manifest, maps), raw, picture)
+        figure.savefig(picture, format="png", metadata={"Software": None})
         with Image.open(picture) as image:
             few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
             few.save(picture, "PNG", optimize=True)
+    plt.close(figure)
