@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from converters.__main__ import main
 from converters.errors import StageFailed
 from converters.gates import (
     LIMITS,
@@ -24,7 +25,7 @@ from converters.gates import (
     physical_values,
 )
 from converters.settle import settle
-from scenes_mjcf.schema import SceneMaps, load_maps
+from scenes_mjcf.schema import SceneMaps, load_maps, save_maps
 
 
 def maps_of(traversable: np.ndarray) -> SceneMaps:
@@ -189,6 +190,19 @@ def test_split_free_space_fails_its_gate(tiny_scene):
     halves[:, halves.shape[1] // 2 - 2 : halves.shape[1] // 2 + 2] = False
     maps = dataclasses.replace(load_maps(folder), traversable=halves)
     assert failed(evaluate(spec_of(folder), maps, ("table_0", "basket_0"))) == {"connected_share"}
+
+
+def test_check_warns_of_floor_that_is_cut_off_and_names_a_damaged_map(tiny_scene, tmp_path, capsys):
+    folder = Path(shutil.copytree(tiny_scene[0], tmp_path / "scene"))
+    maps = load_maps(folder)
+    maps.traversable[:, maps.traversable.shape[1] // 4] = False
+    save_maps(maps, folder)
+    main(["check", str(folder)])
+    assert "warning: 1." in capsys.readouterr().out
+    (folder / "maps.npz").write_bytes((folder / "maps.npz").read_bytes()[:-30])
+    assert main(["check", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert "maps.npz: not readable (BadZipFile" in error and error.count("\n") == 1
 
 
 def test_a_missing_object_is_counted(tiny_scene):

@@ -162,6 +162,35 @@ def test_what_a_killed_generator_left_goes_with_the_next(tmp_path, quick):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
 
 
+@pytest.mark.parametrize(
+    ("failure", "code", "words"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; "),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 2, "No space left on device; "),
+    ],
+)
+@pytest.mark.parametrize(
+    ("fails_at", "old", "written"),
+    [("hut", (), ""), ("shed", (), "hut"), ("shed", ("hut",), ""), ("shed", ("--overwrite", "hut"), "hut")],
+)
+def test_the_last_word_names_what_was_written(
+    tmp_path, quick, monkeypatch, capsys, failure, code, words, fails_at, old, written
+):
+    convert = recipes.convert
+
+    def fail(source: Path, folder: Path, *rest: object) -> object:
+        if folder.name == fails_at:
+            raise failure
+        return convert(source, folder, *rest)  # pyright: ignore
+
+    monkeypatch.setattr(recipes, "convert", fail)
+    for name in old[-1:]:
+        (tmp_path / name).mkdir()
+    assert main(["generate-scenes", str(tmp_path), *old[:-1]]) == code
+    told = f"written before: {tmp_path / written}" if written else "nothing was written"
+    assert capsys.readouterr().err.endswith(f"{words}{told}\n")
+
+
 def test_a_scene_that_another_generator_made_meanwhile_is_kept(tmp_path, quick):
     lines: list[str] = []
 
