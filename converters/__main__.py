@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
+import glob
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -26,15 +25,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
 from converters.errors import StageFailed
+from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import CATEGORIES
-
-if TYPE_CHECKING:
-    from converters.gates import Gate
-    from converters.propose import Proposed
 
 
 class Interrupted(BaseException):
@@ -62,52 +57,6 @@ def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
-def _bounds(gate: Gate) -> str:
-    pairs = ((">=", gate.limit.least), ("<=", gate.limit.most))
-    return " ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
-
-
-def _gate_table(gates: tuple[Gate, ...]) -> Table:
-    table = Table("gate", "value", "limit", "", title="Gates")
-    for gate in gates:
-        verdict = "[green]PASS[/green]" if gate.passed else "[red]FAIL[/red]"
-        table.add_row(gate.name, f"{gate.value:.5g} {gate.limit.unit}", _bounds(gate), verdict)
-    return table
-
-
-def _alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
-    """Units in the head; `settled` is how far the short simulation moved the object from its annotation."""
-    table = Table(
-        "object",
-        "pairs",
-        "rms cm",
-        "shift cm",
-        "yaw °",
-        "scale x y z",
-        "tilt °",
-        "settled cm",
-        title="Pose re-solved from keypoints, against the annotated pose",
-    )
-    for row in rows:
-        if row["solved"]:
-            solved = (
-                f"{100 * row['rms_m']:.1f}",
-                f"{100 * row['translation_difference_m']:.1f}",
-                f"{row['yaw_difference_deg']:.1f}",
-                " ".join(f"{v:.2f}" for v in row["scale_ratio"]),
-            )
-        else:
-            solved = ("-", "-", "-", row["reason"])
-        table.add_row(
-            row["name"],
-            str(row["n_keypoints"]),
-            *solved,
-            f"{row['tilt_removed_deg']:.1f}",
-            f"{100 * row['settle_shift_m']:.1f}",
-        )
-    return table
-
-
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import ConvertConfig, convert_building
 
@@ -126,8 +75,8 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         results = convert_building(arguments.source, arguments.out, config, report)
     for result in results:
         if any(row.get("n_keypoints") for row in result.manifest.alignment):
-            console.print(_alignment_table(result.manifest.alignment))
-        console.print(_gate_table(result.gates))
+            console.print(alignment_table(result.manifest.alignment))
+        console.print(gate_table(result.gates))
         for warning in result.manifest.warnings:
             console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
     times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
@@ -181,9 +130,11 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
     for gate in gates:
         verdict = "PASS" if gate.passed else "FAIL"
         print(
-            f"{verdict}  {gate.name:<18} {gate.value:>10.5g} {gate.limit.unit:<6} limit {_bounds(gate):<8} "
+            f"{verdict}  {gate.name:<18} {gate.value:>10.5g} {gate.limit.unit:<6} limit {bounds(gate):<8} "
             f"({gate.limit.meaning})"
         )
+    for warning in (w for gate in gates for w in gate.warnings):
+        print(f"warning: {warning}")
     failed = sum(not g.passed for g in gates)
     print(f"{manifest.name}: {len(gates) - failed} of {len(gates)} gates pass")
     return 1 if failed else 0
@@ -227,49 +178,6 @@ def _preview(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _proposal_tables(found: Proposed) -> Iterator[Table]:
-    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
-    for k, proposal in enumerate(found.proposals):
-        model = found.retrieved.get(k)
-        table.add_row(
-            proposal.category,
-            f"{proposal.confidence:.2f}",
-            " ".join(f"{v:.2f}" for v in proposal.centre),
-            " ".join(f"{v:.2f}" for v in proposal.extent_m),
-            model.cad.cad_id[:8] if model else "-",
-            f"{model.confidence:.2f}" if model else "-",
-        )
-    yield table
-    if not found.comparisons:
-        return
-    table = Table(
-        "class",
-        "annotated",
-        "chosen",
-        "rank",
-        "cm",
-        "yaw °",
-        "scale x y z",
-        "IoU",
-        "sure",
-        title="Retrieved models against the annotation",
-        caption="cm, yaw and scale: the annotated model's own best fit against its annotated pose",
-    )
-    for row in found.comparisons:
-        table.add_row(
-            row.category,
-            row.true_cad[:6],
-            row.chosen_cad[:6],
-            f"{row.rank}/{row.n_tried}",
-            f"{100 * row.difference.translation_m:.1f}",
-            f"{math.degrees(row.difference.yaw_rad):.1f}",
-            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
-            f"{row.iou:.2f}",
-            f"{row.confidence:.2f}",
-        )
-    yield table
-
-
 def _propose(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import read_source
     from converters.propose import propose
@@ -278,7 +186,7 @@ def _propose(arguments: argparse.Namespace, console: Console) -> int:
     with _progress(console) as report:
         raw = read_source(arguments.source, arguments.format)
         found = propose(raw, arguments.output, library, report)
-    for table in _proposal_tables(found):
+    for table in proposal_tables(found):
         console.print(table)
     console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
     return 0
@@ -337,7 +245,7 @@ def _parser() -> argparse.ArgumentParser:
         help="decompositions side by side (default: one a processor)",
     )
     _add_decompose_options(convert)
-    convert.set_defaults(run=_convert)
+    convert.set_defaults(run=_convert, writes=("{}", "{}_[0-9]*"))
     convert.add_argument(
         "--auto-align",
         action="store_true",
@@ -352,7 +260,7 @@ def _parser() -> argparse.ArgumentParser:
         "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
     )
     propose.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
-    propose.set_defaults(run=_propose)
+    propose.set_defaults(run=_propose, writes=("{}/proposals.*",))
     single = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
     single.add_argument(
         "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"
@@ -368,14 +276,14 @@ def _parser() -> argparse.ArgumentParser:
     single.add_argument("--scale", type=_positive_number, default=1.0, help="of a mesh that is not in metres")
     single.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up (default z)")
     _add_decompose_options(single)
-    single.set_defaults(run=_object)
+    single.set_defaults(run=_object, writes=("{}",))
     check = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
     check.add_argument("scene", type=Path, metavar="SCENE_DIR")
-    check.set_defaults(run=_check)
+    check.set_defaults(run=_check, writes=())
     generate = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
     generate.add_argument("out", type=Path, metavar="OUT", help="folder to make")
     generate.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
-    generate.set_defaults(run=_generate)
+    generate.set_defaults(run=_generate, writes=("{}",))
     scenes = commands.add_parser(
         "generate-scenes", help="make the scenes of a recipe file: generate, convert, draw; goes on where it stopped"
     )
@@ -384,13 +292,23 @@ def _parser() -> argparse.ArgumentParser:
     scenes.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
     scenes.add_argument("--overwrite", action="store_true", help="make those again that are there")
     scenes.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N")
-    scenes.set_defaults(run=_generate_scenes)
+    scenes.set_defaults(run=_generate_scenes, writes=("{}/*",))
     preview = commands.add_parser("preview", help="draw a conversion's stages from above")
     preview.add_argument("scene", type=Path, metavar="SCENE_DIR")
     preview.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
     preview.add_argument("--source", type=Path, metavar="SRC", help="raw folder: draws scan and cut too")
-    preview.set_defaults(run=_preview)
+    preview.set_defaults(run=_preview, writes=("{}",))
     return parser
+
+
+def _standing(arguments: argparse.Namespace) -> dict[str, int]:
+    """What stands where the command writes: path -> inode, another one once something was put in its place."""
+    target = glob.escape(str(getattr(arguments, "out", None) or getattr(arguments, "output", "")))
+    found = {}
+    for path in (p for pattern in arguments.writes for p in glob.glob(pattern.format(target))):
+        with contextlib.suppress(OSError):
+            found[path] = os.stat(path).st_ino
+    return found
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -398,17 +316,23 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     signal.signal(signal.SIGTERM, _on_sigterm)
     console = Console()
+    before = _standing(arguments)
+
+    def written() -> str:
+        new = sorted(path for path, inode in _standing(arguments).items() if before.get(path) != inode)
+        return f"written before: {', '.join(new)}" if new else "nothing was written"
+
     try:
         return arguments.run(arguments, console)
     except KeyboardInterrupt:
-        print("interrupted; nothing was written", file=sys.stderr)
+        print(f"interrupted; {written()}", file=sys.stderr)
         return 130
     except Interrupted:
-        print("terminated; nothing was written", file=sys.stderr)
+        print(f"terminated; {written()}", file=sys.stderr)
         return 143
     except OSError as error:
         where = error.filename or getattr(arguments, "out", None) or "file system"
-        print(f"error: {where}: {error.strerror or error}; nothing was written", file=sys.stderr)
+        print(f"error: {where}: {error.strerror or error}; {written()}", file=sys.stderr)
         return 2
     except (UserError, StageFailed) as error:
         print("error: " + " ".join(str(error).split()), file=sys.stderr)

@@ -12,9 +12,10 @@ import dataclasses
 import functools
 import hashlib
 import importlib
+import importlib.resources
 import json
 import os
-import tempfile
+import time
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -22,21 +23,28 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import whole_file
+
 T = TypeVar("T")
 
 COMPUTING = ("numpy", "scipy", "trimesh", "fast-simplification", "xatlas", "shapely", "mujoco")
 LIMIT_BYTES = 2 * 2**30
 """The oldest entries go beyond this size."""
+KEEP_S = 3600.0
+"""What was read or written within this time may be a running conversion's, and stays."""
+PACKAGE = Path(str(importlib.resources.files("converters")))
 NOT_HASHED = {"hashed": False}
 """Metadata of dataclass fields that no stage's result depends on (names, reports)."""
 
 
 @functools.cache
-def fingerprint() -> bytes:
+def fingerprint(package: Path = PACKAGE) -> bytes:
     """Digest of the converter's source files and the computing libraries' versions."""
     digest = hashlib.sha256(repr([(name, version(name)) for name in COMPUTING]).encode())
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    for path in sorted(package.rglob("*.py")):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.digest()
 
 
@@ -64,8 +72,7 @@ class StageCache:
         found, value = _load(path)
         if not found:
             value = function(*arguments)
-            with contextlib.suppress(OSError):  # a full disk costs the next run time and this run nothing
-                _store(path, value)
+            _store(path, value)
         return value
 
     def _feed(self, digest: Any, value: Any) -> None:
@@ -146,40 +153,48 @@ def _load(path: Path) -> tuple[bool, Any]:
         value = _decode(json.loads(bytes(arrays.pop("tree")).decode()), arrays)
     except Exception:  # a damaged archive fails in zipfile, zlib, struct or NumPy, each in its own way
         return False, None
-    with contextlib.suppress(OSError):
-        os.utime(path)  # the oldest unused go first
+    touch(path)
     return True, value
 
 
 def _store(path: Path, value: Any) -> None:
-    """Writes beside and renames, so that two writers of one key leave one whole file."""
     arrays: list[np.ndarray] = []
     tree = np.frombuffer(json.dumps(_encode(value, arrays)).encode(), np.uint8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
-    os.close(handle)
-    try:
-        named = {f"a{i}": a for i, a in enumerate(arrays)}
-        np.savez(temporary, tree=tree, **named)  # pyright: ignore[reportArgumentType]
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-    prune(path.parent, LIMIT_BYTES)
+    named = {f"a{i}": a for i, a in enumerate(arrays)}
+    store(path, lambda partial: np.savez(partial, tree=tree, **named))  # pyright: ignore[reportArgumentType]
 
 
-def prune(folder: Path, limit_bytes: int) -> None:
-    """Deletes the entries that were not used for longest until the folder is within the limit."""
+def touch(path: Path) -> None:
+    """Marks an entry as used: the oldest unused go first."""
+    with contextlib.suppress(OSError):
+        os.utime(path)
+
+
+def store(path: Path, write: Callable[[Path], None], limit_bytes: int = LIMIT_BYTES) -> None:
+    """Keeps an entry, whole or not at all, and its folder within the limit.
+
+    A cache that cannot be written (full disk, read-only home) costs the next run time and this run nothing.
+    """
+    with contextlib.suppress(FileError), whole_file(path) as partial:
+        write(partial)
+    prune(path.parent, limit_bytes, time.time())
+
+
+def prune(folder: Path, limit_bytes: int, now_s: float) -> None:
+    """Deletes the entries that were not used for longest until the folder is within the limit.
+
+    Those of the last `KEEP_S` stay. What a killed writer left unfinished goes in any case.
+    """
     entries = []
     for path in folder.glob("*.npz"):
         with contextlib.suppress(OSError):
             status = path.stat()
             entries.append((status.st_mtime, status.st_size, path))
     excess = sum(size for _, size, _ in entries) - limit_bytes
-    for _, size, path in sorted(entries):
-        if excess <= 0:
+    for used_s, size, path in sorted(entries):
+        if used_s > now_s - KEEP_S:
             return
-        with contextlib.suppress(OSError):
-            path.unlink()
-        excess -= size
+        if excess > 0 or path.name.startswith(".partial-"):
+            with contextlib.suppress(OSError):
+                path.unlink()
+            excess -= size

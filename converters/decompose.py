@@ -8,7 +8,6 @@ cannot be interrupted from Python. A model is decomposed once, unscaled: scaling
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import errno
 import hashlib
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from converters.cache import LIMIT_BYTES, store, touch
 from converters.errors import CANNOT_WRITE, StageFailed
 from converters.objects import Hull, convex_hull
 
@@ -78,27 +78,14 @@ def _load(path: Path) -> tuple[Hull, ...] | None:
         return None
 
 
-def _store(path: Path, hulls: tuple[Hull, ...]) -> None:
-    """Writes beside and renames, so that two writers of one key leave one whole file.
-
-    A cache that cannot be written (full disk, read-only home) costs the next run time and this run nothing.
-    """
-    with contextlib.suppress(OSError):
-        _write(path, hulls)
-
-
-def _write(path: Path, hulls: tuple[Hull, ...]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _store(path: Path, hulls: tuple[Hull, ...], limit_bytes: int = LIMIT_BYTES) -> None:
     arrays = {f"v{i}": h.vertices for i, h in enumerate(hulls)} | {f"f{i}": h.faces for i, h in enumerate(hulls)}
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".npz")
-    os.close(handle)
-    try:
-        np.savez_compressed(temporary, count=len(hulls), **arrays)  # pyright: ignore[reportArgumentType]
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+    count = len(hulls)
+    store(
+        path,
+        lambda partial: np.savez_compressed(partial, count=count, **arrays),  # pyright: ignore[reportArgumentType]
+        limit_bytes,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,6 +140,7 @@ def decompose_all(
     for name, key in keys.items():
         found = _load(cache / f"{key}.npz")
         if found is not None:
+            touch(cache / f"{key}.npz")
             done[key] = found
         elif key not in {k for k, _ in waiting}:
             waiting.append((key, name))

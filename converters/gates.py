@@ -36,9 +36,8 @@ class Limit:
 
 LIMITS: dict[str, Limit] = {
     "compiles": Limit("bool", least=1, meaning="scene.xml compiles in MuJoCo"),
-    "objects": Limit("count", least=0, meaning="movable bodies, each named in both files; structure alone has none"),
     "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml"),
-    "finite": Limit("bool", least=1, meaning="no non-finite number after 5 s"),
+    "finite": Limit("bool", least=1, meaning="no non-finite number in 5 s, no simulation started over"),
     "drift_hulls": Limit("m", most=0.01, meaning="largest move in 5 s untouched, hulls at the environments' timestep"),
     "drift_boxes": Limit("m", most=0.01, meaning="the same with boxes"),
     "turn_hulls": Limit("deg", most=1.0, meaning="largest turn in 5 s untouched, hulls"),
@@ -46,7 +45,9 @@ LIMITS: dict[str, Limit] = {
     "penetration_hulls": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, hulls"),
     "penetration_boxes": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, boxes"),
     "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),
-    "connected_share": Limit("share", least=0.8, meaning="largest piece of the free space for a disc of 0.18 m"),
+    "connected_share": Limit(
+        "share", least=0.8, meaning="of the free floor, what a disc of 0.18 m radius covers in one piece"
+    ),
     "start_goal": Limit("m", least=START_GOAL_M, meaning="farthest two cells in that piece, straight line"),
     "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
     "hulls": Limit("count", most=400, meaning="hulls in all"),
@@ -62,6 +63,8 @@ class Gate:
     value: float
     passed: bool
     limit: Limit
+    warnings: tuple[str, ...] = ()
+    """What the value does not tell, passed or not."""
 
     def as_dict(self) -> dict[str, Any]:
         """For scene.json."""
@@ -69,12 +72,12 @@ class Gate:
         return {"passed": self.passed, "value": round(self.value, 6), "limit": bound, "unit": self.limit.unit}
 
 
-def judge(name: str, value: float) -> Gate:
+def judge(name: str, value: float, warnings: tuple[str, ...] = ()) -> Gate:
     """Holds a value against the table; a non-finite value fails."""
     limit = LIMITS[name]
     passed = math.isfinite(value)
     passed = passed and (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
-    return Gate(name, float(value) if math.isfinite(value) else -1.0, passed, limit)
+    return Gate(name, float(value) if math.isfinite(value) else -1.0, passed, limit, warnings)
 
 
 def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
@@ -100,6 +103,15 @@ def run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
         mujoco.mj_step(model, data)
 
 
+def started_over(data: mujoco.MjData) -> bool:
+    """Whether MuJoCo met a bad position, velocity or acceleration.
+
+    It then starts the simulation over and only counts a warning: the state alone would look sound.
+    """
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    return any(data.warning[int(w)].number for w in bad)
+
+
 def movable_bodies(model: mujoco.MjModel) -> list[int]:
     """Ids of the bodies that have a joint of their own."""
     return [b for b in range(1, model.nbody) if model.body_jntnum[b] > 0]
@@ -123,15 +135,12 @@ def physical_values(model: mujoco.MjModel) -> dict[str, float]:
         np.linalg.norm(data.xipos[bodies] - start_com, axis=1),
         np.linalg.norm(data.xpos[bodies] - start_pos, axis=1),
     )
-    # MuJoCo starts a diverged simulation over and only counts a warning: the state alone would look sound.
-    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-    diverged = any(data.warning[int(w)].number for w in bad)
     cosine = np.abs((data.xquat[bodies] * start_quat).sum(axis=1))
     return {
         "drift": float(moved.max(initial=0.0)),
         "turn": float(np.degrees(2 * np.arccos(np.clip(cosine, 0, 1))).max(initial=0.0)),
         "penetration": max(depth, deepest_contact(model, data)),
-        "finite": float(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all() and not diverged),
+        "finite": float(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all() and not started_over(data)),
     }
 
 
@@ -144,12 +153,22 @@ def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.
     return ((distance - 0.5) * resolution_m >= radius_m)[1:-1, 1:-1]
 
 
-def free_space_values(maps: SceneMaps) -> dict[str, float]:
-    """Traversable area (m2), share of the largest piece for the disc, and its farthest pair of cells (m)."""
+def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:
+    """Cells where the disc's middle may be, all of them hanging together; and every cell's distance to them, m."""
     free = eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M)
     pieces, count = label_pieces(free, np.ones((3, 3)))
-    size = np.bincount(pieces.ravel(), minlength=2)[1:]
-    cells = np.argwhere(pieces == int(np.argmax(size)) + 1).astype(float) if count else np.zeros((0, 2))
+    if not count:
+        return free, np.full(free.shape, np.inf)
+    piece = pieces == int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1
+    distance = ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m)
+    assert isinstance(distance, np.ndarray)
+    return piece, distance
+
+
+def free_space_values(maps: SceneMaps) -> dict[str, float]:
+    """Traversable area (m2), share of it that the disc covers in one piece, and that piece's farthest pair (m)."""
+    piece, distance = _largest_piece(maps)
+    cells = np.argwhere(piece).astype(float)
     farthest = 0.0
     if len(cells) > 1:
         try:
@@ -157,11 +176,29 @@ def free_space_values(maps: SceneMaps) -> dict[str, float]:
         except QhullError:
             cells = cells[[0, -1]]  # one straight line of cells, sorted along it
         farthest = float(pdist(cells).max()) * maps.resolution_m
+    # The erosion rounds up to whole cells: a disc that touches a wall has its middle up to a cell nearer to it.
+    covered = maps.traversable & (distance <= ROBOT_RADIUS_M + maps.resolution_m)
     return {
         "traversable_area": float(maps.traversable.sum()) * maps.resolution_m**2,
-        "connected_share": float(size.max() / size.sum()) if count else 0.0,
+        "connected_share": float(covered.sum() / max(maps.traversable.sum(), 1)),
         "start_goal": farthest,
     }
+
+
+def free_space_warnings(maps: SceneMaps) -> tuple[str, ...]:
+    """Names the free floor that the robot cannot reach, when it is more than corners and rims.
+
+    Those are within two radii of where its middle may be; of the rest, less than the disc's own area is no matter.
+    """
+    _, distance = _largest_piece(maps)
+    cell_m2 = maps.resolution_m**2
+    lost_m2 = float((maps.traversable & (distance > 2 * ROBOT_RADIUS_M)).sum()) * cell_m2
+    if lost_m2 < math.pi * ROBOT_RADIUS_M**2:
+        return ()
+    return (
+        f"{lost_m2:.1f} of {float(maps.traversable.sum()) * cell_m2:.1f} m2 of free floor cannot be reached by a robot "
+        f"of {ROBOT_RADIUS_M} m radius from the largest piece: too narrow, or cut off; look at the map in the preview",
+    )
 
 
 def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]) -> tuple[Gate, ...]:
@@ -184,7 +221,6 @@ def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]
     by_hull, by_box = physical_values(model), physical_values(boxes)
     values = {
         "compiles": 1.0,
-        "objects": float(len(bodies & set(object_names))),
         "unmatched_objects": float(len(bodies ^ set(object_names))),
         "finite": min(by_hull["finite"], by_box["finite"]),
         "hulls_per_object": float(max(hulls, default=0)),
@@ -194,7 +230,8 @@ def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]
     for quantity in ("drift", "turn", "penetration"):
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
     values |= free_space_values(maps)
-    return tuple(judge(name, values[name]) for name in LIMITS)
+    warnings = {"connected_share": free_space_warnings(maps)}
+    return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
 
 
 def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:

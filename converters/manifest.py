@@ -65,5 +65,9 @@ def make_manifest(
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),
-        warnings=(*raw.warnings, *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items()))),
+        warnings=(
+            *raw.warnings,
+            *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items())),
+            *(warning for gate in gates for warning in gate.warnings),
+        ),
     )

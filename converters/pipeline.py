@@ -352,6 +352,7 @@ def convert_building(
     Raises:
         SceneRejected: bad input.
         StageFailed: a stage broke.
+        FileError: `target` exists already (`overwrite`), or cannot be written.
         OSError: the disk is full or gone.
     """
     return _convert(source, target, config, report, cache, None)
@@ -392,5 +393,5 @@ def _convert(
         for scene, (folder, final) in zip(scenes, folders.items(), strict=True):
             result = convert_raw(scene, folder, config, clock, cache or cache_folder())
             done.append(dataclasses.replace(result, folder=final, stage_s=clock.seconds))
-        publish(folders)
+        publish(folders, config.overwrite)
     return tuple(done)

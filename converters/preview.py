@@ -6,7 +6,6 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 from scipy.spatial import ConvexHull
@@ -28,6 +28,7 @@ from converters.files import read_image, read_textured_obj
 from converters.objects import PlacedObject, convex_hull
 from converters.raw import RawScene, ScanMesh
 from converters.texture import ColourCloud, colour_cloud
+from interactive_nav_common.files import whole_file
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 MARGIN_M = 0.3
@@ -249,11 +250,11 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
 
 
-def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
+def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes.
 
     Returns:
-        A palette that suits the picture.
+        The figure, and a palette that suits it.
     """
     left, right, bottom, top = scene.extent
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
@@ -287,9 +288,7 @@ def draw(scene: _Scene, raw: RawScene | None, target: Path) -> Image.Image:
     figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     figure.tight_layout(rect=(0, 0.03, 1, 0.985))
-    figure.savefig(target, metadata={"Software": None})
-    plt.close(figure)
-    return _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
+    return figure, _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
@@ -301,8 +300,8 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         source: the raw folder it was made from: scan and cut are drawn too.
 
     Raises:
-        SceneError: the folder is not a readable scene, the source is another building's, or the picture cannot
-            be written.
+        SceneError: the folder is not a readable scene, or the source is another building's.
+        FileError: the picture cannot be written.
         SceneRejected: the source is unusable.
     """
     manifest, maps = load_manifest(folder), load_maps(folder)
@@ -310,15 +309,20 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     except ValueError as error:
         raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
+    for item in manifest.objects:
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name) < 0:
+            raise SceneError(
+                f"{folder / 'scene.xml'}: no body named '{item.name}', which scene.json lists; convert the scene again"
+            )
     if not target.parent.is_dir():
         raise SceneError(f"{target.parent}: no such folder; give another -o")
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".preview-") as scratch:
-        picture = Path(scratch) / "preview.png"
-        palette = draw(_Scene(folder, model, data, manifest, maps), raw, picture)
+    figure, palette = draw(_Scene(folder, model, data, manifest, maps), raw)
+    with whole_file(target) as picture:
+        figure.savefig(picture, format="png", metadata={"Software": None})
         with Image.open(picture) as image:
             few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
-            few.save(picture, optimize=True)
-        picture.replace(target)
+            few.save(picture, "PNG", optimize=True)
+    plt.close(figure)

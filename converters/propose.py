@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,6 +29,7 @@ from converters.retrieval import (
     compare_retrieval,
     read_library,
 )
+from interactive_nav_common.files import whole_file
 
 SAME_OBJECT_SHARE = 0.3
 """Share of a proposal's points in an annotated model's box from which they are compared."""
@@ -102,7 +101,8 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
     for annotation in raw.annotations:
         hull = MultiPoint(annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
         axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)
-    handles = [Patch(facecolor="none", edgecolor=CATEGORY_COLOURS[c], label=c) for c in CATEGORY_COLOURS]
+    shown = sorted({p.category for p in found.proposals})
+    handles = [Patch(facecolor="none", edgecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
     handles.append(Patch(facecolor="none", edgecolor="black", linestyle=":", label="annotated model"))
     axes.legend(handles=handles, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
     axes.set_aspect("equal")
@@ -124,12 +124,13 @@ def propose(
 
     Args:
         raw: the read source.
-        target: folder, made if absent; nothing is left in it on failure.
+        target: folder, made if absent; on failure older files in it stay as they were.
         library_root: folder that holds `cad/`; None: boxes only.
         report: progress, (stage, share).
 
     Raises:
-        SceneRejected: no labelled furniture, no library, or a folder that cannot be written.
+        SceneRejected: no labelled furniture, or no library.
+        FileError: the folder cannot be written.
     """
     say = report or (lambda stage, share: None)
     say("propose", 0.0)
@@ -148,21 +149,9 @@ def propose(
                 comparisons.append(compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor))
     found = Proposed(proposals, retrieved, tuple(comparisons))
     say("draw", 0.95)
-    made = not target.exists()
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False)
-        (target / "proposals.json").write_text(text + "\n", encoding="utf-8")
-        _draw(raw, found, target / "proposals.png")
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            if made:
-                shutil.rmtree(target)
-            else:
-                for name in ("proposals.json", "proposals.png"):
-                    (target / name).unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise SceneRejected(f"{target}: cannot be written ({error.strerror}); give another -o") from error
-        raise
+    text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"
+    with whole_file(target / "proposals.json") as written, whole_file(target / "proposals.png") as picture:
+        written.write_text(text, encoding="utf-8")
+        _draw(raw, found, picture)
     say("draw", 1.0)
     return found

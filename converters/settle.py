@@ -9,7 +9,7 @@ import numpy as np
 
 from converters.emit import SceneParts, build_spec
 from converters.errors import StageFailed
-from converters.gates import collide_with, run
+from converters.gates import collide_with, run, started_over
 
 SNAP_M = 0.25
 """An object annotated to stand within this of the floor is set on it; others are dropped."""
@@ -118,8 +118,11 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
         model.dof_damping[dof + 3 : dof + 6] = DAMP_PER_S * model.body_inertia[body].mean()
     data = mujoco.MjData(model)
     run(model, data, seconds)
-    if not np.isfinite(data.qpos).all():
-        raise StageFailed("settle: the simulation became non-finite; two objects overlap too deeply to part")
+    if started_over(data) or not np.isfinite(data.qpos).all():
+        raise StageFailed(
+            f"settle: MuJoCo started the simulation over (its numbers became too large with {shape} geoms); "
+            "two objects overlap too deeply to part, move one of them"
+        )
     return _with_poses(parts, model, data)
 
 
@@ -127,7 +130,7 @@ def settle(parts: SceneParts) -> Settled:
     """Sets objects on the floor, pushes them apart, then lets boxes and after them hulls come to rest.
 
     Raises:
-        StageFailed: non-finite simulation.
+        StageFailed: the simulation diverged.
     """
     result = push_apart(_on_floor(parts))
     result = _simulate(result, "box", SETTLE_S)

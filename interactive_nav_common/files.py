@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import secrets
@@ -61,7 +62,7 @@ def whole_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     """
     with part_folder(target, overwrite) as part:
         yield part
-        publish({part: target})
+        publish({part: target}, overwrite)
 
 
 @contextlib.contextmanager
@@ -95,40 +96,57 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
         release(lock)
 
 
-def publish(folders: Mapping[Path, Path]) -> None:
-    """Renames finished folders to their targets, all or none; an older target is replaced.
+def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
+    """Renames finished folders to their targets, all or none.
 
-    Signals wait until it is done: a few renames take no time, and half of them would be worse.
+    Signals wait until it is done: a few renames take no time, and half of them would be worse. Of two that replace one
+    target at the same time, the last one stands.
 
     Args:
         folders: finished folder -> target, on one file system.
+        overwrite: an older target is replaced; without, only an empty one.
 
     Raises:
         FileError: one could not be renamed; what stood at the targets stands there again.
     """
-    moved: list[tuple[Path, Path | None]] = []
+    placed: list[Path] = []
+    moved: list[tuple[Path, Path]] = []
     with signals_wait():
         try:
             for finished, target in folders.items():
-                old = None
-                if target.exists():
+                while not _take_place(finished, target):
+                    if not overwrite:
+                        raise FileError(f"{target}: exists already; give another place or add --overwrite")
                     old = target.parent / f".{target.name}.old-{os.getpid()}-{secrets.token_hex(4)}"
-                    target.rename(old)
-                moved.append((target, old))
-                finished.rename(target)
+                    with contextlib.suppress(FileNotFoundError):  # another one has moved it
+                        target.rename(old)
+                        moved.append((old, target))
+                placed.append(target)
         except BaseException as error:
-            for target, old in moved:
+            for target in placed:
                 shutil.rmtree(target, ignore_errors=True)
-                if old is not None:
-                    old.rename(target)
+            for old, target in reversed(moved):
+                with contextlib.suppress(OSError):  # then it stays, and the next writer puts it back
+                    if not _take_place(old, target):
+                        shutil.rmtree(old, ignore_errors=True)
             if isinstance(error, OSError):
                 place = ", ".join(str(target) for target in folders.values())
                 reason = error.strerror or error
                 raise FileError(f"{place}: cannot be written ({reason}); make room or give another place") from None
             raise
-        for _, old in moved:
-            if old is not None:
-                shutil.rmtree(old, ignore_errors=True)
+        for old, _ in moved:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _take_place(folder: Path, target: Path) -> bool:
+    """Renames a folder; False where a filled one stands at `target`."""
+    try:
+        folder.rename(target)
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            return False
+        raise
+    return True
 
 
 def remove_stale(target: Path) -> None:

@@ -11,7 +11,7 @@ import difflib
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin, get_type_hints
 
 import numpy as np
 
@@ -20,6 +20,14 @@ from interactive_nav_common.errors import UserError
 SCHEMA_VERSION = 1
 CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy")
 SPLITS = ("train", "test")
+JSON_TYPES: dict[Any, tuple[tuple[type, ...], str]] = {
+    str: ((str,), "a string"),
+    int: ((int,), "a whole number"),
+    float: ((int, float), "a number"),
+    tuple: ((list, tuple), "a list"),
+    dict: ((dict,), "an object"),
+}
+"""A field's type -> what decoded JSON holds there, and its name in errors."""
 
 
 class SceneError(UserError):
@@ -82,7 +90,10 @@ class SceneMaps:
     """Height of the floor in the scan's own frame (0 in the scene's)."""
 
 
-def _known_keys(data: dict[str, Any], cls: type, where: str) -> dict[str, Any]:
+def _known_keys(data: Any, cls: type, where: str) -> dict[str, Any]:
+    """The JSON object, when it has the record's keys and their types."""
+    if not isinstance(data, dict):
+        raise SceneError(f"{where}: got {type(data).__name__}, expected a JSON object; convert the scene again")
     names = {f.name for f in dataclasses.fields(cls)}
     required = {
         f.name
@@ -97,6 +108,13 @@ def _known_keys(data: dict[str, Any], cls: type, where: str) -> dict[str, Any]:
     missing = sorted(required - data.keys())
     if missing:
         raise SceneError(f"{where}: missing key '{missing[0]}'; convert the scene again to rewrite the file")
+    hints = get_type_hints(cls)
+    for key, value in data.items():
+        kinds, words = JSON_TYPES[get_origin(hints[key]) or hints[key]]
+        if not isinstance(value, kinds) or isinstance(value, bool):
+            got = json.dumps(value, default=repr)
+            got = got if len(got) <= 60 else f"{got[:57]}..."
+            raise SceneError(f"{where}: {key} is {got}, expected {words}; convert the scene again")
     return data
 
 
@@ -108,10 +126,9 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
         where: file named in errors.
 
     Raises:
-        SceneError: unknown or missing key, unknown category or split, non-positive mass or friction.
+        SceneError: no JSON object, unknown or missing key, a value of another type, unknown category or split,
+            non-positive mass or friction.
     """
-    if not isinstance(data, dict):
-        raise SceneError(f"{where}: got {type(data).__name__}, expected a JSON object")
     data = dict(_known_keys(data, SceneManifest, where))
     if data.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
         raise SceneError(
@@ -125,7 +142,7 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
             raise SceneError(f"{here}: category is '{obj.category}', expected one of {', '.join(CATEGORIES)}")
         for field in ("mass_kg", "friction"):
             value = getattr(obj, field)
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
+            if not 0 < value < math.inf:
                 raise SceneError(f"{here}: {field} is {value!r}, expected a positive number")
         objects.append(obj)
     names = [o.name for o in objects]
@@ -153,7 +170,7 @@ def load_manifest(folder: str | Path) -> SceneManifest:
         )
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # no UTF-8, no JSON, a number too long, brackets too deep
         raise SceneError(f"{path}: not readable as JSON ({error}); convert the scene again") from error
     return manifest_from_dict(data, str(path))
 
@@ -179,8 +196,9 @@ def load_maps(folder: str | Path) -> SceneMaps:
             resolution = float(arrays["resolution"])
             origin = np.asarray(arrays["origin"], float).reshape(-1)
             floor_height = float(arrays["floor_height"])
-    except (OSError, KeyError, ValueError, EOFError) as error:
-        raise SceneError(f"{path}: not readable ({error}); convert the scene again") from error
+    except Exception as error:  # a damaged archive fails in zipfile, zlib or NumPy, each in its own way
+        reason = " ".join(str(error).split())
+        raise SceneError(f"{path}: not readable ({type(error).__name__}: {reason}); convert the scene again") from error
     if traversable.ndim != 2 or traversable.dtype != np.bool_:
         raise SceneError(f"{path}: traversable is {traversable.dtype}{traversable.shape}, expected a 2-D bool array")
     if not 0 < resolution <= 0.05 + 1e-9:

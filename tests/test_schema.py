@@ -29,6 +29,14 @@ def test_round_trip(room, tmp_path):
         (lambda d: d["objects"][0].update(mass_kg=0), "mass_kg is 0, expected a positive number"),
         (lambda d: d["objects"].append(d["objects"][0]), "two objects share a name"),
         (lambda d: d.update(schema_version=9), "schema_version is 9, expected 1"),
+        (lambda d: d.update(objects=None), "objects is null, expected a list"),
+        (lambda d: d.update(objects=[1, 2]), r"objects.0.: got int, expected a JSON object"),
+        (lambda d: d["objects"][0].update(name=["a"]), r"objects.0.: name is \[\"a\"\], expected a string"),
+        (lambda d: d["objects"][0].update(n_hulls=True), r"n_hulls is true, expected a whole number"),
+        (lambda d: d["objects"][0].update(mass_kg="5"), r'mass_kg is "5", expected a number'),
+        (lambda d: d.update(gates=[]), r"gates is \[\], expected an object"),
+        (lambda d: d.update(warnings=None), "warnings is null, expected a list"),
+        (lambda d: d.update(source="x" * 999), r'source is "x{50,80}\.\.\., expected an object'),
     ],
 )
 def test_bad_manifests_are_named(room, change, message):
@@ -52,4 +60,22 @@ def test_missing_unreadable_and_empty_files(tmp_path):
         schema.load_maps(tmp_path)
     schema.save_maps(schema.SceneMaps(np.ones((4, 4), bool), 0.1, (0.0, 0.0), 0.0), tmp_path)
     with pytest.raises(schema.SceneError, match="resolution is 0.1 m, expected at most 0.05 m"):
+        schema.load_maps(tmp_path)
+
+
+@pytest.mark.parametrize("keep", [0, 3, 60, 300, -30])
+def test_a_truncated_map_is_named(room, tmp_path, keep):
+    (tmp_path / "maps.npz").write_bytes((room / "maps.npz").read_bytes()[:keep])
+    with pytest.raises(schema.SceneError, match=r"maps.npz: not readable .*; convert the scene again"):
+        schema.load_maps(tmp_path)
+
+
+def test_a_damaged_or_odd_map_is_named(room, tmp_path):
+    data = bytearray((room / "maps.npz").read_bytes())
+    data[len(data) // 3 : len(data) // 2] = bytes(len(data) // 2 - len(data) // 3)
+    (tmp_path / "maps.npz").write_bytes(bytes(data))
+    with pytest.raises(schema.SceneError, match="maps.npz: not readable"):
+        schema.load_maps(tmp_path)
+    np.savez(tmp_path / "maps.npz", traversable=np.ones((2, 2), bool), resolution=[1, 2], origin=[0, 0], floor_height=0)
+    with pytest.raises(schema.SceneError, match="maps.npz: not readable"):
         schema.load_maps(tmp_path)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +17,7 @@ from converters.generate.plan import Plan, make_plan
 from converters.generate.scan import Scan, scan_building
 from converters.generate.texture import Atlas, make_atlas
 from converters.generate.write import LICENCE, write_cad, write_json, write_png, write_scan
+from interactive_nav_common.files import part_folder, publish
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "design_building", "generate_building"]
 
@@ -87,8 +85,7 @@ def generate_building(
 ) -> None:
     """Writes a raw building folder.
 
-    Everything is written into a folder beside `out_dir` and renamed at the end, so nothing half-written is
-    left.
+    It appears whole or not at all.
 
     Args:
         out_dir: must not exist, or be an empty folder.
@@ -98,6 +95,7 @@ def generate_building(
 
     Raises:
         GenerationError: `out_dir` is taken, or the building cannot be generated.
+        FileError: it cannot be written, or was filled meanwhile.
     """
     out_dir = Path(out_dir)
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
@@ -107,19 +105,13 @@ def generate_building(
         raise GenerationError(f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder")
     tell = progress or (lambda stage, share: None)
     cfg = (config or BuildingConfig()).validate()
-    tell("drawing the plan", 0.0)
-    building = design_building(seed, cfg)
-    scan, atlas = render_building(building, seed, cfg, tell)
-    tell("writing", 0.85)
-    out_dir.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{out_dir.name}-", dir=out_dir.parent))
-    try:
+    with part_folder(out_dir, overwrite=True) as work:
+        tell("drawing the plan", 0.0)
+        building = design_building(seed, cfg)
+        scan, atlas = render_building(building, seed, cfg, tell)
+        tell("writing", 0.85)
         _write(work, building, scan, atlas, seed, cfg)
-        work.chmod(0o755)
-        os.replace(work, out_dir)
-    except BaseException:
-        shutil.rmtree(work, ignore_errors=True)
-        raise
+        publish({work: out_dir}, overwrite=False)
     tell("done", 1.0)
 
 

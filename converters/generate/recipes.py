@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from converters.generate.cad import TEST_MODELS, TRAIN_MODELS
 from converters.generate.config import NAMES, BuildingConfig, GenerationError
 from converters.pipeline import ConvertConfig, convert
 from converters.preview import preview
+from interactive_nav_common.files import part_folder, publish
 
 MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
 """Split -> CAD models: held-out models are held out here."""
@@ -148,22 +147,18 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
 
     Returns:
         Names of the gates that fail.
+
+    Raises:
+        FileError: it cannot be written; an older one is untouched.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with part_folder(folder, overwrite=True) as work:
         generate_building(work / "raw", recipe.seed, lambda s, share: report(s, GENERATE * share), recipe.building)
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
         made = work / folder.name
         result = convert(work / "raw", made, config, lambda s, share: report(s, GENERATE + CONVERT * share))
         report("drawing", GENERATE + CONVERT)
         preview(made, made / "preview.png")
-        old = work / "old"
-        if folder.exists():
-            folder.rename(old)
-        made.rename(folder)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        publish({made: folder})
     report("done", 1.0)
     return [g.name for g in result.gates if not g.passed]
 
@@ -212,6 +207,9 @@ def make_scenes(
             done = (sum(weight[:k]) + weight[k] * share) / sum(weight)
             report(f"{k + 1}/{len(todo)} {recipe.name}: {stage}", done)
 
+        if not overwrite and (out / recipe.name).exists():  # another generator's, made since
+            tell(f"{recipe.name}: is there, kept")
+            continue
         failed[recipe.name] = make_scene(recipe, recipes.conversion, out / recipe.name, jobs, inner)
         verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
         tell(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")

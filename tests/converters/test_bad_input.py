@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -18,6 +19,7 @@ from converters import decompose, pipeline
 from converters.__main__ import main
 from converters.errors import SceneRejected, StageFailed
 from converters.pipeline import ConvertConfig, convert
+from interactive_nav_common.errors import FileError
 from scenes_mjcf.schema import load_manifest
 from tests.converters import tiny_raw
 
@@ -170,12 +172,18 @@ def test_disk_full_at_any_file(pristine, tmp_path, capsys, cached, monkeypatch, 
 
 
 def test_a_stage_cache_on_a_full_disk_costs_nothing(gibson_raw, tmp_path, monkeypatch, hull_cache):
-    def full(*args, **kwargs):
-        raise FULL
+    save = np.savez
 
-    monkeypatch.setattr("converters.cache.tempfile.mkstemp", full)
+    def full(target, *args, **kwargs):
+        if Path(target).parent == tmp_path / "cache":
+            Path(target).write_bytes(b"PK")
+            raise FULL
+        save(target, *args, **kwargs)
+
+    monkeypatch.setattr(np, "savez", full)
     convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
     assert load_manifest(tmp_path / "out").warnings == ()
+    assert {len(p.stem) for p in (tmp_path / "cache").iterdir()} == {64}  # hulls, which have a writer of their own
 
 
 @pytest.mark.parametrize("stage", ["cut_furniture", "settle", "write_scene", "save_manifest"])
@@ -201,6 +209,56 @@ def test_a_signal_in_any_stage_leaves_nothing(pristine, tmp_path, capsys, cached
         signal.signal(signal.SIGTERM, before)
     assert capsys.readouterr().err == f"{word}; nothing was written\n"
     assert list(out.parent.iterdir()) == []
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Conversions of which every stage after reading is one file."""
+
+    def made(scene, folder, *_):
+        (folder / "scene.json").write_text("new")
+        return pipeline.Converted(folder, None, (), None, 0, {})  # pyright: ignore
+
+    monkeypatch.setattr(pipeline, "convert_raw", made)
+
+
+def test_floors_that_were_put_in_place_when_the_signal_came_are_named(tmp_path, capsys, monkeypatch, quick):
+    root, out, rename = tiny_raw.write_two_floors(tmp_path / "house"), tmp_path / "out", Path.rename
+
+    def signalled(self, target):
+        if target.name == "out_0":
+            os.kill(os.getpid(), signal.SIGINT)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", signalled)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert main(["convert", str(root), str(out)]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == f"interrupted; written before: {out}_0, {out}_1\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["house", "out_0", "out_1"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_of_two_conversions_into_one_folder_one_stands_whole(gibson_raw, tmp_path, monkeypatch, quick, overwrite):
+    made, out = pipeline.convert_raw, tmp_path / "out"
+
+    def slow(scene, folder, *rest):
+        monkeypatch.setattr(pipeline, "convert_raw", made)
+        convert(gibson_raw, out, SMALL)  # starts and ends while the first is at work
+        (out / "mine.txt").write_text("its user's")
+        return made(scene, folder, *rest)
+
+    monkeypatch.setattr(pipeline, "convert_raw", slow)
+    config = dataclasses.replace(SMALL, overwrite=overwrite)
+    if overwrite:
+        convert(gibson_raw, out, config)
+    else:
+        with pytest.raises(FileError, match="out: exists already; give another place or add --overwrite"):
+            convert(gibson_raw, out, config)
+    assert sorted(p.name for p in out.iterdir()) == ([] if overwrite else ["mine.txt"]) + ["scene.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["gibson", "out"]
 
 
 def test_a_map_of_the_wrong_place_names_both_extents(gibson_raw):

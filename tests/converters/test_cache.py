@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from converters import cache
-from converters.cache import StageCache, prune
+from converters.cache import KEEP_S, LIMIT_BYTES, StageCache, fingerprint, prune
 from converters.objects import Box, Hull
 from converters.raw import RawScene, ScanMesh
 
@@ -108,8 +108,50 @@ def test_the_oldest_entries_go_first(tmp_path):
         path = tmp_path / f"{k}.npz"
         path.write_bytes(b"x" * 100)
         os.utime(path, (k, k))
-    prune(tmp_path, 250)
+    prune(tmp_path, 250, KEEP_S + 5.0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["3.npz", "4.npz"]
+
+
+def test_what_was_used_within_the_hour_stays_whatever_its_size(tmp_path):
+    now = 10_000.0
+    for name, age_s in (("in_use", 5.0), ("unused", KEEP_S + 5.0), (".partial-01234567-new", 5.0)):
+        (tmp_path / f"{name}.npz").write_bytes(b"x" * 100)
+        os.utime(tmp_path / f"{name}.npz", (now - age_s, now - age_s))
+    prune(tmp_path, 0, now)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".partial-01234567-new.npz", "in_use.npz"]
+
+
+def test_what_a_killed_writer_left_goes_though_there_is_room(tmp_path):
+    for name in (".partial-01234567-stage.npz", "stage.npz"):
+        (tmp_path / name).write_bytes(b"x")
+        os.utime(tmp_path / name, (0, 0))
+    prune(tmp_path, LIMIT_BYTES, KEEP_S + 1.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["stage.npz"]
+
+
+def test_an_entry_that_vanishes_while_it_is_read_is_computed(tmp_path, monkeypatch):
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+
+    def gone(path, **_):
+        path.unlink()
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(cache.np, "load", gone)
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+    assert len(CALLS) == 2 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_fingerprint_follows_every_source_file_by_its_place(tmp_path):
+    (tmp_path / "mesh").mkdir()
+    (tmp_path / "mesh" / "cut.py").write_text("a = 1")
+    digests = [fingerprint(tmp_path)]
+    (tmp_path / "mesh" / "cut.py").write_text("a = 2")
+    fingerprint.cache_clear()
+    digests.append(fingerprint(tmp_path))
+    (tmp_path / "mesh").rename(tmp_path / "scan")
+    fingerprint.cache_clear()
+    digests.append(fingerprint(tmp_path))
+    assert len(set(digests)) == 3
 
 
 def test_what_cannot_be_hashed_is_refused(tmp_path):

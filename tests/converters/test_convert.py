@@ -176,10 +176,13 @@ def test_auto_align_adds_the_object_that_nobody_annotated(gibson_raw, tmp_path, 
 
 def test_convert_exits_one_when_a_gate_fails_and_keeps_the_scene(pristine, tmp_path, hull_cache, monkeypatch, capsys):
     monkeypatch.setitem(LIMITS, "walls", Limit("count", most=0))
+    monkeypatch.setattr("converters.gates.free_space_warnings", lambda maps: ("a room is cut off",))
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
     assert main(["convert", str(pristine / "gibson"), str(tmp_path / "out")]) == 1
-    assert "gates that fail: walls" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "gates that fail: walls" in printed and "warning: a room is cut off" in printed
     assert load_manifest(tmp_path / "out").gates["walls"]["passed"] is False
+    assert load_manifest(tmp_path / "out").warnings == ("a room is cut off",)
 
 
 def test_settling_parts_two_objects_that_overlap(tiny_scene):
@@ -196,7 +199,7 @@ def test_commands_and_their_exit_codes(tiny_scene, tmp_path, capsys):
     folder, _ = tiny_scene
     assert main(["check", str(folder)]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("PASS") == 16 and "FAIL" not in printed and "drift_hulls" in printed
+    assert printed.count("PASS") == len(LIMITS) and "FAIL" not in printed and "drift_hulls" in printed
     assert main(["preview", str(folder), "-o", str(tmp_path / "p.png")]) == 0
     assert min(Image.open(tmp_path / "p.png").size) > 300
     capsys.readouterr()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import trimesh
 from converters import decompose
 from converters.decompose import DecomposeConfig, content_key, decompose_all
 from converters.errors import StageFailed
+from converters.objects import convex_hull
 from tests.converters import tiny_raw
 
 CONFIG = DecomposeConfig()
@@ -50,6 +52,18 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
     monkeypatch.setattr(decompose, "_start", no_process)
     cached = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path).hulls
     assert len(cached["a"]) == len(cached["b"]) == len(first)
+
+
+def test_hulls_that_are_used_are_not_the_oldest(tmp_path):
+    vertices, faces = table()
+    path = tmp_path / f"{content_key(vertices, faces, CONFIG)}.npz"
+    decompose._store(path, (convex_hull(vertices),))
+    os.utime(path, (0, 0))
+    assert decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path).fallbacks == {}
+    assert path.stat().st_mtime > 0
+    os.utime(path, (0, 0))
+    decompose._store(tmp_path / "other.npz", (convex_hull(vertices),), limit_bytes=0)
+    assert [p.name for p in tmp_path.iterdir()] == ["other.npz"]  # hulls alone are kept within the limit, too
 
 
 def test_the_key_follows_content_and_parameters_only():

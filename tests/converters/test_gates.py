@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from converters.__main__ import main
+from converters.errors import StageFailed
 from converters.gates import (
     LIMITS,
     check_folder,
@@ -18,10 +20,12 @@ from converters.gates import (
     eroded,
     evaluate,
     free_space_values,
+    free_space_warnings,
     judge,
     physical_values,
 )
-from scenes_mjcf.schema import SceneMaps, load_maps
+from converters.settle import settle
+from scenes_mjcf.schema import SceneMaps, load_maps, save_maps
 
 
 def maps_of(traversable: np.ndarray) -> SceneMaps:
@@ -62,9 +66,23 @@ def test_free_space_of_two_rooms_and_a_slit():
     free[20:22, 60:70] = True  # a slit of 10 cm: too narrow for the disc
     values = free_space_values(maps_of(free))
     assert values["traversable_area"] == pytest.approx((40 * 60 + 40 * 30 + 20) * 0.0025)
-    # Eroded by 4 cells on each side: 32 x 52 and 32 x 22, and a few cells at the slit's mouths.
-    assert values["connected_share"] == pytest.approx(52 / 74, abs=0.002)
+    # The larger room but for 6 cells in each of two corners, and what the disc covers of the slit.
+    assert values["connected_share"] == pytest.approx((2400 - 12) / 3620, abs=0.003)
     assert values["start_goal"] == pytest.approx(np.hypot(31, 51) * 0.05)
+
+
+def test_a_piece_too_narrow_for_the_robot_counts_against_the_share_and_is_named():
+    free = np.zeros((40, 60), bool)
+    free[:20, :30] = True
+    free[20, :14] = True  # 614 cells
+    free[30:37, :27] = True  # 189, 35 cm wide
+    assert free.sum() == 614 + 189
+    share = free_space_values(maps_of(free))["connected_share"]
+    assert share == pytest.approx((600 - 4 * 3) / 803, abs=0.02) and not judge("connected_share", share).passed
+    (warning,) = free_space_warnings(maps_of(free))
+    assert warning.startswith("0.5 of 2.0 m2 of free floor cannot be reached")
+    assert free_space_warnings(maps_of(np.ones((20, 31), bool))) == ()  # corners are no piece
+    assert free_space_warnings(maps_of(np.ones((4, 40), bool)))[0].startswith("0.4 of 0.4 m2")
 
 
 @pytest.mark.parametrize(("shape", "farthest"), [((9, 40), 31 * 0.05), ((9, 9), 0.0), ((4, 40), 0.0)])
@@ -147,7 +165,21 @@ def test_a_model_that_diverges_is_not_finite(tiny_scene):
     assert "finite" in change(tiny_scene[0], fling)
 
 
-@pytest.mark.parametrize(("name", "value"), [("hulls_per_object", 17), ("hulls", 401), ("walls", 201), ("objects", -1)])
+@pytest.mark.parametrize("warning", ["BADQPOS", "BADQVEL", "BADQACC"])
+def test_a_simulation_that_mujoco_started_over_has_not_settled(tiny_scene, monkeypatch, warning):
+    step = mujoco.mj_step
+
+    def bad(model, data):
+        if data.time > 0.1 and not any(w.number for w in data.warning):
+            {"BADQPOS": data.qpos, "BADQVEL": data.qvel, "BADQACC": data.qfrc_applied}[warning][0] = np.nan
+        step(model, data)
+
+    monkeypatch.setattr(mujoco, "mj_step", bad)
+    with pytest.raises(StageFailed, match="settle: MuJoCo started the simulation over"):
+        settle(tiny_scene[1].settled.parts)
+
+
+@pytest.mark.parametrize(("name", "value"), [("hulls_per_object", 17), ("hulls", 401), ("walls", 201)])
 def test_the_counting_gates_fail_above_their_limits(name, value):
     assert not judge(name, value).passed
 
@@ -158,6 +190,19 @@ def test_split_free_space_fails_its_gate(tiny_scene):
     halves[:, halves.shape[1] // 2 - 2 : halves.shape[1] // 2 + 2] = False
     maps = dataclasses.replace(load_maps(folder), traversable=halves)
     assert failed(evaluate(spec_of(folder), maps, ("table_0", "basket_0"))) == {"connected_share"}
+
+
+def test_check_warns_of_floor_that_is_cut_off_and_names_a_damaged_map(tiny_scene, tmp_path, capsys):
+    folder = Path(shutil.copytree(tiny_scene[0], tmp_path / "scene"))
+    maps = load_maps(folder)
+    maps.traversable[:, maps.traversable.shape[1] // 4] = False
+    save_maps(maps, folder)
+    main(["check", str(folder)])
+    assert "warning: 1." in capsys.readouterr().out
+    (folder / "maps.npz").write_bytes((folder / "maps.npz").read_bytes()[:-30])
+    assert main(["check", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert "maps.npz: not readable (BadZipFile" in error and error.count("\n") == 1
 
 
 def test_a_missing_object_is_counted(tiny_scene):

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import shapely
 
 from converters.__main__ import main
-from converters.generate import Building, GenerationError, design_building
+from converters.generate import Building, GenerationError, design_building, recipes
 from converters.generate.cad import TEST_MODELS, TRAIN_MODELS
 from converters.generate.doors import wall_behind_m
 from converters.generate.furnish import SIDE_WALL_M
 from converters.generate.maps import clearance
 from converters.generate.recipes import load_recipes, make_scenes, parse_recipes
 from converters.generate.space import GRID_M, passes, room_mask, static_grid, without
+from interactive_nav_common.errors import FileError
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 TINY = """
@@ -87,14 +91,14 @@ def digest(folder: Path) -> dict[str, str]:
 def test_scenes_are_made_kept_and_made_again_with_the_same_bytes(tmp_path, hull_cache, monkeypatch):
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
     (tmp_path / "recipes.yaml").write_text(TINY)
-    recipes, lines, shares = load_recipes(tmp_path / "recipes.yaml"), [], []
-    failed = make_scenes(recipes, tmp_path, ("hut",), report=lambda _, s: shares.append(s), tell=lines.append)
+    tiny, lines, shares = load_recipes(tmp_path / "recipes.yaml"), [], []
+    failed = make_scenes(tiny, tmp_path, ("hut",), report=lambda _, s: shares.append(s), tell=lines.append)
     assert set(failed) == {"hut"} and shares[-1] == pytest.approx(1.0) and shares == sorted(shares)
     assert (tmp_path / "hut" / "preview.png").is_file() and not (tmp_path / "shed").exists()
     first = digest(tmp_path / "hut")
-    assert make_scenes(recipes, tmp_path, ("hut",), tell=lines.append) == {}
+    assert make_scenes(tiny, tmp_path, ("hut",), tell=lines.append) == {}
     assert lines[-1] == "hut: is there, kept"
-    make_scenes(recipes, tmp_path, ("hut",), overwrite=True)
+    make_scenes(tiny, tmp_path, ("hut",), overwrite=True)
     assert digest(tmp_path / "hut") == first
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
 
@@ -107,11 +111,95 @@ def test_an_interruption_leaves_the_old_scene_and_no_litter(tmp_path, monkeypatc
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("converters.generate.recipes.convert", stop)
+    monkeypatch.setattr(recipes, "convert", stop)
     with pytest.raises(KeyboardInterrupt):
         make_scenes(load_recipes(tmp_path / "recipes.yaml"), tmp_path, ("hut",), overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
     assert (tmp_path / "hut" / "scene.json").read_text() == "old"
+
+
+@pytest.fixture
+def quick(tmp_path, monkeypatch):
+    """A recipe folder in which generating, converting and drawing write one file each."""
+    (tmp_path / "recipes.yaml").write_text(TINY)
+
+    def generate(folder: Path, *_: object) -> None:
+        folder.mkdir()
+
+    def convert(_: Path, folder: Path, *__: object) -> SimpleNamespace:
+        folder.mkdir()
+        (folder / "scene.json").write_text("new")
+        return SimpleNamespace(gates=())
+
+    monkeypatch.setattr(recipes, "generate_building", generate)
+    monkeypatch.setattr(recipes, "convert", convert)
+    monkeypatch.setattr(recipes, "preview", lambda folder, target: target.write_text("drawn"))
+    return load_recipes(tmp_path / "recipes.yaml")
+
+
+def test_a_scene_that_cannot_be_put_in_place_leaves_the_old_one(tmp_path, quick, monkeypatch):
+    (tmp_path / "hut").mkdir()
+    (tmp_path / "hut" / "scene.json").write_text("old")
+    rename = Path.rename
+
+    def full(self: Path, target: Path) -> Path:
+        if self.name == "hut" and self.parent != tmp_path:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", full)
+    with pytest.raises(FileError, match="hut: cannot be written .No space left"):
+        make_scenes(quick, tmp_path, ("hut",), overwrite=True)
+    assert (tmp_path / "hut" / "scene.json").read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
+
+
+def test_what_a_killed_generator_left_goes_with_the_next(tmp_path, quick):
+    left = tmp_path / ".hut.part-7-01234567"
+    left.mkdir()
+    os.utime(left, (0, 0))
+    make_scenes(quick, tmp_path, ("hut",))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "words"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; "),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 2, "No space left on device; "),
+    ],
+)
+@pytest.mark.parametrize(
+    ("fails_at", "old", "written"),
+    [("hut", (), ""), ("shed", (), "hut"), ("shed", ("hut",), ""), ("shed", ("--overwrite", "hut"), "hut")],
+)
+def test_the_last_word_names_what_was_written(
+    tmp_path, quick, monkeypatch, capsys, failure, code, words, fails_at, old, written
+):
+    convert = recipes.convert
+
+    def fail(source: Path, folder: Path, *rest: object) -> object:
+        if folder.name == fails_at:
+            raise failure
+        return convert(source, folder, *rest)  # pyright: ignore
+
+    monkeypatch.setattr(recipes, "convert", fail)
+    for name in old[-1:]:
+        (tmp_path / name).mkdir()
+    assert main(["generate-scenes", str(tmp_path), *old[:-1]]) == code
+    told = f"written before: {tmp_path / written}" if written else "nothing was written"
+    assert capsys.readouterr().err.endswith(f"{words}{told}\n")
+
+
+def test_a_scene_that_another_generator_made_meanwhile_is_kept(tmp_path, quick):
+    lines: list[str] = []
+
+    def tell(line: str) -> None:
+        lines.append(line)
+        (tmp_path / "shed").mkdir(exist_ok=True)  # while the first is made
+
+    assert set(make_scenes(quick, tmp_path, tell=tell)) == {"hut"}
+    assert lines[-1] == "shed: is there, kept" and list((tmp_path / "shed").iterdir()) == []
 
 
 RECIPES = {r.name: r for r in load_recipes(SCENES / "recipes.yaml").scenes if r.name != "apartment_0"}

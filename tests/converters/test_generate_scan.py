@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from converters.generate import BuildingConfig, GenerationError, design_building
 from converters.generate.annotate import SCAN_TO_WORLD, pose_in_world
 from converters.generate.scan import NYU40, building_solids, nearest_solids, seen_from
 from converters.generate.volume import fuse, solid_from_box
+from interactive_nav_common.errors import FileError
 
 SEED = 3
 TINY = BuildingConfig(
@@ -278,6 +280,20 @@ def test_a_taken_folder_is_left_alone(tmp_path):
     with pytest.raises(GenerationError, match="not an empty folder"):
         generate_building(tmp_path / "home", 1, config=TINY)
     assert (tmp_path / "home" / "note.txt").read_text() == "mine"
+
+
+def test_a_folder_that_was_filled_meanwhile_is_left_alone_and_litter_goes(tmp_path, monkeypatch):
+    def fill(*args, **kwargs):
+        (tmp_path / "home").mkdir()
+        (tmp_path / "home" / "note.txt").write_text("mine")
+
+    left = tmp_path / ".home.part-7-01234567"  # of a process that was killed
+    left.mkdir()
+    os.utime(left, (0, 0))
+    monkeypatch.setattr(generate, "_write", fill)
+    with pytest.raises(FileError, match="home: exists already"):
+        generate_building(tmp_path / "home", 1, config=TINY)
+    assert [p.name for p in tmp_path.rglob("*")] == ["home", "note.txt"]
 
 
 def test_a_file_in_the_way_is_named(tmp_path):

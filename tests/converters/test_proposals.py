@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -216,6 +218,21 @@ def test_propose_writes_json_and_picture_and_prints_the_comparison(scan2cad_raw,
     assert data[0]["n_aligned_models"] == len(data[0]["aligned_models"]) == 2
     assert all(0 < m["proposal"]["confidence"] <= 1 and m["id_cad"] for m in data[0]["aligned_models"])
     assert min(Image.open(tmp_path / "p" / "proposals.png").size) > 500
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
+def test_what_fails_while_drawing_leaves_the_older_files(scan2cad_raw, tmp_path, monkeypatch, capsys, failure):
+    for name in ("proposals.json", "proposals.png"):
+        (tmp_path / name).write_text("older")
+
+    def fail(*_):
+        raise failure
+
+    monkeypatch.setattr("converters.propose._draw", fail)
+    assert main(["propose", str(scan2cad_raw), "-o", str(tmp_path)]) == (130 if failure.args == () else 2)
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [(tmp_path / name).read_text() for name in ("proposals.json", "proposals.png")] == ["older", "older"]
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_propose_refuses_a_scan_without_furniture_labels(gibson_raw, tmp_path, capsys):

@@ -12,6 +12,7 @@ from converters.errors import SceneRejected
 from converters.gibson import read_gibson
 from converters.pipeline import ConvertConfig, convert, convert_building
 from converters.storeys import split_storeys, storey_of
+from interactive_nav_common.errors import FileError
 from scenes_mjcf.schema import load_manifest, load_maps
 from tests.converters import tiny_raw
 
@@ -64,7 +65,7 @@ def test_a_building_becomes_one_folder_a_floor(two_floors, tmp_path, hull_cache)
         assert maps.floor_height_m == height
         # Upstairs the table is not annotated: its legs stay obstacles.
         assert 2.85 * 2.35 - 0.6 * k <= maps.traversable.sum() * 0.05**2 <= 3.0 * 2.5
-    with pytest.raises(SceneRejected, match="home_0: exists already"):
+    with pytest.raises(FileError, match="home_0: exists already"):
         convert_building(two_floors, tmp_path / "home", SMALL, cache=hull_cache)
     with pytest.raises(SceneRejected, match="has 2 floors, expected 1; use convert_building"):
         convert(two_floors, tmp_path / "flat", SMALL, cache=hull_cache)

@@ -45,6 +45,59 @@ def test_publishing_is_all_or_nothing(tmp_path, monkeypatch):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["t0", "t1"] and (targets[1] / "file").read_text() == "1"
 
 
+def folder_of(path: Path, text: str) -> Path:
+    path.mkdir()
+    (path / "file").write_text(text)
+    return path
+
+
+def test_two_writers_that_may_not_replace_leave_the_first_ones(tmp_path):
+    first, second, target = folder_of(tmp_path / "a", "first"), folder_of(tmp_path / "b", "second"), tmp_path / "t"
+    publish({first: target}, overwrite=False)
+    with pytest.raises(FileError, match="t: exists already"):
+        publish({second: target}, overwrite=False)
+    assert (target / "file").read_text() == "first"
+    with pytest.raises(FileError, match="made: exists already"), whole_folder(tmp_path / "made"):
+        folder_of(tmp_path / "made", "somebody else's")
+    assert (tmp_path / "made" / "file").read_text() == "somebody else's"
+    (tmp_path / "empty").mkdir()
+    publish({second: tmp_path / "empty"}, overwrite=False)
+    assert (tmp_path / "empty" / "file").read_text() == "second"
+
+
+def test_of_two_that_replace_at_once_the_last_stands_whole(tmp_path, monkeypatch):
+    mine, other, target = (folder_of(tmp_path / name, name) for name in ("mine", "other", "old"))
+    rename = Path.rename
+
+    def between(self, to):
+        result = rename(self, to)
+        if self == target and other.exists():
+            rename(other, target)  # the other one's, while the older is moved aside
+        return result
+
+    monkeypatch.setattr(Path, "rename", between)
+    publish({mine: target})
+    assert (target / "file").read_text() == "mine" and [p.name for p in tmp_path.iterdir()] == ["old"]
+
+
+def test_a_failing_writer_leaves_what_another_has_put_there(tmp_path, monkeypatch):
+    mine, other, target = (folder_of(tmp_path / name, name) for name in ("mine", "other", "old"))
+    rename = Path.rename
+
+    def failing(self, to):
+        if self == mine and not other.exists():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        result = rename(self, to)
+        if self == target and other.exists():
+            rename(other, target)
+        return result
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(FileError, match="No space left"):
+        publish({mine: target})
+    assert (target / "file").read_text() == "other"
+
+
 def test_a_signal_waits_for_the_renames(tmp_path, monkeypatch):
     (tmp_path / "part").mkdir()
     rename = Path.rename
