@@ -25,13 +25,14 @@ from converters.errors import SceneRejected
 from converters.files import SourceFolder
 from converters.gates import collide_with, physical_values
 from converters.manifest import PACKAGES
+from converters.meshes import colours_of_faces, read_surface
 from converters.obj import TexturedMesh
 from converters.objects import Hull, PlacedObject, convex_hull, fit_box, rotation_of
 from converters.physical import MATERIALS, Physical
 from converters.raw import ScanMesh
 from converters.settle import settle
 from converters.texture import VisualMesh, bake_object, colour_cloud
-from converters.urdf import RigidObject, colours_of_faces, read_surface, read_urdf
+from converters.urdf import RigidObject, read_urdf
 from interactive_nav_common.files import whole_folder
 from scenes_mjcf.schema import CATEGORIES
 
@@ -47,11 +48,11 @@ WORDS = {
     "door": ("door",),
 }
 """Category -> words that tell it in a name."""
-DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0}
+DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0, "other": 300.0}
 """Of the hulls, for meshes without a mass: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm
-0.7 kg in 0.8 dm3, a plastic toy is mostly hollow. Furniture has `converters.physical.MATERIALS`."""
-FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4}
-"""Sliding coefficients on a floor: rubber soles, clay, plastic."""
+0.7 kg in 0.8 dm3, a plastic toy is mostly hollow; other things lie between. Furniture has `converters.physical.MATERIALS`."""
+FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4, "other": 0.5}
+"""Sliding coefficients on a floor: rubber soles, clay, plastic, anything."""
 FOOT_SHARE = 0.03
 """Of the height: what ends within this above the base is brought down to it. Collision meshes come from voxels, and
 a pot on unequal hulls rests tilted."""
@@ -64,7 +65,7 @@ class ObjectConfig:
     """Choices of one object."""
 
     category: str | None = None
-    """One of `CATEGORIES`; None: told from the name."""
+    """One of `CATEGORIES`; None: told from the name, `other` where it tells nothing."""
     mass_kg: float | None = None
     friction: float | None = None
     scale: float = 1.0
@@ -84,10 +85,11 @@ def guess_category(*names: str) -> str | None:
     return max(found)[1] if found else None
 
 
-def _category(config: ObjectConfig, names: tuple[str, ...], path: Path) -> str:
+def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder) -> str:
     category = config.category or guess_category(*names)
     if category is None:
-        raise SceneRejected(f"{path}: its name tells no category; add --category with one of {', '.join(CATEGORIES)}")
+        source.note(f"the name {names[0]} tells no category: it is 'other', unless --category says so")
+        return "other"
     if category not in CATEGORIES:
         raise SceneRejected(f"category is '{category}', expected one of {', '.join(CATEGORIES)}")
     return category
@@ -185,7 +187,7 @@ def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path |
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")
     with whole_folder(target, config.overwrite) as folder:
         item, source = read_object(path, config)
-        category = _category(config, (item.name, path.stem), path)
+        category = _category(config, (item.name, path.stem), source)
         low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
         if not 0.005 < (high - low).max() < 10.0:
             raise SceneRejected(

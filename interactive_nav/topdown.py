@@ -44,8 +44,7 @@ def outlines(replay: Replay, scene: Scene) -> dict[str, tuple[str, np.ndarray]]:
     """Boxes of everything movable: body name -> (category, [n, 10] centre, quaternion, half sizes, body frame)."""
     found = {m.name: (m.category, m.boxes) for m in scene.movables}
     for i, obj in enumerate(pick(replay.num_objects)):
-        rows = [[*box.centre_m, 1.0, 0.0, 0.0, 0.0, *box.half_m] for box in obj.boxes]
-        found[f"{obj.category}_small_{i}"] = (obj.category, np.asarray(rows))
+        found[f"{obj.category}_small_{i}"] = (obj.category, obj.rows)
     return found
 
 

@@ -35,6 +35,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "shoe": (0.80, 0.28, 0.30),
     "pot": (0.55, 0.34, 0.56),
     "toy": (0.93, 0.78, 0.24),
+    "other": (0.60, 0.60, 0.60),
 }
 """RGB in [0, 1] by class, in colour and mask pictures alike."""
 CLASSES = tuple(COLOURS)

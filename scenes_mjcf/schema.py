@@ -18,7 +18,7 @@ import numpy as np
 from interactive_nav_common.errors import UserError
 
 SCHEMA_VERSION = 1
-CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy")
+CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy", "other")
 SPLITS = ("train", "test")
 
 
