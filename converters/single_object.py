@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import re
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ WORDS = {
 """Category -> words that tell it in a name."""
 DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0, "other": 300.0}
 """Of the hulls, for meshes without a mass: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm
-0.7 kg in 0.8 dm3, a plastic toy is mostly hollow; other things lie between. Furniture has `converters.physical.MATERIALS`."""
+0.7 kg in 0.8 dm3, a plastic toy is mostly hollow; other things lie between.
+Furniture has `converters.physical.MATERIALS`."""
 FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4, "other": 0.5}
 """Sliding coefficients on a floor: rubber soles, clay, plastic, anything."""
 FOOT_SHARE = 0.03
@@ -73,6 +75,8 @@ class ObjectConfig:
     seed: int = 0
     """Seed of coacd's search."""
     overwrite: bool = False
+    source: Path | None = None
+    """Folder that the files which the model names must lie in; None: the model's own."""
     strict: bool = False
     """Refuse what would be repaired with a warning."""
     timeout_s: float = 240.0
@@ -105,11 +109,12 @@ def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFo
     Raises:
         SceneRejected: missing, damaged or empty file, or no rigid object.
     """
-    source = SourceFolder(path.parent, config.strict)
+    source = SourceFolder(config.source or path.parent, config.strict)
+    relative = source.inside(path)
     if path.suffix.lower() == ".urdf":
-        item = read_urdf(source, path.name, "give a mesh or a URDF")
+        item = read_urdf(source, relative, "give a mesh or a URDF")
     else:
-        surface = read_surface(source, path.name, "give a mesh or a URDF")
+        surface = read_surface(source, relative, "give a mesh or a URDF")
         item = RigidObject(path.stem, surface, None, (surface.vertices, surface.faces), None, None)
     turn = config.scale * (Y_UP_TO_Z_UP if config.up == "y" else np.eye(3))
     pieces = None if item.pieces is None else tuple((v @ turn.T, f) for v, f in item.pieces)
@@ -164,7 +169,13 @@ def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMe
     return bake_object(vertices, faces, colours, cloud, FACES, TEXELS)[0]
 
 
-def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path | None = None) -> dict[str, Any]:
+def convert_object(
+    path: Path,
+    target: Path,
+    config: ObjectConfig,
+    cache: Path | None = None,
+    warn: Callable[[str], None] = lambda warning: None,
+) -> dict[str, Any]:
     """Converts one mesh or URDF; `target` appears whole or not at all.
 
     The URDF's mass, friction and collision mesh are used; its inertia is not (released ones are placeholders): it
@@ -175,6 +186,7 @@ def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path |
         target: folder to make: `object.xml`, `object.json`, `assets/`.
         config: choices; they win over the URDF's values.
         cache: folder of hulls by content; default `cache_folder()`.
+        warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
 
     Returns:
         The content of `object.json`.
@@ -188,6 +200,8 @@ def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path |
     with whole_folder(target, config.overwrite) as folder:
         item, source = read_object(path, config)
         category = _category(config, (item.name, path.stem), source)
+        for warning in source.warnings:
+            warn(warning)
         low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
         if not 0.005 < (high - low).max() < 10.0:
             raise SceneRejected(

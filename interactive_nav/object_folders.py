@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from interactive_nav.config import NavConfig
 from interactive_nav.objects import Box, SmallObject, pick
 from interactive_nav.scene import Movable, read_movable
 from scenes_mjcf.schema import CATEGORIES, SceneError
@@ -28,16 +28,21 @@ class ConvertedObject(SmallObject):
     """Its body in the same frame: mass properties and hulls as converted."""
 
 
-def small_objects(config: NavConfig) -> tuple[SmallObject, ...]:
+def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple[SmallObject, ...]:
     """The small objects of an environment: the folders in turn where there are some, else the built-in ones.
+
+    Args:
+        num_objects: how many.
+        split: whose built-in models, train or test.
+        folders: of `NavConfig.objects`.
 
     Raises:
         SceneError: a folder that is no object.
     """
-    if not config.objects:
-        return pick(config.num_objects, config.small_objects)
-    models = [load_object(folder) for folder in config.objects]
-    return tuple(models[i % len(models)] for i in range(config.num_objects))
+    if not folders:
+        return pick(num_objects, split)
+    models = [load_object(folder) for folder in folders]
+    return tuple(models[i % len(models)] for i in range(num_objects))
 
 
 def load_object(folder: str | Path) -> ConvertedObject:

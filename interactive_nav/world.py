@@ -453,7 +453,7 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
             f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
             "use collision='boxes'"
         )
-    small = small_objects(config)
+    small = small_objects(config.num_objects, config.small_objects, config.objects)
     specs, models, slots = [], [], []
     for i in range(len(scenes)):
         spec, slots = _build_spec(robot, i, scenes, small, config)
