@@ -60,7 +60,7 @@ def draw_object(folder: Path) -> Figure:
     image = read_image(folder / "assets" / f"{name}.png", "RGB")
     scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
     size_m = float(np.ptp(vertices, axis=0).max())
-    cloud = colour_cloud(scan, vertices @ turn.T + origin, faces, np.arange(len(faces)), 0.5 * size_m / PIXELS)
+    cloud = colour_cloud(scan, vertices @ turn.T + origin, faces, np.arange(len(faces)), 0.9 * size_m / PIXELS)
     figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
     for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
         points = cloud.points @ axes_w.T
