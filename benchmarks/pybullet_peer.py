@@ -60,7 +60,7 @@ class BulletScene:
         for k, (name, kind, at) in enumerate(zip(world.names[0], layout.slot_kind, layout.slot_qpos, strict=True)):
             if kind == "small":
                 obj = world.small_objects[k]
-                boxes = np.array([[*b.centre_m, 1, 0, 0, 0, *b.half_m] for b in obj.boxes])
+                boxes = obj.rows
                 mass, friction = obj.mass_kg, obj.friction
                 pos, quat = qpos[at : at + 3], qpos[at + 3 : at + 7]
             elif name:

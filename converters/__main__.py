@@ -57,6 +57,18 @@ def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
+def _warn_once(console: Console) -> Callable[[str], None]:
+    """Prints a warning unless it has been printed before: most come while reading, and all again with the result."""
+    printed: set[str] = set()
+
+    def warn(warning: str) -> None:
+        if warning not in printed:
+            printed.add(warning)
+            console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+
+    return warn
+
+
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import ConvertConfig, convert_building
 
@@ -71,14 +83,15 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         strict=arguments.strict,
         timeout_s=arguments.timeout,
     )
+    warn = _warn_once(console)
     with _progress(console) as report:
-        results = convert_building(arguments.source, arguments.out, config, report)
+        results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
     for result in results:
         if any(row.get("n_keypoints") for row in result.manifest.alignment):
             console.print(alignment_table(result.manifest.alignment))
         console.print(gate_table(result.gates))
         for warning in result.manifest.warnings:
-            console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+            warn(warning)
     times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
     console.print(f"Seconds: {times}", soft_wrap=True)
     for result in results:
@@ -106,12 +119,14 @@ def _object(arguments: argparse.Namespace, console: Console) -> int:
         up=arguments.up,
         seed=arguments.seed,
         overwrite=arguments.overwrite,
+        source=arguments.within,
         strict=arguments.strict,
         timeout_s=arguments.timeout,
     )
-    made = convert_object(arguments.source, arguments.out, config)
+    warn = _warn_once(console)
+    made = convert_object(arguments.source, arguments.out, config, warn=warn)
     for warning in made["warnings"]:
-        console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+        warn(warning)
     size = " x ".join(f"{100 * v:.1f}" for v in made["size_m"])
     console.print(
         f"{arguments.out}: {made['category']}, {made['mass_kg']:.3f} kg ({made['mass_source']}), {size} cm, "
@@ -266,7 +281,7 @@ def _parser() -> argparse.ArgumentParser:
         "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"
     )
     single.add_argument("out", type=Path, metavar="OUT", help="folder to make; its name becomes the body's")
-    single.add_argument("--category", choices=CATEGORIES, help="default: told from the file's name")
+    single.add_argument("--category", choices=CATEGORIES, help="default: told from the file's name, else other")
     single.add_argument(
         "--mass", type=_positive_number, metavar="KG", help="default: the URDF's, else density x volume"
     )
@@ -274,7 +289,12 @@ def _parser() -> argparse.ArgumentParser:
         "--friction", type=_positive_number, metavar="MU", help="default: the URDF's, else the category's"
     )
     single.add_argument("--scale", type=_positive_number, default=1.0, help="of a mesh that is not in metres")
-    single.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up (default z)")
+    single.add_argument(
+        "--up", choices=("z", "y"), default="z", help="axis of the mesh that points up (default z; DAE says it itself)"
+    )
+    single.add_argument(
+        "--within", type=Path, metavar="DIR", help="folder that textures are read from (default: the model's own)"
+    )
     _add_decompose_options(single)
     single.set_defaults(run=_object, writes=("{}",))
     check = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
@@ -294,7 +314,7 @@ def _parser() -> argparse.ArgumentParser:
     scenes.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N")
     scenes.set_defaults(run=_generate_scenes, writes=("{}/*",))
     preview = commands.add_parser("preview", help="draw a conversion's stages from above")
-    preview.add_argument("scene", type=Path, metavar="SCENE_DIR")
+    preview.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
     preview.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
     preview.add_argument("--source", type=Path, metavar="SRC", help="raw folder: draws scan and cut too")
     preview.set_defaults(run=_preview, writes=("{}",))

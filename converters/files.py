@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,12 @@ class SourceFolder:
         """Path of a file that must exist; its hash goes into the record.
 
         Raises:
-            SceneRejected: missing or unreadable; `remedy` ends the message.
+            SceneRejected: missing (`remedy` ends the message), unreadable, or a link out of the folder.
         """
         path = self.root / relative
-        if not path.is_file():
+        if os.path.isfile(path) or path.is_symlink():
+            self.inside(path)
+        if not os.path.isfile(path):
             raise SceneRejected(f"{path}: no such file; {remedy}")
         try:
             self.sha256[relative] = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -51,9 +54,23 @@ class SourceFolder:
     def relative(self, path: Path) -> str | None:
         """The path relative to the folder, or None where it leads out of it."""
         try:
-            return path.resolve().relative_to(self.root.resolve()).as_posix()
-        except (ValueError, OSError):  # outside, or no path at all (a NUL byte, a loop of links)
+            return self.inside(path)
+        except SceneRejected:
             return None
+
+    def inside(self, path: Path) -> str:
+        """The path relative to the folder, links followed.
+
+        Raises:
+            SceneRejected: it leads out of the folder, or it is no path at all (a NUL byte, a loop of links).
+        """
+        try:
+            end = path.resolve()
+        except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
+            raise SceneRejected(f"{path}: leads nowhere ({error}); put the file itself there") from error
+        if not end.is_relative_to(self.root.resolve()):
+            raise SceneRejected(f"{path}: leads out of the source folder, to {end}; put a copy of the file there")
+        return end.relative_to(self.root.resolve()).as_posix()
 
     def note(self, message: str) -> None:
         """Records something the user should know; it goes into scene.json, so it names no absolute path."""
@@ -187,7 +204,7 @@ def read_obj(path: Path) -> ObjMesh:
     libraries: list[str] = []
     current = -1
     try:
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
             if line.startswith("v "):
                 positions.extend(line.split()[1:4])
                 if len(positions) % 3:

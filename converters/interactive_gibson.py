@@ -21,12 +21,13 @@ from converters.errors import SceneRejected
 from converters.files import SourceFolder
 from converters.gibson import building, read_floors, read_traversable
 from converters.maps import sample_faces
+from converters.meshes import colours_of_faces
 from converters.obj import TexturedMesh, join_meshes, read_scan_obj
 from converters.objects import upright_box
 from converters.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, Hinge, RawScene
 from converters.storeys import label_storeys
 from converters.surfaces import check_upright
-from converters.urdf import colours_of_faces, read_urdf
+from converters.urdf import read_urdf
 
 MESH = "mesh_z_up_cleaned.obj"
 PREFIX = "alignment_centered"

@@ -7,13 +7,15 @@ missing costs colour only and is a warning.
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from PIL import Image
 
 from converters.errors import SceneRejected
-from converters.files import SourceFolder, read_image, read_obj
+from converters.files import ObjMesh, SourceFolder, read_image, read_obj
 
 GREY = (170, 170, 170)
 """Colour of what has none."""
@@ -36,29 +38,43 @@ class TexturedMesh:
 
 
 def find_file(source: SourceFolder, folder: Path, name: str) -> Path | None:
-    """The file that an OBJ or MTL names, sought also by its bare name (paths of another machine, letter case)."""
-    words = name.strip().strip('"')
+    """The file that a model names, sought also by its bare name (paths of another machine, letter case).
+
+    Raises:
+        SceneRejected: what stands under that name is a link that leads out of the source or nowhere.
+    """
+    words = name.strip().strip('"').removeprefix("file://")
     bare = words.replace("\\", "/")
-    for candidate in (bare, bare.split()[-1] if bare.split() else bare):
+    names = dict.fromkeys(n for n in (bare, bare.split()[-1] if bare.split() else bare, unquote(bare)) if n)
+    for candidate in names:
         path = folder / candidate
-        if source.relative(path) is not None and path.is_file():
+        if _is_there(path) and Path(os.path.abspath(path)).is_relative_to(os.path.abspath(source.root)):
+            source.inside(path)
             return path
-    wanted = {w.rsplit("/", 1)[-1].lower() for w in (bare, bare.split()[-1] if bare.split() else bare)}
+    wanted = {n.rsplit("/", 1)[-1].lower() for n in names}
     for path in sorted(folder.iterdir()):
-        if path.name.lower() in wanted and path.is_file():
+        if path.name.lower() in wanted and _is_there(path):
+            source.inside(path)
             return path
     return None
 
 
-def _use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | None:
-    """The named file with its hash recorded; a warning where it stands under another name than the given one."""
+def _is_there(path: Path) -> bool:
+    """A file or a link, a broken one too."""
+    return os.path.isfile(path) or os.path.islink(path)
+
+
+def use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | None:
+    """The named file with its hash recorded; a warning where it stands under another name than the given one.
+
+    Raises:
+        SceneRejected: a link that leads out of the source or nowhere.
+    """
     found = find_file(source, folder, name)
     if found is None:
         return None
-    relative = source.relative(found)
-    if relative is None:
-        return None
-    if source.relative(folder / name.strip()) != relative:
+    relative = source.inside(found)
+    if source.relative(folder / unquote(name.strip())) != relative:
         source.repaired(f"{by}: names '{name.strip()}', which is not there; {relative} is taken")
     return source.use(relative, "")
 
@@ -75,7 +91,7 @@ def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) 
         Material -> (h, w, 3) uint8; (1, 1, 3) for a plain colour.
     """
     where = source.relative(obj) or obj.name
-    found = [_use_found(source, obj.parent, name, where) for name in libraries]
+    found = [use_found(source, obj.parent, name, where) for name in libraries]
     paths = [p for p in found if p is not None]
     if not paths and obj.with_suffix(".mtl").is_file():
         paths = [source.use(source.relative(obj.with_suffix(".mtl")) or "", "")]
@@ -88,16 +104,22 @@ def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) 
         for name, (colour, image_name) in parse_mtl(path.read_text(encoding="utf-8", errors="replace")).items():
             result[name] = np.array(colour, np.uint8).reshape(1, 1, 3)
             if image_name:
-                image = _texture(source, path, image_name)
+                image = read_texture(source, path, image_name)
                 result[name] = result[name] if image is None else image
     return result
 
 
-def _texture(source: SourceFolder, mtl: Path, name: str) -> np.ndarray | None:
-    where = source.relative(mtl) or mtl.name
-    path = _use_found(source, mtl.parent, name, where)
+def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None:
+    """The image (h, w, 3) uint8 that a material file or model names; None and a warning where there is none.
+
+    Raises:
+        SceneRejected: a link that leads out of the source or nowhere; with a strict source, no readable image.
+    """
+    where = source.relative(by) or by.name
+    path = use_found(source, by.parent, name, where)
     if path is None:
-        source.repaired(f"{where}: names the texture '{name}', which is missing; the material's plain colour is taken")
+        lack = "lies outside of the source folder" if os.path.isfile(by.parent / name) else "is missing"
+        source.repaired(f"{where}: names the texture '{name}', which {lack}; the material's plain colour is taken")
         return None
     try:
         return read_image(path, "RGB")
@@ -129,26 +151,25 @@ def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
     return result
 
 
-def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
-    """Reads an OBJ with all its materials, their textures joined in one image.
+def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
+    """Reads an OBJ with all its materials.
 
     Args:
         source: the folder; takes hashes and warnings.
         relative: path of the OBJ in it.
         remedy: ends the message where the file is missing.
 
+    Returns:
+        The mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
+
     Raises:
-        SceneRejected: missing or damaged OBJ.
+        SceneRejected: missing or damaged OBJ, or a link that leads out of the source.
     """
     path = source.use(relative, remedy)
     mesh = read_obj(path)
-    if mesh.corner_uv is None:
-        if not mesh.libraries:
-            source.note(f"{relative}: has no texture; it stays grey")
-            return TexturedMesh(mesh.vertices, mesh.faces, None, None)
-        uv = np.zeros((len(mesh.faces), 3, 2))
-    else:
-        uv = mesh.corner_uv
+    if mesh.corner_uv is None and not mesh.libraries:
+        source.note(f"{relative}: has no texture; it stays grey")
+        return mesh, np.zeros(len(mesh.faces), np.int64), []
     images = read_materials(source, path, mesh.libraries)
     grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
     chosen = [images.get(name, grey) for name in mesh.materials]
@@ -161,7 +182,25 @@ def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedM
         only = next(iter(images.values())) if len(images) == 1 else grey
         number[number < 0] = len(chosen)
         chosen.append(only)
-    return TexturedMesh(mesh.vertices, mesh.faces, *join_textures(uv, number, chosen))
+    return mesh, number, chosen
+
+
+def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
+    """Reads an OBJ with all its materials, their textures joined in one image; arguments as `read_painted_obj`."""
+    mesh, number, images = read_painted_obj(source, relative, remedy)
+    if not images:
+        return TexturedMesh(mesh.vertices, mesh.faces, None, None)
+    uv = mesh.corner_uv if mesh.corner_uv is not None else np.zeros((len(mesh.faces), 3, 2))
+    return TexturedMesh(mesh.vertices, mesh.faces, *join_textures(uv, number, images))
+
+
+def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(n, 3) uint8 of an image (h, w, 3) at texture coordinates (n, 2); it repeats outside [0, 1]."""
+    height, width = image.shape[:2]
+    u, v = (uv % 1.0).T
+    return image[
+        np.clip(((1.0 - v) * height).astype(int), 0, height - 1), np.clip((u * width).astype(int), 0, width - 1)
+    ]
 
 
 def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -337,7 +337,12 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
 
 
 def convert_building(
-    source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
+    source: Path,
+    target: Path,
+    config: ConvertConfig,
+    report: Report | None = None,
+    cache: Path | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> tuple[Converted, ...]:
     """Converts one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
 
@@ -348,6 +353,7 @@ def convert_building(
         config: choices.
         report: progress callback.
         cache: folder of hulls and stage results by content; default `cache_folder()`.
+        warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
 
     Raises:
         SceneRejected: bad input.
@@ -355,7 +361,7 @@ def convert_building(
         FileError: `target` exists already (`overwrite`), or cannot be written.
         OSError: the disk is full or gone.
     """
-    return _convert(source, target, config, report, cache, None)
+    return _convert(source, target, config, report, cache, None, warn)
 
 
 def convert(
@@ -370,7 +376,13 @@ def convert(
 
 
 def _convert(
-    source: Path, target: Path, config: ConvertConfig, report: Report | None, cache: Path | None, floors: int | None
+    source: Path,
+    target: Path,
+    config: ConvertConfig,
+    report: Report | None,
+    cache: Path | None,
+    floors: int | None,
+    warn: Callable[[str], None] | None = None,
 ) -> tuple[Converted, ...]:
     clock = _Clock(report or (lambda stage, share: None))
     with contextlib.ExitStack() as stack:
@@ -379,6 +391,9 @@ def _convert(
         with clock.stage("read"):
             raw = dataclasses.replace(read_source(source, config.format, config.strict), name=target.name)
             scenes = split_storeys(raw)
+        if warn is not None:
+            for warning in raw.warnings:
+                warn(warning)
         if config.auto_align and config.library is None:
             config = dataclasses.replace(config, library=source)
         if floors is not None and len(scenes) != floors:

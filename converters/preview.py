@@ -25,6 +25,7 @@ from scipy.spatial import ConvexHull
 from converters.cut import cut_furniture
 from converters.emit import CATEGORY_COLOURS
 from converters.files import read_image, read_textured_obj
+from converters.object_preview import draw_object, view
 from converters.objects import PlacedObject, convex_hull
 from converters.raw import RawScene, ScanMesh
 from converters.texture import ColourCloud, colour_cloud
@@ -71,19 +72,6 @@ def _coloured_points(folder: Path, stem: str, spacing_m: float) -> tuple[np.ndar
     scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
     cloud = colour_cloud(scan, vertices, faces, np.arange(len(faces)), spacing_m)
     return cloud.points, cloud.colours.astype(np.uint8)
-
-
-def _view_from_above(
-    points: np.ndarray, colours: np.ndarray, low: np.ndarray, shape: tuple[int, int], pixel_m: float
-) -> np.ndarray:
-    """(rows, columns, 3) uint8 view from above: the highest point of a pixel shows; white without any."""
-    index = np.floor((points[:, :2] - low) / pixel_m).astype(int)
-    inside = (index >= 0).all(axis=1) & (index[:, 0] < shape[1]) & (index[:, 1] < shape[0])
-    flat = index[inside, 1] * shape[1] + index[inside, 0]
-    order = np.argsort(points[inside, 2], kind="stable")
-    image = np.full((shape[0] * shape[1], 3), 255, np.uint8)
-    image[flat[order]] = colours[inside][order]  # later (higher) points overwrite earlier ones
-    return image.reshape(*shape, 3)
 
 
 def _palette(views: list[np.ndarray]) -> Image.Image:
@@ -137,9 +125,9 @@ def _draw_surface(axes: Axes, scene: _Scene, sample: Callable[[float], list[Colo
     clouds = sample(0.9 * pixel_m)
     shape = (int(np.ceil(size_m[1] / pixel_m)), int(np.ceil(size_m[0] / pixel_m)))
     points, colours = np.vstack([c.points for c in clouds]), np.vstack([c.colours for c in clouds])
-    view = _view_from_above(points, colours.astype(np.uint8), low, shape, pixel_m)
+    seen = view(points, colours.astype(np.uint8), low, shape, pixel_m)
     extent = (low[0], low[0] + shape[1] * pixel_m, low[1], low[1] + shape[0] * pixel_m)
-    axes.imshow(view, origin="lower", extent=extent, interpolation="nearest")
+    axes.imshow(seen, origin="lower", extent=extent, interpolation="nearest")
     _frame(axes, scene, title)
 
 
@@ -292,18 +280,28 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
-    """Draws a scene folder into a PNG of few colours, whole or not at all.
+    """Draws a scene or object folder into a PNG of few colours, whole or not at all.
 
     Args:
-        folder: of the scene.
+        folder: of the scene, or of an object made by `python -m converters object`.
         target: the PNG.
-        source: the raw folder it was made from: scan and cut are drawn too.
+        source: the raw folder that a scene was made from: scan and cut are drawn too.
 
     Raises:
-        SceneError: the folder is not a readable scene, or the source is another building's.
+        SceneError: the folder is not a readable scene or object, or the source is another building's.
         FileError: the picture cannot be written.
         SceneRejected: the source is unusable.
     """
+    if not target.parent.is_dir():
+        raise SceneError(f"{target.parent}: no such folder; give another -o")
+    if (folder / "object.json").is_file():
+        if source is not None:
+            raise SceneError(f"{folder}: is a single object, which has no scan to draw; leave --source out")
+        figure = draw_object(folder)
+        with whole_file(target) as picture:
+            figure.savefig(picture, format="png", metadata={"Software": None})
+        plt.close(figure)
+        return
     manifest, maps = load_manifest(folder), load_maps(folder)
     try:
         model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
@@ -314,8 +312,6 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
             raise SceneError(
                 f"{folder / 'scene.xml'}: no body named '{item.name}', which scene.json lists; convert the scene again"
             )
-    if not target.parent.is_dir():
-        raise SceneError(f"{target.parent}: no such folder; give another -o")
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import re
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,14 @@ from converters.errors import SceneRejected
 from converters.files import SourceFolder
 from converters.gates import collide_with, physical_values
 from converters.manifest import PACKAGES
+from converters.meshes import colours_of_faces, read_surface
 from converters.obj import TexturedMesh
 from converters.objects import Hull, PlacedObject, convex_hull, fit_box, rotation_of
 from converters.physical import MATERIALS, Physical
 from converters.raw import ScanMesh
 from converters.settle import settle
 from converters.texture import VisualMesh, bake_object, colour_cloud
-from converters.urdf import RigidObject, colours_of_faces, read_surface, read_urdf
+from converters.urdf import RigidObject, read_urdf
 from interactive_nav_common.files import whole_folder
 from scenes_mjcf.schema import CATEGORIES
 
@@ -47,11 +49,12 @@ WORDS = {
     "door": ("door",),
 }
 """Category -> words that tell it in a name."""
-DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0}
+DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0, "other": 300.0}
 """Of the hulls, for meshes without a mass: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm
-0.7 kg in 0.8 dm3, a plastic toy is mostly hollow. Furniture has `converters.physical.MATERIALS`."""
-FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4}
-"""Sliding coefficients on a floor: rubber soles, clay, plastic."""
+0.7 kg in 0.8 dm3, a plastic toy is mostly hollow; other things lie between.
+Furniture has `converters.physical.MATERIALS`."""
+FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4, "other": 0.5}
+"""Sliding coefficients on a floor: rubber soles, clay, plastic, anything."""
 FOOT_SHARE = 0.03
 """Of the height: what ends within this above the base is brought down to it. Collision meshes come from voxels, and
 a pot on unequal hulls rests tilted."""
@@ -64,7 +67,7 @@ class ObjectConfig:
     """Choices of one object."""
 
     category: str | None = None
-    """One of `CATEGORIES`; None: told from the name."""
+    """One of `CATEGORIES`; None: told from the name, `other` where it tells nothing."""
     mass_kg: float | None = None
     friction: float | None = None
     scale: float = 1.0
@@ -72,6 +75,8 @@ class ObjectConfig:
     seed: int = 0
     """Seed of coacd's search."""
     overwrite: bool = False
+    source: Path | None = None
+    """Folder that the files which the model names must lie in; None: the model's own."""
     strict: bool = False
     """Refuse what would be repaired with a warning."""
     timeout_s: float = 240.0
@@ -84,10 +89,11 @@ def guess_category(*names: str) -> str | None:
     return max(found)[1] if found else None
 
 
-def _category(config: ObjectConfig, names: tuple[str, ...], path: Path) -> str:
+def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder) -> str:
     category = config.category or guess_category(*names)
     if category is None:
-        raise SceneRejected(f"{path}: its name tells no category; add --category with one of {', '.join(CATEGORIES)}")
+        source.note(f"the name {names[0]} tells no category: it is 'other', unless --category says so")
+        return "other"
     if category not in CATEGORIES:
         raise SceneRejected(f"category is '{category}', expected one of {', '.join(CATEGORIES)}")
     return category
@@ -103,11 +109,12 @@ def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFo
     Raises:
         SceneRejected: missing, damaged or empty file, or no rigid object.
     """
-    source = SourceFolder(path.parent, config.strict)
+    source = SourceFolder(config.source or path.parent, config.strict)
+    relative = source.inside(path)
     if path.suffix.lower() == ".urdf":
-        item = read_urdf(source, path.name, "give a mesh or a URDF")
+        item = read_urdf(source, relative, "give a mesh or a URDF")
     else:
-        surface = read_surface(source, path.name, "give a mesh or a URDF")
+        surface = read_surface(source, relative, "give a mesh or a URDF")
         item = RigidObject(path.stem, surface, None, (surface.vertices, surface.faces), None, None)
     turn = config.scale * (Y_UP_TO_Z_UP if config.up == "y" else np.eye(3))
     pieces = None if item.pieces is None else tuple((v @ turn.T, f) for v, f in item.pieces)
@@ -162,7 +169,13 @@ def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMe
     return bake_object(vertices, faces, colours, cloud, FACES, TEXELS)[0]
 
 
-def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path | None = None) -> dict[str, Any]:
+def convert_object(
+    path: Path,
+    target: Path,
+    config: ObjectConfig,
+    cache: Path | None = None,
+    warn: Callable[[str], None] = lambda warning: None,
+) -> dict[str, Any]:
     """Converts one mesh or URDF; `target` appears whole or not at all.
 
     The URDF's mass, friction and collision mesh are used; its inertia is not (released ones are placeholders): it
@@ -173,6 +186,7 @@ def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path |
         target: folder to make: `object.xml`, `object.json`, `assets/`.
         config: choices; they win over the URDF's values.
         cache: folder of hulls by content; default `cache_folder()`.
+        warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
 
     Returns:
         The content of `object.json`.
@@ -185,7 +199,9 @@ def convert_object(path: Path, target: Path, config: ObjectConfig, cache: Path |
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")
     with whole_folder(target, config.overwrite) as folder:
         item, source = read_object(path, config)
-        category = _category(config, (item.name, path.stem), path)
+        category = _category(config, (item.name, path.stem), source)
+        for warning in source.warnings:
+            warn(warning)
         low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
         if not 0.005 < (high - low).max() < 10.0:
             raise SceneRejected(

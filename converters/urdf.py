@@ -7,7 +7,6 @@ known, from which it follows.
 from __future__ import annotations
 
 import dataclasses
-import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -15,10 +14,10 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from converters.cad import face_colours, material_image
 from converters.errors import SceneRejected
-from converters.files import SourceFolder, check_mesh, read_obj
-from converters.obj import TexturedMesh, find_file, join_meshes, read_scan_obj
+from converters.files import SourceFolder, read_obj
+from converters.meshes import read_surface
+from converters.obj import TexturedMesh, find_file, join_meshes
 
 MAX_PIECES = 16
 """Convex pieces of one object; the gates' limit (`hulls_per_object`)."""
@@ -38,56 +37,6 @@ class RigidObject:
     """The collision mesh itself, to be decomposed where there are no pieces; the surface without a collision mesh."""
     mass_kg: float | None
     friction: float | None
-
-
-def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
-    """Reads a mesh file of any kind that trimesh knows, with its texture or colours.
-
-    Raises:
-        SceneRejected: missing, damaged or empty.
-    """
-    if relative.lower().endswith(".obj"):
-        return read_scan_obj(source, relative, remedy)
-    path = source.use(relative, remedy)
-    try:
-        loaded = trimesh.load(path, process=False, force="mesh")
-    except Exception as error:  # trimesh's loaders raise anything on a broken file
-        reason = " ".join(str(error).split())
-        raise SceneRejected(
-            f"{path}: not readable as a mesh ({type(error).__name__}: {reason}); expected OBJ, PLY, STL, GLB or DAE"
-        ) from error
-    if not isinstance(loaded, trimesh.Trimesh):
-        raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
-    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
-    check_mesh(path, vertices, faces)
-    image = material_image(getattr(loaded.visual, "material", None))
-    uv = getattr(loaded.visual, "uv", None)
-    if image is not None and uv is not None and len(uv) == len(vertices):
-        return TexturedMesh(vertices, faces, np.asarray(uv, float)[faces], np.asarray(image.convert("RGB")))
-    return textured_by_face(vertices, faces, face_colours(loaded))
-
-
-def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> TexturedMesh:
-    """A mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
-    palette, index = np.unique(np.asarray(colours, np.uint8), axis=0, return_inverse=True)
-    side = math.ceil(math.sqrt(len(palette)))
-    image = np.zeros((side * side, 3), np.uint8)
-    image[: len(palette)] = palette
-    image = np.repeat(np.repeat(image.reshape(side, side, 3), 4, axis=0), 4, axis=1)
-    row, column = np.divmod(index.reshape(-1), side)
-    uv = np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=1)
-    return TexturedMesh(vertices, faces, np.repeat(uv[:, None], 3, axis=1), image)
-
-
-def colours_of_faces(mesh: TexturedMesh) -> np.ndarray:
-    """(m, 3) uint8: the texture at the middle of each face, grey without one."""
-    if mesh.texture is None or mesh.corner_uv is None:
-        return np.full((len(mesh.faces), 3), 170, np.uint8)
-    height, width = mesh.texture.shape[:2]
-    u, v = (mesh.corner_uv.mean(axis=1) % 1.0).T
-    return mesh.texture[
-        np.clip(((1.0 - v) * height).astype(int), 0, height - 1), np.clip((u * width).astype(int), 0, width - 1)
-    ]
 
 
 def convex_pieces(
@@ -254,9 +203,9 @@ def _geometries(source: SourceFolder, path: Path, link: ElementTree.Element, kin
         if shape.tag == "mesh":
             name = str(shape.get("filename") or "").removeprefix("package://").removeprefix("file://")
             target = find_file(source, path.parent, name) if name else None
-            inside = None if target is None else source.relative(target)
-            if inside is None:
+            if target is None:
                 raise SceneRejected(f"{path}: names the mesh '{name}', which is not there; put it beside the URDF")
+            inside = source.inside(target)
             mesh = read_surface(source, inside, "") if kind == "visual" else _bare(source, inside)
             mesh = _place(mesh, np.diag([*_numbers(shape.get("scale"), (1.0, 1.0, 1.0)), 1.0]))
         else:

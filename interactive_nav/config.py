@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+from pathlib import Path
 from typing import Any
 
 BACKENDS = ("auto", "warp", "jax", "native")
@@ -67,6 +68,9 @@ class NavConfig:
     """Small objects strewn about at random each episode."""
     small_objects: str = "train"
     """Whose models the small objects are: train, or test, which no training episode shows."""
+    objects: tuple[str, ...] = ()
+    """Folders of `python -m converters object`, relative to the current folder: they are the small objects in place of
+    the built-in ones, in turn until there are num_objects."""
     observations: tuple[str, ...] = OBSERVATIONS
     """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
     odometry, collision, joints, lidar. With images (depth, segmentation) the observation is a dict."""
@@ -186,9 +190,14 @@ class NavConfig:
             raise ValueError(f"{field} is {getattr(self, field)!r}, expected {expected}")
 
         object.__setattr__(self, "observations", tuple(self.observations))
+        if isinstance(self.objects, (str, Path)):
+            refuse("objects", f"a list of object folders; write ['{self.objects}']")
+        object.__setattr__(self, "objects", tuple(str(folder) for folder in self.objects))
         for field, choices in CHOICES.items():
             if getattr(self, field) not in choices:
                 refuse(field, f"one of {', '.join(choices)}")
+        if self.objects and self.small_objects != "train":
+            refuse("small_objects", "train, its default: with objects there are no built-in models to choose from")
         known = (*SIGNALS, *IMAGES)
         unknown = [o for o in self.observations if o not in known]
         if unknown or not self.observations or len(set(self.observations)) != len(self.observations):

@@ -153,8 +153,8 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     if file.objects_digest != _objects_digest(env):
         raise EpisodeFileError(
             f"{where}: made with {len(file.objects)} small objects ({', '.join(file.objects) or 'none'}), the "
-            f"environment has {len(env.world.small_objects)} or other models; set num_objects={len(file.objects)}, or "
-            "make the episodes again"
+            f"environment has {len(env.world.small_objects)} or other models; set num_objects={len(file.objects)} and "
+            "the same objects, or make the episodes again"
         )
     rows, count = file.episodes, len(file.objects)
     small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]
@@ -256,13 +256,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     make_parser.add_argument("--episodes", type=int, default=100, help="default: 100")
     make_parser.add_argument("--seed", type=int, default=0, help="default: 0")
     make_parser.add_argument("--num-objects", type=int, default=10, help="small objects (default 10)")
+    make_parser.add_argument(
+        "--objects", nargs="+", default=(), metavar="OBJECT_DIR", help="folders of small objects (default: built-in)"
+    )
     make_parser.add_argument("-o", "--out", required=True, metavar="FILE")
     arguments = parser.parse_args(argv)
     import interactive_nav
 
     try:
         env = interactive_nav.make(
-            arguments.robot, arguments.scenes, backend="native", num_objects=arguments.num_objects
+            arguments.robot,
+            arguments.scenes,
+            backend="native",
+            num_objects=arguments.num_objects,
+            objects=arguments.objects,
         )
         file = draw(env, arguments.episodes, arguments.seed)
         save(file, arguments.out)

@@ -8,15 +8,19 @@ to look at. All models of a kind have equally many boxes, so that scenes of one 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import mujoco
+import numpy as np
 
 Rgba = tuple[float, float, float, float]
 SPLITS = ("train", "test")
 KINDS = ("basket", "shoe", "pot", "toy", "shoe", "basket", "toy", "pot")
 """Kinds in the order in which `pick` deals them: ten are 3 baskets, 3 shoes, 2 pots, 2 toys."""
 VISUAL_GROUP = 2
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+"""Quaternion w x y z of what is not turned."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +29,23 @@ class Box:
 
     centre_m: tuple[float, float, float]
     half_m: tuple[float, float, float]
+    quat: tuple[float, float, float, float] = LEVEL
+
+    def __repr__(self) -> str:
+        # Digests in episode files are of this text: a box that is not turned has the same as ever.
+        turn = "" if self.quat == LEVEL else f", quat={self.quat!r}"
+        return f"Box(centre_m={self.centre_m!r}, half_m={self.half_m!r}{turn})"
+
+    @property
+    def corners_m(self) -> list[tuple[float, float, float]]:
+        """Its eight corners, in the object's frame."""
+        corner, found = np.zeros(3), []
+        for signs in itertools.product((-1, 1), repeat=3):
+            own = [s * h for s, h in zip(signs, self.half_m, strict=True)]
+            mujoco.mju_rotVecQuat(corner, np.array(own), np.array(self.quat))
+            x, y, z = (c + float(v) for c, v in zip(self.centre_m, corner, strict=True))
+            found.append((x, y, z))
+        return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,12 +80,17 @@ class SmallObject:
     @property
     def radius_m(self) -> float:
         """Radius of the disc about the origin that holds the object's footprint."""
-        return max(math.hypot(abs(b.centre_m[0]) + b.half_m[0], abs(b.centre_m[1]) + b.half_m[1]) for b in self.boxes)
+        return max(math.hypot(x, y) for b in self.boxes for x, y, _ in b.corners_m)
 
     @property
     def height_m(self) -> float:
         """Top of the boxes above the floor."""
-        return max(b.centre_m[2] + b.half_m[2] for b in self.boxes)
+        return max(z for b in self.boxes for _, _, z in b.corners_m)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[n, 10] of its boxes: centre (3), quaternion (4), half sizes (3)."""
+        return np.asarray([[*b.centre_m, *b.quat, *b.half_m] for b in self.boxes], float)
 
 
 def _rgba(red: float, green: float, blue: float) -> Rgba:

@@ -22,6 +22,8 @@ import mujoco
 import numpy as np
 
 from interactive_nav.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav.object_folders import small_objects
+from interactive_nav.objects import SmallObject
 from interactive_nav_common.errors import UserError
 
 FORMAT = 1
@@ -48,7 +50,7 @@ class Replay:
     """SHA-256 of its scene.xml and maps.npz."""
     control_dt_s: float
     num_objects: int
-    """Small objects; `objects.pick` says which."""
+    """Small objects; `small` says which."""
     policy: str
     episode: int
     label: str
@@ -77,6 +79,19 @@ class Replay:
     """[T] bool."""
     metrics: dict[str, float]
     """The episode's scores, `EPISODE_METRICS`."""
+    small_objects: str = "train"
+    """Whose models the small objects are."""
+    objects: tuple[str, ...] = ()
+    """Their folders, absolute, where they are not the built-in ones."""
+
+    @property
+    def small(self) -> tuple[SmallObject, ...]:
+        """The small objects.
+
+        Raises:
+            SceneError: a folder of `objects` is not there or no object.
+        """
+        return small_objects(self.num_objects, self.small_objects, self.objects)
 
     @property
     def num_steps(self) -> int:
@@ -179,6 +194,8 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         touches_movable=counts["interaction_steps"],
         touches_structure=counts["structure_steps"],
         metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
+        small_objects=env.config.small_objects,
+        objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
     )
 
 
@@ -268,5 +285,6 @@ def load(path: str | Path) -> Replay:
         raise ReplayError(f"{path}: is no replay or damaged ({error}); record the episode again") from error
     if header.pop("format", None) != FORMAT:
         raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
-    header["bodies"] = tuple(header["bodies"])
+    for name in ("bodies", "objects"):
+        header[name] = tuple(header.get(name, ()))
     return Replay(**header, **arrays)

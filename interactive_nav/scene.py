@@ -86,6 +86,66 @@ def _hull(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return model.mesh_vert[start : start + count] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
 
 
+def _geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    return [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
+
+
+def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, friction: float) -> Movable:
+    """One movable body of a compiled scene or single object.
+
+    Args:
+        model: compiled from `xml`.
+        xml: named in errors.
+        name: of the body.
+        category: of the object.
+        friction: sliding coefficient.
+
+    Raises:
+        SceneError: no such body, not one joint that is free or a hinge, or no box to collide with.
+    """
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if body < 0:
+        raise SceneError(f"{xml}: no body named '{name}', which its JSON file lists; convert it again")
+    if model.body_jntnum[body] != 1:
+        raise SceneError(f"{xml}: body '{name}' has {model.body_jntnum[body]} joints, expected 1")
+    joint = model.body_jntadr[body]
+    box = [g for g in _geoms(model, body) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
+    hull = [
+        g
+        for g in _geoms(model, body)
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH and (model.geom_contype[g] or model.geom_conaffinity[g])
+    ]
+    if not box:
+        raise SceneError(f"{xml}: body '{name}' has no box geom to collide with; convert it again")
+    hinge = None
+    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+        dof = model.jnt_dofadr[joint]
+        limits = tuple(float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else None
+        hinge = Hinge(
+            axis=model.jnt_axis[joint].copy(),
+            anchor_m=model.jnt_pos[joint].copy(),
+            range_rad=limits,  # type: ignore[arg-type]
+            damping=float(np.ravel(model.dof_damping[dof])[0]),
+            frictionloss=float(model.dof_frictionloss[dof]),
+        )
+    elif model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise SceneError(f"{xml}: joint of '{name}' is neither free nor a hinge")
+    return Movable(
+        name=name,
+        category=category,
+        mass_kg=float(model.body_mass[body]),
+        inertia=model.body_inertia[body].copy(),
+        com_m=model.body_ipos[body].copy(),
+        inertia_quat=model.body_iquat[body].copy(),
+        pos_w=model.body_pos[body].copy(),
+        quat_w=model.body_quat[body].copy(),
+        friction=friction,
+        boxes=_boxes(model, box),
+        hulls=tuple(_hull(model, g) for g in hull),
+        hinge=hinge,
+    )
+
+
 def load_scene(folder: str | Path) -> Scene:
     """Reads and checks a scene folder.
 
@@ -109,57 +169,14 @@ def load_scene(folder: str | Path) -> Scene:
     structure = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "structure")
     if structure < 0:
         raise SceneError(f"{xml}: no body named 'structure'; convert the scene again")
-    geoms_of = {b: [g for g in range(model.ngeom) if model.geom_bodyid[g] == b] for b in range(model.nbody)}
-    solid = [g for g in geoms_of[structure] if model.geom_contype[g] or model.geom_conaffinity[g]]
+    solid = [g for g in _geoms(model, structure) if model.geom_contype[g] or model.geom_conaffinity[g]]
     wrong = [g for g in solid if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_BOX]
     if wrong:
         raise SceneError(f"{xml}: geom '{model.geom(wrong[0]).name}' of 'structure' collides but is not a box")
 
     movables = []
     for obj in manifest.objects:
-        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, obj.name)
-        if body < 0:
-            raise SceneError(f"{xml}: no body named '{obj.name}', which scene.json lists; convert the scene again")
-        if model.body_jntnum[body] != 1:
-            raise SceneError(f"{xml}: body '{obj.name}' has {model.body_jntnum[body]} joints, expected 1")
-        joint = model.body_jntadr[body]
-        box = [g for g in geoms_of[body] if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
-        hull = [
-            g
-            for g in geoms_of[body]
-            if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH and (model.geom_contype[g] or model.geom_conaffinity[g])
-        ]
-        if not box:
-            raise SceneError(f"{xml}: body '{obj.name}' has no box geom to collide with; convert the scene again")
-        hinge = None
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
-            dof = model.jnt_dofadr[joint]
-            limits = tuple(float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else None
-            hinge = Hinge(
-                axis=model.jnt_axis[joint].copy(),
-                anchor_m=model.jnt_pos[joint].copy(),
-                range_rad=limits,  # type: ignore[arg-type]
-                damping=float(np.ravel(model.dof_damping[dof])[0]),
-                frictionloss=float(model.dof_frictionloss[dof]),
-            )
-        elif model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-            raise SceneError(f"{xml}: joint of '{obj.name}' is neither free nor a hinge")
-        movables.append(
-            Movable(
-                name=obj.name,
-                category=obj.category,
-                mass_kg=float(model.body_mass[body]),
-                inertia=model.body_inertia[body].copy(),
-                com_m=model.body_ipos[body].copy(),
-                inertia_quat=model.body_iquat[body].copy(),
-                pos_w=model.body_pos[body].copy(),
-                quat_w=model.body_quat[body].copy(),
-                friction=obj.friction,
-                boxes=_boxes(model, box),
-                hulls=tuple(_hull(model, g) for g in hull),
-                hinge=hinge,
-            )
-        )
+        movables.append(read_movable(model, xml, obj.name, obj.category, obj.friction))
     walls = _boxes(model, solid)
     for row in walls:
         row[:3] = model.body_pos[structure] + _quat_rotate(model.body_quat[structure], row[:3])

@@ -27,7 +27,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path as Outline
 
-from interactive_nav.objects import pick
 from interactive_nav.record import check_scene
 from interactive_nav.replay import Replay, ReplayError, load
 from interactive_nav.robots import get_robot
@@ -43,9 +42,8 @@ MOVED_M = 0.02
 def outlines(replay: Replay, scene: Scene) -> dict[str, tuple[str, np.ndarray]]:
     """Boxes of everything movable: body name -> (category, [n, 10] centre, quaternion, half sizes, body frame)."""
     found = {m.name: (m.category, m.boxes) for m in scene.movables}
-    for i, obj in enumerate(pick(replay.num_objects)):
-        rows = [[*box.centre_m, 1.0, 0.0, 0.0, 0.0, *box.half_m] for box in obj.boxes]
-        found[f"{obj.category}_small_{i}"] = (obj.category, np.asarray(rows))
+    for i, obj in enumerate(replay.small):
+        found[f"{obj.category}_small_{i}"] = (obj.category, obj.rows)
     return found
 
 

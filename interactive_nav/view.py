@@ -146,6 +146,7 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
                 name=f"{name}_box_{k}",
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 pos=box.centre_m,
+                quat=box.quat,
                 size=box.half_m,
                 density=obj.mass_kg / volume,
                 friction=[obj.friction, 0.005, 0.0001],

@@ -11,6 +11,7 @@ import colorsys
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -18,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from interactive_nav.env import InteractiveNav
-from interactive_nav.objects import pick
+from interactive_nav.objects import SmallObject
 from interactive_nav.replay import world_poses
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
@@ -35,6 +36,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "shoe": (0.80, 0.28, 0.30),
     "pot": (0.55, 0.34, 0.56),
     "toy": (0.93, 0.78, 0.24),
+    "other": (0.60, 0.60, 0.60),
 }
 """RGB in [0, 1] by class, in colour and mask pictures alike."""
 CLASSES = tuple(COLOURS)
@@ -104,16 +106,16 @@ class FloorPaint:
 class SceneView:
     """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
 
-    def __init__(self, robot: RobotSpec, scene: Scene, num_objects: int):
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject]):
         """Compiles the model to look at.
 
         Args:
             robot: its collision shapes are drawn, or its visual ones where it has any.
             scene: its visual meshes are drawn.
-            num_objects: small objects, as in `NavConfig`.
+            small: the small objects.
         """
         self.robot = robot
-        self.model = _compile(robot, scene, num_objects)
+        self.model = _compile(robot, scene, small)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
         self._class = _geom_classes(self.model, robot, scene)
@@ -239,7 +241,7 @@ class ThirdPerson:
 
     def __init__(self, env: InteractiveNav, rows: int = 360, columns: int = 480):
         self.env, self.rows, self.columns = env, rows, columns
-        self._view = functools.cache(lambda scene: SceneView(env.robot, env.scenes[scene], env.config.num_objects))
+        self._view = functools.cache(lambda scene: SceneView(env.robot, env.scenes[scene], env.world.small_objects))
 
     def frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
         """[rows, columns, 3] u8.
@@ -304,7 +306,7 @@ def _floor_colour(xy_w: np.ndarray, paint: FloorPaint) -> np.ndarray:
     return colour
 
 
-def _compile(robot: RobotSpec, scene: Scene, num_objects: int) -> mujoco.MjModel:
+def _compile(robot: RobotSpec, scene: Scene, small: Sequence[SmallObject]) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
     movable = {m.name for m in scene.movables}
     seen = {geom.parent.name for geom in spec.geoms if geom.group <= 2}
@@ -335,11 +337,17 @@ def _compile(robot: RobotSpec, scene: Scene, num_objects: int) -> mujoco.MjModel
     visual = [g for g in own if g.group <= 2]
     for geom in own:
         geom.group = _ROBOT if geom in visual or not visual else _HIDDEN
-    for i, obj in enumerate(pick(num_objects)):
+    for i, obj in enumerate(small):
         body = spec.worldbody.add_body(name=f"{obj.category}_small_{i}", pos=[0, 0, -50.0])
         for box in obj.boxes:
             body.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre_m, size=box.half_m, group=_THINGS, contype=0, mass=1.0
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=box.centre_m,
+                quat=box.quat,
+                size=box.half_m,
+                group=_THINGS,
+                contype=0,
+                mass=1.0,
             )
     return spec.compile()
 

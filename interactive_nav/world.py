@@ -15,7 +15,8 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.contacts import add_contact_sensors
-from interactive_nav.objects import SmallObject, pick
+from interactive_nav.object_folders import ConvertedObject, small_objects
+from interactive_nav.objects import SmallObject
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Movable, Scene
 from scenes_mjcf.schema import SceneError
@@ -230,8 +231,12 @@ def _add_movable(
     _add_feet(body, name, boxes, com, friction)
 
 
-def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> None:
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, collision: str) -> None:
     x, y = parking_spot(park)
+    if isinstance(obj, ConvertedObject):
+        parked = dataclasses.replace(obj.movable, pos_w=np.array([x, y, 0.0]))
+        _add_movable(spec, name, parked, len(obj.boxes), "small", park, collision, padded=False)
+        return
     body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
     body.add_freejoint(name=f"{name}_joint")
     volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
@@ -245,8 +250,7 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int) -> N
             friction=[obj.friction, 0.005, 0.0001],
             group=3,
         )
-    rows = np.array([[*b.centre_m, 1, 0, 0, 0, *b.half_m] for b in obj.boxes], float)
-    _add_feet(body, name, rows, rows[:, :3].mean(0), obj.friction)
+    _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
 
 
 def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
@@ -321,7 +325,7 @@ def _build_spec(
     slots: list[tuple[str, str]] = []
     for i, obj in enumerate(small):
         name = f"{obj.category}_small_{i}"
-        _add_small(spec, name, obj, len(slots))
+        _add_small(spec, name, obj, len(slots), config.collision)
         slots.append((name, "small"))
     lists = [sorted_movables(s) for s in scenes]
     for kind, per_scene in (("free", [a for a, _ in lists]), ("hinge", [b for _, b in lists])):
@@ -439,7 +443,8 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
 
     Raises:
         ValueError: no scene, or hulls with several scenes.
-        SceneError: a scene whose furniture does not come to rest at finite coordinates.
+        SceneError: a scene whose furniture does not come to rest at finite coordinates, or a folder in
+            `config.objects` that is no object.
     """
     if not scenes:
         raise ValueError("scenes is empty, expected at least one scene folder")
@@ -448,7 +453,7 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
             f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
             "use collision='boxes'"
         )
-    small = pick(config.num_objects, config.small_objects)
+    small = small_objects(config.num_objects, config.small_objects, config.objects)
     specs, models, slots = [], [], []
     for i in range(len(scenes)):
         spec, slots = _build_spec(robot, i, scenes, small, config)

@@ -18,7 +18,7 @@ import numpy as np
 from interactive_nav_common.errors import UserError
 
 SCHEMA_VERSION = 1
-CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy")
+CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy", "other")
 SPLITS = ("train", "test")
 JSON_TYPES: dict[Any, tuple[tuple[type, ...], str]] = {
     str: ((str,), "a string"),

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.objects import SmallObject
 from interactive_nav.observation import rotation_from_quat
 from interactive_nav.scene import Movable
 from interactive_nav.world import World, sorted_movables
@@ -32,10 +31,11 @@ CLASS_IDS = {
     "pot": 7,
     "toy": 9,
     "shoe": 10,
+    "other": 0,
 }
 """Segmentation ids of Interactive Gibson's code (reference benchmark, section 1.4); the second basket model is 8.
 
-The kinds of ids 7 and 10 are not public (a shoe and a pot, in some order).
+The kinds of ids 7 and 10 are not public (a shoe and a pot, in some order). What has no class is as the structure.
 """
 NUM_CLASSES = 11
 """Divides a class id into the observation's [0, 1], as the original does."""
@@ -99,10 +99,6 @@ def class_id(category: str, five: bool = False) -> int:
     return DESK_ID if five and category == "desk" else CLASS_IDS[category]
 
 
-def _small_boxes(obj: SmallObject) -> np.ndarray:
-    return np.asarray([[*b.centre_m, 1.0, 0.0, 0.0, 0.0, *b.half_m] for b in obj.boxes])
-
-
 def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
@@ -119,7 +115,7 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
         column: list[tuple[np.ndarray, int, Movable | None]] = []
         for i, kind in enumerate(layout.slot_kind):
             if kind == "small":
-                column.append((_small_boxes(world.small_objects[i]), world.small_objects[i].segmentation_id, None))
+                column.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id, None))
                 continue
             movable = next(own[kind], None)
             boxes = np.zeros((0, 10)) if movable is None else movable.boxes

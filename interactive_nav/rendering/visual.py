@@ -71,6 +71,7 @@ def build_visual(world: World, scene: int) -> VisualModel:
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 pos=box.centre_m,
+                quat=box.quat,
                 size=box.half_m,
                 group=VISUAL_GROUP,
                 rgba=[*PALETTE[class_id(obj.category)], 1.0],

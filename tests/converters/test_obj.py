@@ -108,9 +108,35 @@ def test_nothing_outside_the_folder_is_read(tmp_path):
     source = two_materials(inner, "../secret.png")
     mesh = read_scan_obj(source, "mesh.obj", "")
     np.testing.assert_array_equal(sampled(mesh, 0), (170, 170, 170))
-    assert "m.mtl: names the texture '../secret.png', which is missing; the material's plain colour is taken" in (
-        source.warnings
-    )
+    assert (
+        "m.mtl: names the texture '../secret.png', which lies outside of the source folder; the material's plain "
+        "colour is taken"
+    ) in (source.warnings)
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", "m.mtl", "red.png"])
+def test_a_link_out_of_the_folder_is_refused(tmp_path, name):
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    source = two_materials(inner)
+    (inner / name).rename(tmp_path / name)
+    (inner / name).symlink_to(tmp_path / name)
+    with pytest.raises(SceneRejected, match=f"inner/{name}: leads out of the source folder, to .*/{name}; put a copy"):
+        read_scan_obj(source, "mesh.obj", "")
+    assert name not in source.sha256
+    (inner / name).unlink()
+    (inner / name).symlink_to(inner / name)
+    with pytest.raises(SceneRejected, match=f"inner/{name}: leads nowhere"):
+        read_scan_obj(SourceFolder(inner), "mesh.obj", "")
+
+
+def test_a_link_within_the_folder_is_followed(tmp_path):
+    source = two_materials(tmp_path)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "red.png").rename(tmp_path / "images" / "red.png")
+    (tmp_path / "red.png").symlink_to("images/red.png")
+    np.testing.assert_array_equal(sampled(read_scan_obj(source, "mesh.obj", ""), 0), (255, 0, 0))
+    assert "images/red.png" in source.sha256 and source.root == tmp_path
 
 
 def test_joining_keeps_each_mesh_its_colour():

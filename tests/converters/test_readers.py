@@ -131,7 +131,10 @@ def test_missing_gibson_file(gibson_raw, name):
     [
         ("mesh_z_up.mtl", "mesh_z_up.obj: its material file mesh_z_up.mtl is missing; it stays grey"),
         ("paint.png", "mesh_z_up.mtl: names the texture 'paint.png', which is missing; the material's plain colour"),
-        ("cad/04379243/table-a/models/model_normalized.mtl", "'model_normalized.mtl' is missing; the model stays grey"),
+        (
+            "cad/04379243/table-a/models/model_normalized.mtl",
+            "file model_normalized.mtl is missing; it stays grey",
+        ),
     ],
 )
 def test_missing_colour_is_a_warning_and_an_error_where_strict(gibson_raw, name, warning):

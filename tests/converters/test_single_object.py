@@ -143,9 +143,10 @@ def test_a_plain_mesh_takes_mass_from_its_category(tmp_path, hull_cache):
 def test_the_command(tmp_path, capsys, monkeypatch, hull_cache):
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(hull_cache))
     path = write(tmp_path, name="thing")
-    assert main(["object", str(path), str(tmp_path / "out")]) == 2
-    assert "its name tells no category; add --category with one of chair" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert main(["object", str(path), str(tmp_path / "plain")]) == 0
+    said = capsys.readouterr().out
+    assert said.count("the name thing tells no category: it is 'other', unless --category says so") == 1
+    assert "plain: other, 2.500 kg (urdf)" in said
     assert main(["object", str(path), str(tmp_path / "out"), "--category", "basket", "--mass", "1.5"]) == 0
     assert "basket, 1.500 kg (given), 30.0 x 20.0 x 10.0 cm, 1 hulls (collision mesh)" in capsys.readouterr().out
     assert main(["object", str(path), str(tmp_path / "out"), "--category", "basket"]) == 2
@@ -158,6 +159,73 @@ def test_the_command(tmp_path, capsys, monkeypatch, hull_cache):
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
         assert not (tmp_path / "other").exists()
+
+
+def test_a_thing_without_category_takes_mass_from_its_volume(tmp_path, hull_cache):
+    trimesh.creation.box(BOX).export(tmp_path / "drainer.stl")
+    about = convert_object(tmp_path / "drainer.stl", tmp_path / "out", ObjectConfig(), hull_cache)
+    assert (about["category"], about["mass_source"], about["friction"]) == ("other", "density", 0.5)
+    assert about["mass_kg"] == pytest.approx(300 * 0.006, rel=0.25)
+
+
+def test_warnings_of_reading_come_before_the_work(tmp_path, monkeypatch, hull_cache):
+    from converters import single_object
+
+    class Stop(Exception):
+        pass
+
+    def stop(*arguments):
+        raise Stop
+
+    told: list[str] = []
+    trimesh.creation.box(BOX).export(tmp_path / "toy.obj", include_texture=False, include_color=False)
+    monkeypatch.setattr(single_object, "_hulls", stop)
+    with pytest.raises(Stop):
+        convert_object(tmp_path / "toy.obj", tmp_path / "out", ObjectConfig(), hull_cache, told.append)
+    assert told == ["toy.obj: has no texture; it stays grey"]
+
+
+def test_the_source_may_be_wider_than_the_models_folder(tmp_path, hull_cache):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "models").mkdir()
+    Image.new("RGB", (4, 4), (200, 30, 10)).save(tmp_path / "images/t.png")
+    solid = trimesh.creation.box(BOX)
+    lines = [f"v {x} {y} {z}" for x, y, z in solid.vertices] + ["vt 0.5 0.5", "usemtl a"]
+    lines += [f"f {a}/1 {b}/1 {c}/1" for a, b, c in solid.faces + 1]
+    (tmp_path / "models/toy.obj").write_text("\n".join(["mtllib m.mtl", *lines, ""]))
+    (tmp_path / "models/m.mtl").write_text("newmtl a\nKd 1 1 1\nmap_Kd ../images/t.png\n")
+    path = tmp_path / "models/toy.obj"
+    about = convert_object(path, tmp_path / "narrow", ObjectConfig(), hull_cache)
+    assert any("'../images/t.png', which lies outside of the source folder" in w for w in about["warnings"])
+    about = convert_object(path, tmp_path / "wide", ObjectConfig(source=tmp_path), hull_cache)
+    assert about["warnings"] == [] and "images/t.png" in about["source"]["sha256"]
+    colours = np.asarray(Image.open(tmp_path / "wide/assets/wide.png").convert("RGB")).reshape(-1, 3)
+    np.testing.assert_allclose(np.median(colours, axis=0), (200, 30, 10), atol=4)
+
+
+def test_an_object_joins_a_scene_and_rests_there(tmp_path, hull_cache, room):
+    convert_object(write(tmp_path), tmp_path / "out", ObjectConfig(), hull_cache)
+    scene = mujoco.MjSpec.from_file(str(room / "scene.xml"))
+    frame = scene.worldbody.add_frame(pos=[1.0, 1.0, 0.0])
+    frame.attach_body(mujoco.MjSpec.from_file(str(tmp_path / "out" / "object.xml")).body("out"), "new_", "")
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 200)
+    np.testing.assert_allclose(data.body("new_out").xpos, (1.0, 1.0, 0.0), atol=2e-3)
+    assert model.body("new_out").mass == pytest.approx(2.5)
+
+
+def test_the_preview_of_an_object_shows_surface_and_solids(tmp_path, hull_cache):
+    convert_object(write(tmp_path), tmp_path / "out", ObjectConfig(), hull_cache)
+    assert main(["preview", str(tmp_path / "out"), "-o", str(tmp_path / "x.png")]) == 0
+    picture = np.asarray(Image.open(tmp_path / "x.png").convert("RGB")).astype(int)
+    grey = (np.abs(picture - 170).max(axis=2) < 12).mean()
+    blue = (np.abs(picture - [203, 219, 239]).max(axis=2) < 12).mean()
+    assert 0.05 < grey < 0.5 and 0.05 < blue < 0.5
+    assert main(["preview", str(tmp_path / "out"), "-o", str(tmp_path / "y.png"), "--source", str(tmp_path)]) == 2
+    (tmp_path / "out" / "object.json").write_text("{}")
+    assert main(["preview", str(tmp_path / "out"), "-o", str(tmp_path / "y.png")]) == 2
+    assert not (tmp_path / "y.png").exists()
 
 
 @pytest.mark.data

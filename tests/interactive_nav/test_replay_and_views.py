@@ -13,6 +13,7 @@ from PIL import Image
 
 import interactive_nav
 from interactive_nav import gym_env, record, replay, topdown
+from interactive_nav.objects import pick
 from interactive_nav.replay import Player, ReplayError
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
@@ -113,7 +114,7 @@ def test_files_that_are_no_replays_are_refused(played, tmp_path):
 
 @pytest.fixture(scope="module")
 def view(room):
-    return SceneView(get_robot("turtlebot"), load_scene(room), 1)
+    return SceneView(get_robot("turtlebot"), load_scene(room), pick(1))
 
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0]
