@@ -21,6 +21,7 @@ import interactive_nav
 from interactive_nav.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
+from interactive_nav_common.locks import locked
 from interactive_nav_common.signals import stop_signals
 from train import checkpoint, tracking
 from train.algorithms import ALGORITHMS
@@ -214,6 +215,15 @@ def train_run(
             folder.path.rmdir()
             folder.path.parent.rmdir()
         raise
+    busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
+    with locked(folder.lock, busy):
+        return _train_in(folder, config, env, console, wrap_env)
+
+
+def _train_in(
+    folder: RunFolder, config: TrainConfig, env: Any, console: Console, wrap_env: Callable[[Any], Env]
+) -> tuple[TrainResult, RunFolder, int | None]:
+    """Trains in a folder that nobody else writes to."""
     exists = folder.open(config)
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "

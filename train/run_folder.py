@@ -6,6 +6,7 @@
                  tensorboard/      the same as events
                  checkpoints/      see `checkpoint`
                  summary.json      how it ended
+                 lock              held by the process that trains it
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ class RunFolder:
         self.metrics = path / METRICS
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
+        self.lock = path / "lock"
 
     def read_config(self) -> TrainConfig:
         """The resolved config of the run.

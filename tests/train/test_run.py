@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,9 +19,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from interactive_nav.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.locks import release, take_lock
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
+from train import __main__ as program
 from train import checkpoint, run_folder
 from train.config import resolve
 from train.config_io import from_yaml
@@ -98,6 +102,22 @@ def test_another_config_in_the_same_folder_is_refused(finished):
     with pytest.raises(FileError, match="has ppo.learning_rate = 0.0003, this one 0.01; set run.name"):
         train_run(other, quiet(), build_env=build_toy)
     assert from_yaml(folder.config.read_text()) == resolve(config, "native")
+
+
+def test_a_run_that_another_process_trains_is_refused(finished, tmp_path, monkeypatch, capsys):
+    """The lock is another's as long as it lives, and no longer; whoever only reads needs none."""
+    _, folder, config, _ = finished
+    copy = RunFolder(tmp_path / "toy")
+    shutil.copytree(folder.path, copy.path)
+    before = {path: path.read_bytes() for path in copy.path.rglob("*") if path.is_file()}
+    monkeypatch.setattr(train_run, "__defaults__", (build_toy, AutoResetEnv))
+    held = take_lock(copy.lock)
+    assert program.main(["--resume", str(copy.path), "run.num_timesteps=9999"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train: ") and f"process {os.getpid()} on " in line and "set run.name" in line
+    release(held)
+    assert {path: path.read_bytes() for path in before} == before
+    assert program.main(["--resume", str(copy.path)]) == 0
 
 
 def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
