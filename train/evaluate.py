@@ -31,7 +31,7 @@ from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
 from train.rollout import Episodes, Player, episode_keys
 from train.row_files import EvaluationAsked, paths_beside
 from train.rows import episode_table, score_table, write_parquet
-from train.run import check_fits, make_env
+from train.run import check_fits, config_to_play, make_env
 from train.run_folder import FAILURES, RunFolder, claim, versions
 
 LEARNED = "learned"
@@ -256,12 +256,15 @@ def _place(arguments: argparse.Namespace, folder: RunFolder | None, run: str, as
     return Path(arguments.out) if arguments.out or not folder else folder.path / "evaluation" / "episodes.parquet"
 
 
-def _wanted(folder: RunFolder | None, policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
+def _wanted(
+    folder: RunFolder | None, policies: Sequence[str], arguments: argparse.Namespace, console: Console
+) -> TrainConfig:
     """A run's config with the environment that the command line asks for."""
-    config = folder.read_config() if folder else _config_of_yardsticks(policies, arguments)
-    config = config_io.apply_overrides(config, [word for word in arguments.words if "=" in word])
-    scenes = tuple(arguments.scenes) if arguments.scenes else config.env.scenes
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scenes))
+    words = [word for word in arguments.words if "=" in word]
+    if folder:
+        return config_to_play(folder, words, arguments.scenes, console)
+    config = config_io.apply_overrides(_config_of_yardsticks(policies, arguments), words)
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
 
 
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
@@ -280,7 +283,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         if len(runs) > 1 and arguments.out:
             raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
         folders = runs or [None]
-        configs = [_wanted(folder, policies, arguments) for folder in folders]
+        configs = [_wanted(folder, policies, arguments, console) for folder in folders]
         fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
         # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
         kinds = [dataclasses.replace(config.env, k_int=0.0) for config in configs]

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,13 @@ from rich.console import Console
 from tensorboardX import SummaryWriter
 
 import interactive_nav
+from interactive_nav.physics import resolve_backend
 from interactive_nav.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import locked
 from interactive_nav_common.signals import stop_signals
-from train import checkpoint, tracking
+from train import checkpoint, config_io, tracking
 from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
@@ -43,6 +44,35 @@ def make_env(config: EnvConfig) -> Any:
         return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
     except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
+
+
+def config_to_play(
+    folder: RunFolder, words: Sequence[str], scenes: Sequence[str] | None, console: Console
+) -> TrainConfig:
+    """A run's config with the environment to play in: the run's own, but for what a command line asks for.
+
+    What a run learned on a GPU can be played without one: where its backend is not here, another one is taken.
+
+    Args:
+        folder: of the run.
+        words: `env.key=value`; a backend that they name is taken as it is.
+        scenes: folders; None: those that it was trained on.
+        console: told of another backend.
+
+    Raises:
+        UserError: the folder is no run, or a word is wrong.
+    """
+    config = config_io.apply_overrides(folder.read_config(), words)
+    env = dataclasses.replace(config.env, scenes=tuple(scenes) if scenes else config.env.scenes)
+    if not any(word.startswith("env.backend=") for word in words):
+        try:
+            resolve_backend(env.backend)
+        except ValueError:
+            there = resolve_backend("auto")
+            told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
+            console.print(told, highlight=False, soft_wrap=True)
+            env = dataclasses.replace(env, backend=there)
+    return dataclasses.replace(config, env=env)
 
 
 class FolderCallbacks:
