@@ -1,4 +1,7 @@
-"""Imports, and programs that are run by name, go one way: converters and interactive_nav know only the schema; train knows interactive_nav; and so on."""
+"""Imports, and programs run by name, go one way.
+
+Converters and interactive_nav know only the schema; train knows interactive_nav; and so on.
+"""
 
 import ast
 import re

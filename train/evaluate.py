@@ -35,6 +35,8 @@ from train.run import check_fits, config_to_play, make_env
 from train.run_folder import FAILURES, RunFolder, claim, versions
 
 LEARNED = "learned"
+ROWS = "evaluation/episodes.parquet"
+"""Of a run folder's own evaluation."""
 AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
 """Episodes played at a time, per physics backend."""
 
@@ -205,9 +207,9 @@ def _read_episodes(path: str) -> EpisodeFile:
 
 def _config_of_yardsticks(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
     """The default config, for policies that need no run folder."""
-    if LEARNED in policies or not arguments.scenes or not (arguments.out or arguments.dataset):
+    if LEARNED in policies or not arguments.scenes:
         raise ConfigError(
-            "RUN_DIR is missing; without one, expected --scenes, --out and --policies without learned, "
+            "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
             "for example --policies random,follower,avoider,namo:0.5"
         )
     return dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="yardsticks"))
@@ -244,16 +246,19 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
     sizes = ", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items())
     made.add_argument("--batch", type=int, metavar="N", help=f"episodes played at a time (default: {sizes})")
-    made.add_argument("--out", metavar="PATH", help="Parquet file (default RUN_DIR/evaluation/episodes.parquet)")
+    made.add_argument("--out", metavar="PATH", help=f"Parquet file (default RUN_DIR/{ROWS})")
     made.add_argument("--dataset", metavar="DIR", help="add a file for each run and evaluation to this folder instead")
     return made
 
 
-def _place(arguments: argparse.Namespace, folder: RunFolder | None, run: str, asked: EvaluationAsked) -> Path:
-    """Where rows go."""
-    if arguments.dataset:
-        return Path(arguments.dataset) / asked.file_name(run)
-    return Path(arguments.out) if arguments.out or not folder else folder.path / "evaluation" / "episodes.parquet"
+def _place(
+    arguments: argparse.Namespace, folder: RunFolder | None, config: TrainConfig, asked: EvaluationAsked
+) -> Path:
+    """Where rows go; those without a run go where those of a run of their name would."""
+    if words.dataset:
+        return Path(words.dataset) / asked.file_name(config.run.name)
+    home = folder.path if folder else Path(config.run.out_dir) / config.run.name
+    return Path(words.out or home / ROWS)
 
 
 def _wanted(
@@ -302,15 +307,15 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                 settings=tuple(sorted(word for word in arguments.words if "=" in word)),
                 episode_file=_digest(arguments.episode_file) if fixed else "",
             )
-            out = _place(arguments, folder, config.run.name, asked)
+            out = _place(arguments, folder, config, asked)
             claim(out.parent)
             if player is None or kinds[i] != built:
                 player = None  # the old one's memory goes before the new one's comes
                 player, built = Player(build_env(config.env)), kinds[i]
             rows, played = evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch)
             trained_steps = folder.origin().get("env_steps") if folder else None
+            write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
             write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
-            write_paths(paths_beside(out), played, player.env)
             _tell(console, rows, config, player.env, out)
     except UserError as error:
         print(f"train.evaluate: {error}", file=sys.stderr)

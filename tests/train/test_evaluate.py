@@ -14,7 +14,8 @@ from rich.console import Console
 from interactive_nav.env import EPISODE_METRICS
 from tests.train.toy_run import build_toy, toy_config
 from train import checkpoint, evaluate, figures, rollout
-from train.rows import score_table
+from train.row_files import paths_beside
+from train.rows import score_table, write_parquet
 from train.run import train_run
 
 
@@ -143,6 +144,34 @@ def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, ev
     assert evaluate.main([str(run.path), *words], build_env=build) == 0
     assert len({path.name for path in tmp_path.glob("*.parquet")} - files) == 1
     assert pandas.read_parquet(tmp_path).groupby("run").size().to_dict() == {"other": 12, "toy": 24}
+
+
+def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
+    """The README's line: without --out the rows lie where those of a run of that name would."""
+    monkeypatch.chdir(tmp_path)
+    words = ["--scenes", "plane", "--policies", "random", "--episodes", "3"]
+    assert evaluate.main(words, build_env=build_toy) == 0
+    rows = tmp_path / "runs" / "yardsticks" / "evaluation" / "episodes.parquet"
+    assert pq.read_table(rows)["policy"].to_pylist() == ["random"] * 3 and paths_beside(rows).is_file()
+
+
+def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
+    """Paths come first: whoever finds rows finds paths that are as new; a run that is only read is left as it is."""
+    before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if "evaluation" not in str(path)}
+    seen = []
+
+    def at_rows(rows, path, *others):
+        seen.append((path.is_file(), paths_beside(path).is_file() and paths_beside(path).read_bytes()))
+        write_parquet(rows, path, *others)
+
+    monkeypatch.setattr(evaluate, "write_parquet", at_rows)
+    words = [str(run.path), "--policies", "random", "--episodes", "2", "--dataset", str(tmp_path)]
+    for record in ("1", "2"):
+        assert evaluate.main([*words, "--record", record], build_env=build_toy) == 0
+    (rows,) = tmp_path.glob("*.parquet")
+    assert [there for there, _ in seen] == [False, True]
+    assert seen[0][1] != seen[1][1] == paths_beside(rows).read_bytes()
+    assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
 @pytest.mark.parametrize(
