@@ -255,10 +255,10 @@ def _place(
     arguments: argparse.Namespace, folder: RunFolder | None, config: TrainConfig, asked: EvaluationAsked
 ) -> Path:
     """Where rows go; those without a run go where those of a run of their name would."""
-    if words.dataset:
-        return Path(words.dataset) / asked.file_name(config.run.name)
+    if arguments.dataset:
+        return Path(arguments.dataset) / asked.file_name(config.run.name)
     home = folder.path if folder else Path(config.run.out_dir) / config.run.name
-    return Path(words.out or home / ROWS)
+    return Path(arguments.out or home / ROWS)
 
 
 def _wanted(

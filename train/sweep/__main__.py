@@ -28,8 +28,8 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m train.sweep",
         description="Trains and evaluates every run of a sweep. The same command continues what was stopped or killed, "
         "and leaves out what is done.",
-        epilog=f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done, 1 runs were given up, "
-        "2 the file is wrong, 3 stopped by the time limit, 128 + signal",
+        epilog=f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: "
+        "0 all done (or in another sweep's hands), 1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     known = ", ".join(spec.known_sweeps())
@@ -123,7 +123,9 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them", highlight=False)
     if outcome.stopped_by or outcome.timed_out:
         console.print("the same command continues", highlight=False)
-    return outcome.exit_code("trained" if arguments.only == "train" else "done")
+    return outcome.exit_code(
+        "unfinished" if arguments.unfinished else "trained" if arguments.only == "train" else "done"
+    )
 
 
 if __name__ == "__main__":
