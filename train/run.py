@@ -124,6 +124,8 @@ class FolderCallbacks:
         env_mb = 2 * env_mb if env_mb <= self._config.run.env_state_limit_mb else 0.0
         claim(self._folder.path, one_mb * (self._config.run.keep_checkpoints + 2) + env_mb)
         self._folder.cut_metrics(snapshot.env_steps)
+        if snapshot.env_steps < total_steps:
+            self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
         if self._config.run.tensorboard:
             self._events = SummaryWriter(str(self._folder.tensorboard), purge_step=snapshot.env_steps + 1)
         note = getattr(snapshot.env_state, "note", "")
@@ -267,8 +269,8 @@ def _train_in(
             result = ALGORITHMS[config.algorithm].train(wrap_env(env), config, callbacks)
         finally:
             callbacks.close()
-    metrics = result.metrics or last_metrics(folder)
-    write_text(folder.path / "summary.json", json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
+        metrics = result.metrics or last_metrics(folder)
+        write_text(folder.summary, json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
     best = checkpoint.best_checkpoint(checkpoint.list_checkpoints(folder.checkpoints))
     console.print(
         f"{folder.path}: {'done' if result.completed else 'stopped'} at {result.snapshot.env_steps:,} steps; "

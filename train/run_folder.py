@@ -57,6 +57,7 @@ class RunFolder:
         self.metrics = path / METRICS
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
+        self.summary = path / "summary.json"
         self.lock = path / "lock"
 
     def read_config(self) -> TrainConfig:

@@ -28,8 +28,9 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m train.sweep",
         description="Trains and evaluates every run of a sweep. The same command continues what was stopped or killed, "
         "and leaves out what is done.",
-        epilog=f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: "
-        "0 all done (or in another sweep's hands), 1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal",
+        epilog=f"keys of the file (default):\n{spec.help_text()}\n\n"
+        "exit codes: 0 all done (or in another sweep's hands), 1 runs were given up or are not done, 2 the "
+        "file is wrong, 3 stopped by the time limit, 128 + signal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     known = ", ".join(spec.known_sweeps())
