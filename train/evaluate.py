@@ -280,7 +280,11 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name} is {value}, expected at least 1")
+        if arguments.record < 0 or not -(2**63) <= arguments.seed < 2**63:
+            raise ConfigError(f"--record {arguments.record} --seed {arguments.seed}: expected 0 or more and 64 bits")
         policies = tuple(name for name in arguments.policies.split(",") if name)
+        if not policies:
+            raise ConfigError(f"--policies is {arguments.policies!r}, expected at least one, such as {LEARNED}")
         for word in arguments.words:
             if "=" in word and not word.startswith("env."):
                 raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -12,11 +13,14 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.env import EPISODE_METRICS
+from interactive_nav_common.errors import FileError
 from tests.train.toy_run import build_toy, toy_config
 from train import checkpoint, evaluate, figures, rollout
+from train.config import RunConfig
 from train.row_files import paths_beside
 from train.rows import score_table, write_parquet
 from train.run import train_run
+from train.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")
@@ -186,6 +190,9 @@ def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
         (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: cannot read"),
         (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
         (["--episodes", "0"], "--episodes is 0, expected at least 1"),
+        (["--seed", str(2**70)], "--seed 1180591620717411303424: expected 0 or more and 64 bits"),
+        (["--record", "-1"], "--record -1 --seed 1000000: expected 0 or more"),
+        (["--policies", ","], "--policies is ',', expected at least one, such as learned"),
         (["--batch", "0"], "--batch is 0, expected at least 1"),
         (["another", "--out", "rows.parquet"], "--out is for one run; several write into a folder: --dataset DIR"),
         (["ppo.learning_rate=1"], "expected env.<setting>=value"),
@@ -203,9 +210,35 @@ def test_no_run_folder(tmp_path, capsys):
     assert "is no run folder (no config.yaml)" in capsys.readouterr().err
 
 
-def test_checkpoint_of_another_robot(run, tmp_path, capsys):
-    import shutil
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("metrics.jsonl.gz", b"xx", "metrics.jsonl.gz: not readable"),
+        ("evaluation/episodes.npz", b"PK\x03\x04", "episodes.npz: not readable"),
+        ("metrics.jsonl", b"5\n\xff", ""),
+    ],
+)
+def test_damaged_files_are_one_line_for_figures(run, evaluated, tmp_path, capsys, name, data, message):
+    copy = tmp_path / "copy"
+    shutil.copytree(run.path, copy)
+    (copy / name).write_bytes(data)
+    assert figures.main([str(copy), "-o", str(tmp_path / "f")]) == (2 if message else 0)
+    assert message in capsys.readouterr().err
 
+
+def test_a_run_folder_with_damaged_files(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.config.write_bytes(bytes(range(256)))
+    with pytest.raises(FileError, match=r"config.yaml: cannot be read \(not a text file\)"):
+        folder.read_config()
+    (tmp_path / "summary.json").write_text("[]")
+    (tmp_path / "versions.json").write_text("5")
+    assert folder.origin()["env_steps"] is None
+    with pytest.raises(ValueError, match="name is '..', expected one folder name"):
+        RunConfig(name="..")
+
+
+def test_checkpoint_of_another_robot(run, tmp_path, capsys):
     copy = tmp_path / "copy"
     shutil.copytree(run.path, copy)
     path, meta = checkpoint.find(copy / "checkpoints", "last")

@@ -187,7 +187,7 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
         else:
             made[key] = value
     made["name"] = made.get("name") or default_name
-    if made["name"] != Path(made["name"]).name:
+    if made["name"] != Path(made["name"]).name or made["name"] == "..":
         raise ConfigError(f"{where}: name is {made['name']!r}, expected one folder name (out_dir says where it lies)")
     if not made.get("preset"):
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
