@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         chosen = [name for name in (arguments.sweep, arguments.config) if name]
         if len(chosen) != 1:
             raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
-        if arguments.time_limit is not None and arguments.time_limit <= 0:
+        if arguments.time_limit is not None and not arguments.time_limit > 0:
             raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
         if not 0 < arguments.policy_step <= 4:
             raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")

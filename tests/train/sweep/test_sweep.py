@@ -361,6 +361,17 @@ def test_status_prints_every_run_and_does_nothing(tmp_path, capsys):
     assert find_gpus() is not None
 
 
+def test_impossible_words_are_one_line(tmp_path, capsys):
+    path = str(write_sweep(tmp_path))
+    for words, message in (
+        (["--time-limit", "nan"], "--time-limit is nan, expected a positive number of seconds"),
+        (["--where", "env.k_int=["], "--where 'env.k_int=[': not readable"),
+    ):
+        assert main([path, *words], FAKE) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
+
+
 def test_unfinished_runs_can_be_evaluated_as_far_as_they_are(tmp_path):
     slow = {f"k_int{k}-seed{s}": ["slow"] for k in (0, 1) for s in (0, 1)}
     set_fates(tmp_path, slow)
