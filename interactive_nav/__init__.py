@@ -15,10 +15,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from interactive_nav import mjx_without_warp
+
 # The scenes' tables are constants of `reset` and `step`, tens to hundreds of megabytes. Without this, JAX
 # writes them as text into every program that it compiles (measured: 23 s instead of 8 s for a small room).
 # JAX reads it once, at its own import: import interactive_nav first, or set the variable yourself.
 os.environ.setdefault("JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS", "1")
+mjx_without_warp.hush()
 
 if TYPE_CHECKING:
     from interactive_nav import geodesic, metrics, reward

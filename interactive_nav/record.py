@@ -1,17 +1,14 @@
-"""`python -m interactive_nav.record RUN --episode K -o out.mp4`: a run or a replay in, a video out.
+"""`python -m interactive_nav.record REPLAY -o out.mp4`: a replay in, a video out.
 
 The picture: the robot from behind, its goal and path painted on the floor; beside it what the robot's camera
 sees, as colour, depth and class mask; below, the step and its reward, force and touches.
 
-Playing a policy is for `train` to do: for a run, its program is asked for a replay, as a user would.
+Playing a policy is for `train` to do: `python -m train.record RUN` plays an episode of a run, and has it drawn here.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -38,6 +35,7 @@ from interactive_nav.views import (
     robot_camera,
     yaw_of,
 )
+from interactive_nav_common.files import whole_file
 
 FORMATS = (".mp4", ".gif")
 CAMERA_PIXELS = 68
@@ -63,8 +61,7 @@ class Compositor:
             ReplayError: the scene is not the one that the replay was recorded in.
             ValueError: a height that does not divide.
         """
-        if height < 120 or height % 12:
-            raise ValueError(f"height is {height}, expected a multiple of 12 from 120 on")
+        check_height(height)
         check_scene(replay, scene)
         self.replay, self.height = replay, height
         robot = get_robot(replay.robot)
@@ -127,6 +124,18 @@ class Compositor:
         return np.asarray(strip)
 
 
+def check_height(height: int) -> None:
+    """Raises `ValueError` unless every part of a frame of so many rows has whole, even pixels."""
+    if height < 120 or height % 12:
+        raise ValueError(f"height is {height}, expected a multiple of 12 from 120 on")
+
+
+def check_format(path: Path) -> None:
+    """Raises `ReplayError` unless a video can be written to a file of that ending."""
+    if path.suffix not in FORMATS:
+        raise ReplayError(f"{path}: ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
+
+
 def check_scene(replay: Replay, scene: Scene) -> None:
     """Raises `ReplayError` unless the scene's files are those that the replay was recorded in."""
     if scene.digest != replay.scene_digest:
@@ -161,21 +170,14 @@ def write_video(
 
     Raises:
         ReplayError: another ending.
+        FileError: it cannot be written.
     """
-    if path.suffix not in FORMATS:
-        raise ReplayError(f"{path}: ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
+    check_format(path)
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
     rate = 1.0 / (compositor.replay.control_dt_s * every)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        write = _write_gif if path.suffix == ".gif" else _write_mp4
+    write = _write_gif if path.suffix == ".gif" else _write_mp4
+    with whole_file(path) as partial:
         write(_counted(compositor, steps, on_progress), partial, rate, compositor.size)
-        os.replace(partial, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise
     return len(steps)
 
 
@@ -208,65 +210,76 @@ def _write_gif(frames: Iterator[np.ndarray], path: Path, rate: float, size: tupl
     pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0)
 
 
-def replay_of(run: Path, episode: int, policy: str, extra: Sequence[str] = ()) -> Path:
-    """Has `train.replay` play an episode of a run.
-
-    Returns:
-        The replay's file, RUN/replays/<policy>-episode<K>.npz.
+def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
+    """Where a run keeps the replay of an episode.
 
     Raises:
-        ReplayError: the program refused; it has said why on stderr.
+        ReplayError: it has none; the message says who plays one.
     """
-    words = ["--episodes", str(episode), "--policies", policy, *extra]
-    done = subprocess.run([sys.executable, "-m", "train.replay", str(run), *words])
-    if done.returncode:
-        raise ReplayError(
-            f"{run}: no replay of episode {episode} (python -m train.replay ended with {done.returncode})"
-        )
-    return run / "replays" / f"{policy}-episode{episode}.npz"
+    path = run / "replays" / f"{policy}-episode{episode}.npz"
+    if not path.is_file():
+        words = f"{run} --episode {episode} --policy {policy} -o {out}"
+        raise ReplayError(f"{path}: no such replay; play the episode and draw it: python -m train.record {words}")
+    return path
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    made = argparse.ArgumentParser(prog="python -m interactive_nav.record", description="Makes a video of an episode.")
-    made.add_argument("run", metavar="RUN", help="folder that `python -m train` wrote, or a replay (.npz)")
+def add_picture_words(made: argparse.ArgumentParser) -> None:
+    """What to draw, and where to."""
     made.add_argument("--episode", type=int, default=0, metavar="K", help="which of the fixed episodes (default 0)")
     made.add_argument("--policy", default="learned", help="learned (default), or a policy of `train.evaluate`")
-    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
     made.add_argument("-o", "--out", default="episode.mp4", metavar="PATH", help=".mp4 or .gif (default episode.mp4)")
     made.add_argument("--height", type=int, default=360, help="rows of the view from behind (default 360)")
     made.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N control steps (default 1)")
-    return made
+
+
+def check_picture_words(arguments: argparse.Namespace) -> None:
+    """Refuses what cannot be drawn, before anything is played.
+
+    Raises:
+        ValueError: the message says what.
+    """
+    check_format(Path(arguments.out))
+    check_height(arguments.height)
+    if arguments.every < 1 or arguments.episode < 0:
+        raise ReplayError(f"--every {arguments.every} --episode {arguments.episode}: expected 1 and 0 or more")
+
+
+def record(source: Path, arguments: argparse.Namespace, console: Console) -> None:
+    """Draws a replay as the words of `add_picture_words` say.
+
+    Raises:
+        ValueError, OSError: the replay or its scene cannot be read, or the video not be written.
+    """
+    replay, out = load(source), Path(arguments.out)
+    compositor = Compositor(replay, load_scene(replay.scene), arguments.height)
+    columns = (
+        *(SpinnerColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} frames")),
+        *(TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=-(-replay.num_steps // arguments.every) + 1)
+        frames = write_video(compositor, out, arguments.every, lambda n: bar.update(task, completed=n))
+    console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Records; 0 when done, 2 on a user's error, 130 when interrupted."""
-    arguments = parser().parse_args(argv)
-    out, source = Path(arguments.out), Path(arguments.run)
-    console = Console()
+    made = argparse.ArgumentParser(prog="python -m interactive_nav.record", description="Makes a video of an episode.")
+    made.add_argument("replay", metavar="REPLAY", help="a replay (.npz), or a run folder that holds the episode's")
+    add_picture_words(made)
+    arguments = made.parse_args(argv)
+    source = Path(arguments.replay)
     try:
-        if out.suffix not in FORMATS:
-            raise ReplayError(f"{out}: ends in '{out.suffix}', expected one of {', '.join(FORMATS)}")
-        if arguments.every < 1 or arguments.episode < 0:
-            raise ReplayError(f"--every {arguments.every} --episode {arguments.episode}: expected 1 and 0 or more")
+        check_picture_words(arguments)
         if source.suffix != ".npz":
-            source = replay_of(source, arguments.episode, arguments.policy, ["--checkpoint", arguments.checkpoint])
-        replay = load(source)
-        compositor = Compositor(replay, load_scene(replay.scene), arguments.height)
-        columns = (
-            *(SpinnerColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} frames")),
-            *(TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()),
-        )
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-            task = bar.add_task("", total=-(-replay.num_steps // arguments.every) + 1)
-            frames = write_video(compositor, out, arguments.every, lambda n: bar.update(task, completed=n))
+            source = replay_of(source, arguments.episode, arguments.policy, arguments.out)
+        record(source, arguments, Console())
     except (ValueError, OSError) as error:  # ReplayError, SceneError and an unknown robot are ValueErrors
         print(f"interactive_nav.record: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interactive_nav.record: stopped; no video was written", file=sys.stderr)
         return 130
-    console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
     return 0
 
 

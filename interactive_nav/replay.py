@@ -6,11 +6,9 @@ alone: without the policy, the physics, or the other scenes of the environment t
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import json
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +23,7 @@ from interactive_nav.env import EPISODE_METRICS, InteractiveNav
 from interactive_nav.object_folders import small_objects
 from interactive_nav.objects import SmallObject
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.files import whole_file
 
 FORMAT = 1
 _CHUNK_STEPS = 50
@@ -252,20 +251,15 @@ def world_poses(env: InteractiveNav, scene: int, qpos: np.ndarray) -> tuple[Any,
 
 
 def save(replay: Replay, path: str | Path) -> None:
-    """Writes a replay as npz, whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Writes a replay as npz, whole or not at all.
+
+    Raises:
+        FileError: it cannot be written.
+    """
     fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
     header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        with open(partial, "wb") as file:
-            np.savez_compressed(file, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
-        os.replace(partial, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
 
 
 def load(path: str | Path) -> Replay:
@@ -279,8 +273,16 @@ def load(path: str | Path) -> Replay:
         raise ReplayError(f"{path}: no such file, expected a replay (npz)")
     try:
         with np.load(path, allow_pickle=False) as stored:
+            if "policies" in stored.files:
+                raise ReplayError(
+                    f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "
+                    f"bodies; draw the paths (python -m train.figures {path.parent}), or play the episode again "
+                    "(python -m train.replay RUN_DIR)"
+                )
             header = json.loads(str(stored["header"]))
             arrays = {name: stored[name] for name in _ARRAYS}
+    except ReplayError:
+        raise
     except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
         raise ReplayError(f"{path}: is no replay or damaged ({error}); record the episode again") from error
     if header.pop("format", None) != FORMAT:

@@ -86,7 +86,7 @@ def locked(path: Path, busy: str) -> Iterator[None]:
     """
     descriptor = take_lock(path)
     if descriptor is None:
-        raise FileError(busy.format(holder=holder(path)))
+        raise FileError(busy.replace("{holder}", holder(path)))  # a path in it may have braces
     try:
         yield
     finally:

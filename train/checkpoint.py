@@ -63,8 +63,8 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
                 np.savez(file, *leaves)
                 _flush(file)
         _write(partial / META, json.dumps(dataclasses.asdict(meta), indent=1).encode())
-        if final.exists():  # written twice: a stop right after an interval
-            shutil.rmtree(final)
+        if final.exists():
+            _remove(final)
         os.replace(partial, final)
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
@@ -76,7 +76,7 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
     best = best_checkpoint(kept)
     for old in kept[:-keep]:
         if old != best:
-            shutil.rmtree(root / f"{old.env_steps:012d}")
+            _remove(root / f"{old.env_steps:012d}")
     for old in kept[:-1]:
         (root / f"{old.env_steps:012d}" / ENV_STATE).unlink(missing_ok=True)
     return final
@@ -213,6 +213,13 @@ def remove_partial(root: Path) -> None:
     """Removes what a killed run had begun to write."""
     for left_over in root.glob(".partial-*"):
         shutil.rmtree(left_over, ignore_errors=True)
+
+
+def _remove(folder: Path) -> None:
+    """Whole for a reader, or not there at all."""
+    gone = folder.with_name(f".partial-gone-{folder.name}")
+    os.replace(folder, gone)
+    shutil.rmtree(gone)
 
 
 def _write(path: Path, data: bytes) -> None:

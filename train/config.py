@@ -267,7 +267,7 @@ class RunConfig:
         _require(self, "seed", 0, 2**32 - 1)
         _require(self, "num_timesteps log_every_steps checkpoint_every_steps keep_checkpoints", 1)
         _require(self, "env_state_limit_mb", 0.0)
-        if self.name != Path(self.name).name:
+        if self.name != Path(self.name).name or self.name == "..":
             raise ValueError(f"name is {self.name!r}, expected one folder name (out_dir says where it lies)")
         if self.checkpoint_every_steps < self.log_every_steps:
             raise ValueError(

@@ -31,10 +31,12 @@ from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
 from train.rollout import Episodes, Player, episode_keys
 from train.row_files import EvaluationAsked, paths_beside
 from train.rows import episode_table, score_table, write_parquet
-from train.run import check_fits, make_env
+from train.run import check_fits, config_to_play, make_env
 from train.run_folder import FAILURES, RunFolder, claim, versions
 
 LEARNED = "learned"
+ROWS = "evaluation/episodes.parquet"
+"""Of a run folder's own evaluation."""
 AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
 """Episodes played at a time, per physics backend."""
 
@@ -205,9 +207,9 @@ def _read_episodes(path: str) -> EpisodeFile:
 
 def _config_of_yardsticks(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
     """The default config, for policies that need no run folder."""
-    if LEARNED in policies or not arguments.scenes or not (arguments.out or arguments.dataset):
+    if LEARNED in policies or not arguments.scenes:
         raise ConfigError(
-            "RUN_DIR is missing; without one, expected --scenes, --out and --policies without learned, "
+            "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
             "for example --policies random,follower,avoider,namo:0.5"
         )
     return dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="yardsticks"))
@@ -244,24 +246,30 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
     sizes = ", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items())
     made.add_argument("--batch", type=int, metavar="N", help=f"episodes played at a time (default: {sizes})")
-    made.add_argument("--out", metavar="PATH", help="Parquet file (default RUN_DIR/evaluation/episodes.parquet)")
+    made.add_argument("--out", metavar="PATH", help=f"Parquet file (default RUN_DIR/{ROWS})")
     made.add_argument("--dataset", metavar="DIR", help="add a file for each run and evaluation to this folder instead")
     return made
 
 
-def _place(arguments: argparse.Namespace, folder: RunFolder | None, run: str, asked: EvaluationAsked) -> Path:
-    """Where rows go."""
+def _place(
+    arguments: argparse.Namespace, folder: RunFolder | None, config: TrainConfig, asked: EvaluationAsked
+) -> Path:
+    """Where rows go; those without a run go where those of a run of their name would."""
     if arguments.dataset:
-        return Path(arguments.dataset) / asked.file_name(run)
-    return Path(arguments.out) if arguments.out or not folder else folder.path / "evaluation" / "episodes.parquet"
+        return Path(arguments.dataset) / asked.file_name(config.run.name)
+    home = folder.path if folder else Path(config.run.out_dir) / config.run.name
+    return Path(arguments.out or home / ROWS)
 
 
-def _wanted(folder: RunFolder | None, policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
+def _wanted(
+    folder: RunFolder | None, policies: Sequence[str], arguments: argparse.Namespace, console: Console
+) -> TrainConfig:
     """A run's config with the environment that the command line asks for."""
-    config = folder.read_config() if folder else _config_of_yardsticks(policies, arguments)
-    config = config_io.apply_overrides(config, [word for word in arguments.words if "=" in word])
-    scenes = tuple(arguments.scenes) if arguments.scenes else config.env.scenes
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scenes))
+    words = [word for word in arguments.words if "=" in word]
+    if folder:
+        return config_to_play(folder, words, arguments.scenes, console)
+    config = config_io.apply_overrides(_config_of_yardsticks(policies, arguments), words)
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
 
 
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
@@ -272,7 +280,11 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name} is {value}, expected at least 1")
+        if arguments.record < 0 or not -(2**63) <= arguments.seed < 2**63:
+            raise ConfigError(f"--record {arguments.record} --seed {arguments.seed}: expected 0 or more and 64 bits")
         policies = tuple(name for name in arguments.policies.split(",") if name)
+        if not policies:
+            raise ConfigError(f"--policies is {arguments.policies!r}, expected at least one, such as {LEARNED}")
         for word in arguments.words:
             if "=" in word and not word.startswith("env."):
                 raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
@@ -280,7 +292,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         if len(runs) > 1 and arguments.out:
             raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
         folders = runs or [None]
-        configs = [_wanted(folder, policies, arguments) for folder in folders]
+        configs = [_wanted(folder, policies, arguments, console) for folder in folders]
         fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
         # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
         kinds = [dataclasses.replace(config.env, k_int=0.0) for config in configs]
@@ -299,15 +311,15 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                 settings=tuple(sorted(word for word in arguments.words if "=" in word)),
                 episode_file=_digest(arguments.episode_file) if fixed else "",
             )
-            out = _place(arguments, folder, config.run.name, asked)
+            out = _place(arguments, folder, config, asked)
             claim(out.parent)
             if player is None or kinds[i] != built:
                 player = None  # the old one's memory goes before the new one's comes
                 player, built = Player(build_env(config.env)), kinds[i]
             rows, played = evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch)
             trained_steps = folder.origin().get("env_steps") if folder else None
+            write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
             write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
-            write_paths(paths_beside(out), played, player.env)
             _tell(console, rows, config, player.env, out)
     except UserError as error:
         print(f"train.evaluate: {error}", file=sys.stderr)

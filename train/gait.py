@@ -17,7 +17,7 @@ import argparse
 import dataclasses
 import importlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -404,24 +404,43 @@ def evaluate(robot: str, backend: str, network: Network | None, num_envs: int, s
     return {name: float(values.mean()) for name, values in first.items()}
 
 
+def _positive(kind: type) -> Callable[[str], Any]:
+    def number(text: str) -> Any:
+        if not kind(text) > 0:
+            raise argparse.ArgumentTypeError(f"{text}, expected above 0")
+        return kind(text)
+
+    return number
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line."""
     made = argparse.ArgumentParser(
         prog="python -m train.gait", description="Trains the network that corrects a legged robot's scripted gait."
     )
     made.add_argument("--robot", nargs="+", choices=ROBOTS, required=True, help="one after the other")
-    made.add_argument("--backend", default="auto", help="physics: warp, jax, native, auto")
-    made.add_argument("--num-envs", type=int, help="environments stepped together (default: by backend)")
+    made.add_argument(
+        "--backend", default="auto", choices=("auto", "warp", "jax", "native"), help="physics: warp, jax, native, auto"
+    )
+    made.add_argument("--num-envs", type=_positive(int), help="environments stepped together (default: by backend)")
     made.add_argument("--seed", type=int, default=0)
-    made.add_argument("--max-seconds", type=float, nargs="+", default=[3600.0], help="per robot, compiling included")
-    made.add_argument("--steps", type=int, default=1_000_000_000, help="environment steps at most")
-    made.add_argument("--log-every", type=int, help="environment steps between two lines and exports")
+    made.add_argument(
+        "--max-seconds", type=_positive(float), nargs="+", default=[3600.0], help="per robot, compiling included"
+    )
+    made.add_argument("--steps", type=_positive(int), default=1_000_000_000, help="environment steps at most")
+    made.add_argument("--log-every", type=_positive(int), help="environment steps between two lines and exports")
     made.add_argument("--out", type=Path, default=Path("runs/gait"))
     made.add_argument(
         "--evaluate", type=Path, help="train nothing: compare the script with OUT/<robot>.npz of this OUT"
     )
     args = made.parse_args(argv)
-    backend = resolve_backend(args.backend)
+    missing = [robot for robot in args.robot if args.evaluate and not (args.evaluate / f"{robot}.npz").is_file()]
+    if missing:
+        made.error(f"--evaluate {args.evaluate}: holds no {missing[0]}.npz; train it first (--out)")
+    try:
+        backend = resolve_backend(args.backend)
+    except ValueError as error:
+        made.error(str(error))
     if args.evaluate:
         for robot in args.robot:
             networks = {"script": None, "network": load_network(args.evaluate / f"{robot}.npz")}

@@ -3,13 +3,12 @@
 Episode K starts as row K of `python -m train.evaluate` with the same seed: same place, goal and objects. The
 numbers that a network computes may differ in their last bits with the size of the batch, so a close call may
 end otherwise; a replay carries its own scores. Videos and maps are drawn from its files:
-`python -m interactive_nav.record`, `python -m interactive_nav.topdown`.
+`python -m train.record`, `python -m interactive_nav.topdown`.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,12 +18,11 @@ from rich.console import Console
 
 from interactive_nav import replay
 from interactive_nav_common.errors import ConfigError, UserError
-from train import config_io
 from train.config import EnvConfig
 from train.evaluate import LEARNED, load_policy
 from train.policies import YARDSTICKS
 from train.rollout import episode_keys
-from train.run import make_env
+from train.run import config_to_play, make_env
 from train.run_folder import RunFolder, claim
 
 
@@ -62,10 +60,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
         episodes = [int(word) for word in arguments.episodes.split(",")]
         folder = RunFolder(Path(arguments.run))
-        config = folder.read_config()
-        config = config_io.apply_overrides(config, arguments.overrides)
-        if arguments.scenes:
-            config = dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
+        config = config_to_play(folder, arguments.overrides, arguments.scenes, console)
         claim(folder.path / "replays")
         env = build_env(config.env)
         keys = episode_keys(arguments.seed, max(episodes) + 1)

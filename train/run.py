@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,13 @@ from rich.console import Console
 from tensorboardX import SummaryWriter
 
 import interactive_nav
+from interactive_nav.physics import resolve_backend
 from interactive_nav.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
+from interactive_nav_common.locks import locked
 from interactive_nav_common.signals import stop_signals
-from train import checkpoint, tracking
+from train import checkpoint, config_io, tracking
 from train.algorithms import ALGORITHMS
 from train.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
@@ -42,6 +44,35 @@ def make_env(config: EnvConfig) -> Any:
         return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
     except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
+
+
+def config_to_play(
+    folder: RunFolder, words: Sequence[str], scenes: Sequence[str] | None, console: Console
+) -> TrainConfig:
+    """A run's config with the environment to play in: the run's own, but for what a command line asks for.
+
+    What a run learned on a GPU can be played without one: where its backend is not here, another one is taken.
+
+    Args:
+        folder: of the run.
+        words: `env.key=value`; a backend that they name is taken as it is.
+        scenes: folders; None: those that it was trained on.
+        console: told of another backend.
+
+    Raises:
+        UserError: the folder is no run, or a word is wrong.
+    """
+    config = config_io.apply_overrides(folder.read_config(), words)
+    env = dataclasses.replace(config.env, scenes=tuple(scenes) if scenes else config.env.scenes)
+    if not any(word.startswith("env.backend=") for word in words):
+        try:
+            resolve_backend(env.backend)
+        except ValueError:
+            there = resolve_backend("auto")
+            told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
+            console.print(told, highlight=False, soft_wrap=True)
+            env = dataclasses.replace(env, backend=there)
+    return dataclasses.replace(config, env=env)
 
 
 class FolderCallbacks:
@@ -93,6 +124,8 @@ class FolderCallbacks:
         env_mb = 2 * env_mb if env_mb <= self._config.run.env_state_limit_mb else 0.0
         claim(self._folder.path, one_mb * (self._config.run.keep_checkpoints + 2) + env_mb)
         self._folder.cut_metrics(snapshot.env_steps)
+        if snapshot.env_steps < total_steps:
+            self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
         if self._config.run.tensorboard:
             self._events = SummaryWriter(str(self._folder.tensorboard), purge_step=snapshot.env_steps + 1)
         note = getattr(snapshot.env_state, "note", "")
@@ -214,6 +247,15 @@ def train_run(
             folder.path.rmdir()
             folder.path.parent.rmdir()
         raise
+    busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
+    with locked(folder.lock, busy):
+        return _train_in(folder, config, env, console, wrap_env)
+
+
+def _train_in(
+    folder: RunFolder, config: TrainConfig, env: Any, console: Console, wrap_env: Callable[[Any], Env]
+) -> tuple[TrainResult, RunFolder, int | None]:
+    """Trains in a folder that nobody else writes to."""
     exists = folder.open(config)
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
@@ -227,8 +269,8 @@ def train_run(
             result = ALGORITHMS[config.algorithm].train(wrap_env(env), config, callbacks)
         finally:
             callbacks.close()
-    metrics = result.metrics or last_metrics(folder)
-    write_text(folder.path / "summary.json", json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
+        metrics = result.metrics or last_metrics(folder)
+        write_text(folder.summary, json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
     best = checkpoint.best_checkpoint(checkpoint.list_checkpoints(folder.checkpoints))
     console.print(
         f"{folder.path}: {'done' if result.completed else 'stopped'} at {result.snapshot.env_steps:,} steps; "

@@ -6,6 +6,7 @@
                  tensorboard/      the same as events
                  checkpoints/      see `checkpoint`
                  summary.json      how it ended
+                 lock              held by the process that trains it
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,8 @@ class RunFolder:
         self.metrics = path / METRICS
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
+        self.summary = path / "summary.json"
+        self.lock = path / "lock"
 
     def read_config(self) -> TrainConfig:
         """The resolved config of the run.
@@ -66,7 +70,12 @@ class RunFolder:
         """
         if not self.config.is_file():
             raise FileError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
-        return from_yaml(self.config.read_text(), where=str(self.config))
+        try:
+            text = self.config.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not a text file"
+            raise FileError(f"{self.config}: cannot be read ({reason}); expected the config of a run") from None
+        return from_yaml(text, where=str(self.config))
 
     def open(self, config: TrainConfig) -> bool:
         """Writes config and versions of a new run, or checks that an existing one is continued as it began.
@@ -95,9 +104,10 @@ class RunFolder:
         kept = {}
         for name in ("summary.json", "versions.json"):
             try:
-                kept[name] = json.loads((self.path / name).read_text())
+                found = json.loads((self.path / name).read_text())
             except (OSError, ValueError):
-                kept[name] = {}
+                found = {}
+            kept[name] = found if isinstance(found, dict) else {}
         summary, versions = kept.values()
         return {
             "completed": summary.get("completed", False),
@@ -139,14 +149,24 @@ def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out."""
-    everything = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    try:
+        everything = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    except (OSError, EOFError, zlib.error) as error:
+        raise FileError(f"{path}: not readable ({error}); expected the metrics of a run") from None
     lines = []
-    for text in everything.decode().splitlines():
+    for text in everything.decode(errors="replace").splitlines():
         try:
-            lines.append(json.loads(text))
+            line = json.loads(text)
         except ValueError:
             break
+        if not isinstance(line, dict):
+            break
+        lines.append(line)
     return lines
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -12,10 +13,14 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.env import EPISODE_METRICS
+from interactive_nav_common.errors import FileError
 from tests.train.toy_run import build_toy, toy_config
 from train import checkpoint, evaluate, figures, rollout
-from train.rows import score_table
+from train.config import RunConfig
+from train.row_files import paths_beside
+from train.rows import score_table, write_parquet
 from train.run import train_run
+from train.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +150,34 @@ def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, ev
     assert pandas.read_parquet(tmp_path).groupby("run").size().to_dict() == {"other": 12, "toy": 24}
 
 
+def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
+    """The README's line: without --out the rows lie where those of a run of that name would."""
+    monkeypatch.chdir(tmp_path)
+    words = ["--scenes", "plane", "--policies", "random", "--episodes", "3"]
+    assert evaluate.main(words, build_env=build_toy) == 0
+    rows = tmp_path / "runs" / "yardsticks" / "evaluation" / "episodes.parquet"
+    assert pq.read_table(rows)["policy"].to_pylist() == ["random"] * 3 and paths_beside(rows).is_file()
+
+
+def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
+    """Paths come first: whoever finds rows finds paths that are as new; a run that is only read is left as it is."""
+    before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if "evaluation" not in str(path)}
+    seen = []
+
+    def at_rows(rows, path, *others):
+        seen.append((path.is_file(), paths_beside(path).is_file() and paths_beside(path).read_bytes()))
+        write_parquet(rows, path, *others)
+
+    monkeypatch.setattr(evaluate, "write_parquet", at_rows)
+    words = [str(run.path), "--policies", "random", "--episodes", "2", "--dataset", str(tmp_path)]
+    for record in ("1", "2"):
+        assert evaluate.main([*words, "--record", record], build_env=build_toy) == 0
+    (rows,) = tmp_path.glob("*.parquet")
+    assert [there for there, _ in seen] == [False, True]
+    assert seen[0][1] != seen[1][1] == paths_beside(rows).read_bytes()
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -157,6 +190,9 @@ def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, ev
         (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: cannot read"),
         (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
         (["--episodes", "0"], "--episodes is 0, expected at least 1"),
+        (["--seed", str(2**70)], "--seed 1180591620717411303424: expected 0 or more and 64 bits"),
+        (["--record", "-1"], "--record -1 --seed 1000000: expected 0 or more"),
+        (["--policies", ","], "--policies is ',', expected at least one, such as learned"),
         (["--batch", "0"], "--batch is 0, expected at least 1"),
         (["another", "--out", "rows.parquet"], "--out is for one run; several write into a folder: --dataset DIR"),
         (["ppo.learning_rate=1"], "expected env.<setting>=value"),
@@ -174,9 +210,35 @@ def test_no_run_folder(tmp_path, capsys):
     assert "is no run folder (no config.yaml)" in capsys.readouterr().err
 
 
-def test_checkpoint_of_another_robot(run, tmp_path, capsys):
-    import shutil
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("metrics.jsonl.gz", b"xx", "metrics.jsonl.gz: not readable"),
+        ("evaluation/episodes.npz", b"PK\x03\x04", "episodes.npz: not readable"),
+        ("metrics.jsonl", b"5\n\xff", ""),
+    ],
+)
+def test_damaged_files_are_one_line_for_figures(run, evaluated, tmp_path, capsys, name, data, message):
+    copy = tmp_path / "copy"
+    shutil.copytree(run.path, copy)
+    (copy / name).write_bytes(data)
+    assert figures.main([str(copy), "-o", str(tmp_path / "f")]) == (2 if message else 0)
+    assert message in capsys.readouterr().err
 
+
+def test_a_run_folder_with_damaged_files(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.config.write_bytes(bytes(range(256)))
+    with pytest.raises(FileError, match=r"config.yaml: cannot be read \(not a text file\)"):
+        folder.read_config()
+    (tmp_path / "summary.json").write_text("[]")
+    (tmp_path / "versions.json").write_text("5")
+    assert folder.origin()["env_steps"] is None
+    with pytest.raises(ValueError, match="name is '..', expected one folder name"):
+        RunConfig(name="..")
+
+
+def test_checkpoint_of_another_robot(run, tmp_path, capsys):
     copy = tmp_path / "copy"
     shutil.copytree(run.path, copy)
     path, meta = checkpoint.find(copy / "checkpoints", "last")

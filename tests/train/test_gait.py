@@ -78,3 +78,18 @@ def test_the_command_trains_and_writes_a_network(tmp_path, capsys):
     assert script.startswith("ant, script: ") and corrected.startswith("ant, network: ")
     # The script does not fall, nor does it after two updates that began at it.
     assert "fallen 0.000  length 500.000" in script
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--num-envs", "0"], "--num-envs: 0, expected above 0"),
+        (["--max-seconds", "nan"], "--max-seconds: nan, expected above 0"),
+        (["--backend", "gpu"], "invalid choice: 'gpu'"),
+        (["--evaluate", "/nowhere"], "--evaluate /nowhere: holds no ant.npz; train it first"),
+    ],
+)
+def test_impossible_settings_are_refused(words, message, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--robot", "ant", *words])
+    assert ended.value.code == 2 and message in capsys.readouterr().err

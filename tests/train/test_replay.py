@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
+import importlib.util
 
 import numpy as np
 import pytest
 
-from interactive_nav import record, replay
+import interactive_nav.record
+from interactive_nav import replay, topdown
 from tests.train.toy_run import toy_config
+from train import record
 from train import replay as program
 from train.config import EnvConfig, resolve
 from train.run_folder import RunFolder
@@ -26,28 +27,68 @@ def run(tmp_path_factory, room):
     return folder.path
 
 
-def test_one_command_makes_a_video_of_a_run(run, tmp_path, monkeypatch, capsys):
-    called = []
-
-    def in_this_process(words):
-        called.append(words)
-        return subprocess.CompletedProcess(words, program.main(words[3:]))
-
-    monkeypatch.setattr(record.subprocess, "run", in_this_process)
+def test_one_command_makes_a_video_of_a_run(run, tmp_path, capsys):
     out = tmp_path / "out.mp4"
-    arguments = ["--episode", "2", "--policy", "random", "--height", "120", "--every", "5", "-o", str(out)]
-    assert record.main([str(run), *arguments]) == 0
-    assert called[0][:3] == [sys.executable, "-m", "train.replay"]
-    assert out.stat().st_size > 1000
+    pictures = ["--height", "120", "--every", "5", "-o", str(out)]
+    asked = [str(run), "--episode", "2", "--policy", "random"]
+    # Whoever only draws plays nothing, and says who does.
+    assert interactive_nav.record.main([*asked, *pictures]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"python -m train.record {run} --episode 2 --policy random -o {out}" in line
+    assert record.main([*asked, *pictures]) == 0
+    size = out.stat().st_size
+    assert size > 1000
     kept = replay.load(program.replay_path(run, "random", 2))
     assert (kept.policy, kept.episode, kept.num_steps) == ("random", 2, 15)
     printed = "".join(capsys.readouterr().out.split())  # the console breaks lines where it is narrow
     assert f"{out}:4framesofrandom,episode2" in printed
-    # Without a checkpoint there is no learned policy: the program says so, and no video is left behind.
     out.unlink()
-    assert record.main([str(run), "-o", str(out)]) == 2
-    assert "no replay of episode 0 (python -m train.replay ended with 2)" in capsys.readouterr().err
+    assert interactive_nav.record.main([*asked, *pictures]) == 0  # the replay is there now
+    assert out.stat().st_size == size
+
+
+def test_what_cannot_be_drawn_is_not_played(run, tmp_path, capsys):
+    out = tmp_path / "out.mp4"
+    for words, message in (
+        (["-o", str(out)], "holds no checkpoint"),
+        (["-o", "x.avi"], "ends in '.avi', expected one of .mp4, .gif"),
+        (["--height", "125"], "height is 125, expected a multiple of 12"),
+        (["--every", "0"], "--every 0 --episode 0: expected 1 and 0 or more"),
+    ):
+        assert record.main([str(run), *words]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
     assert not out.exists()
+
+
+def test_paths_of_an_evaluation_are_no_replay(tmp_path, capsys):
+    """They have no poses of bodies: the message says what they are, and what draws them."""
+    paths = tmp_path / "evaluation" / "episodes.npz"
+    paths.parent.mkdir()
+    np.savez(paths, **{"policies": np.array(["learned"]), "learned/goal_xy_w": np.zeros((1, 2))})
+    for drawn in (interactive_nav.record, topdown):
+        assert drawn.main([str(paths), "-o", str(tmp_path / "out.gif")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "holds paths that an evaluation recorded, expected a replay" in line
+        assert f"python -m train.figures {paths.parent}" in line and "damaged" not in line
+
+
+@pytest.mark.parametrize("words", [[], ["env.backend=warp"]])
+def test_a_run_of_a_gpu_is_played_without_one(run, tmp_path, monkeypatch, capsys, words):
+    """Unless the command line itself asks for what is not here."""
+    copy = RunFolder(tmp_path / "run")
+    copy.path.mkdir()
+    copy.config.write_text(RunFolder(run).config.read_text().replace("backend: native", "backend: warp"))
+    usual = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
+    ended = program.main([str(copy.path), "--policies", "random", *words])
+    said = capsys.readouterr()
+    if words:
+        assert ended == 2 and "backend is 'warp'" in said.err
+    else:
+        assert ended == 0
+        assert f"{copy.path}: trained with backend warp, which is not here; played with native" in said.out
+        assert replay.load(program.replay_path(copy.path, "random", 0)).num_steps == 15
 
 
 def test_an_episode_starts_as_its_number_says_whoever_plays_it(run):

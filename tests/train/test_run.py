@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,10 +19,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from interactive_nav.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.locks import release, take_lock
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
-from train import checkpoint, run_folder
+from train import __main__ as program
+from train import checkpoint, run, run_folder
 from train.config import resolve
 from train.config_io import from_yaml
 from train.errors import CheckpointError, DivergedError
@@ -100,6 +105,22 @@ def test_another_config_in_the_same_folder_is_refused(finished):
     assert from_yaml(folder.config.read_text()) == resolve(config, "native")
 
 
+def test_a_run_that_another_process_trains_is_refused(finished, tmp_path, monkeypatch, capsys):
+    """The lock is another's as long as it lives, and no longer; whoever only reads needs none."""
+    _, folder, config, _ = finished
+    copy = RunFolder(tmp_path / "toy")
+    shutil.copytree(folder.path, copy.path)
+    before = {path: path.read_bytes() for path in copy.path.rglob("*") if path.is_file()}
+    monkeypatch.setattr(train_run, "__defaults__", (build_toy, AutoResetEnv))
+    held = take_lock(copy.lock)
+    assert program.main(["--resume", str(copy.path), "run.num_timesteps=9999"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train: ") and f"process {os.getpid()} on " in line and "set run.name" in line
+    release(held)
+    assert {path: path.read_bytes() for path in before} == before
+    assert program.main(["--resume", str(copy.path)]) == 0
+
+
 def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
     meta = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)
     scores = {100: None, 200: 0.9, 300: 0.5, 400: 0.7, 500: 0.8}
@@ -127,6 +148,55 @@ def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
         checkpoint.load_learner(path, {"w": np.zeros(3)})
     with pytest.raises(CheckpointError, match="holds no checkpoint"):
         checkpoint.find(tmp_path / "none", "best")
+
+
+def test_a_checkpoint_that_goes_is_gone_for_readers_at_once(tmp_path, monkeypatch):
+    """An evaluation may look while a run trains: it never finds half a checkpoint."""
+    meta = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)
+    snapshot = type("S", (), {"learner": {"w": np.zeros(3)}, "env_state": None})()
+    usual, seen = shutil.rmtree, []
+
+    def slow(path, *words, **named):
+        seen.append([c.env_steps for c in checkpoint.list_checkpoints(tmp_path)])
+        usual(path, *words, **named)
+
+    monkeypatch.setattr(checkpoint.shutil, "rmtree", slow)
+    for steps in (100, 200):
+        checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps), 1, 1.0)
+    assert seen == [[200]] and [path.name for path in tmp_path.iterdir()] == ["000000000200"]
+
+
+def test_a_signal_after_the_last_update_leaves_a_summary(tmp_path, monkeypatch):
+    def signalled(path, text):
+        if path.name == "summary.json":
+            signal.raise_signal(signal.SIGTERM)
+        write_text(path, text)
+
+    usual = signal.signal(signal.SIGTERM, lambda *_: pytest.fail("too late to be collected"))
+    monkeypatch.setattr(run, "write_text", signalled)
+    try:
+        result, folder, stopped_by = train_run(toy_config(tmp_path, updates=2), quiet(), build_env=build_toy)
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+    assert result.completed and stopped_by == signal.SIGTERM
+    assert folder.origin()["completed"] and folder.origin()["env_steps"] == 2 * UPDATE_STEPS
+
+
+def test_a_run_that_goes_on_no_longer_tells_how_it_ended_before(finished, tmp_path):
+    """Killed in the middle, its rows would else be of fewer steps than their checkpoint."""
+    _, folder, config, _ = finished
+    copy = RunFolder(tmp_path / "toy")
+    shutil.copytree(folder.path, copy.path)
+    more = dataclasses.replace(config.run, out_dir=str(tmp_path), num_timesteps=7 * UPDATE_STEPS)
+    seen = []
+
+    def watched(self, env_steps):
+        seen.append(copy.origin()["env_steps"])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run.FolderCallbacks, "on_update", watched)
+        train_run(dataclasses.replace(config, run=more), quiet(), build_env=build_toy)
+    assert seen == [None, None] and copy.origin()["env_steps"] == 7 * UPDATE_STEPS
 
 
 def test_score_of_a_checkpoint_weighs_episodes_alike():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -148,9 +149,12 @@ def _by_k_int(by_k_int: dict[float, Path]) -> Figure:
 
 
 def _paths(path: Path) -> dict[str, np.ndarray] | None:
-    with np.load(path) as stored:
-        first = f"{stored['policies'][0]}/goal_xy_w" if "policies" in stored.files else ""
-        return dict(stored) if first and len(stored[first]) else None
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            first = f"{stored['policies'][0]}/goal_xy_w" if "policies" in stored.files else ""
+            return dict(stored) if first and len(stored[first]) else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise FileError(f"{path}: not readable ({error}); evaluate the run again") from None
 
 
 def _name(path: Path) -> str:

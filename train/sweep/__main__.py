@@ -28,8 +28,9 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m train.sweep",
         description="Trains and evaluates every run of a sweep. The same command continues what was stopped or killed, "
         "and leaves out what is done.",
-        epilog=f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done, 1 runs were given up, "
-        "2 the file is wrong, 3 stopped by the time limit, 128 + signal",
+        epilog=f"keys of the file (default):\n{spec.help_text()}\n\n"
+        "exit codes: 0 all done (or in another sweep's hands), 1 runs were given up or are not done, 2 the "
+        "file is wrong, 3 stopped by the time limit, 128 + signal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     known = ", ".join(spec.known_sweeps())
@@ -79,7 +80,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         chosen = [name for name in (arguments.sweep, arguments.config) if name]
         if len(chosen) != 1:
             raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
-        if arguments.time_limit is not None and arguments.time_limit <= 0:
+        if arguments.time_limit is not None and not arguments.time_limit > 0:
             raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
         if not 0 < arguments.policy_step <= 4:
             raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")
@@ -123,7 +124,9 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them", highlight=False)
     if outcome.stopped_by or outcome.timed_out:
         console.print("the same command continues", highlight=False)
-    return outcome.exit_code("trained" if arguments.only == "train" else "done")
+    return outcome.exit_code(
+        "unfinished" if arguments.unfinished else "trained" if arguments.only == "train" else "done"
+    )
 
 
 if __name__ == "__main__":

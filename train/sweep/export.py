@@ -13,6 +13,7 @@ from typing import Any
 import pyarrow as pa
 
 from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import whole_file
 from train import checkpoint
 from train.errors import CheckpointError
 from train.policy_file import STEP
@@ -74,25 +75,25 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rows = read_rows(new)
     replaced = {name for name in rows["run"].unique().to_pylist() if name}
-    for path in (path for name in replaced for path in files_of_run(out, name)):  # of an export that did not merge
-        path.unlink()
     old = sorted(out.glob("*.parquet"))
-    if old:
-        kept = read_rows(old)
+    superseded = {path for name in replaced for path in files_of_run(out, name)}  # of an export that did not merge
+    if set(old) - superseded:
+        kept = read_rows([path for path in old if path not in superseded])
         others = pa.array([name not in replaced for name in kept["run"].to_pylist()])
         rows = pa.concat_tables([kept.filter(others), rows], promote_options="permissive")
-    asked = {one for path in (*old, *new) for one in read_notes(path).get("asked", "").splitlines()}
+    asked = {note for path in {*old, *new} - superseded for note in read_notes(path).get("asked", "").splitlines()}
+    # Paths, then rows, then what is no longer wanted: rows are never without paths as new as they.
+    paths = [paths_beside(path) for path in new if paths_beside(path).is_file()]
+    for path in paths:
+        with whole_file(out / "_paths" / path.name) as partial:
+            shutil.copy2(path, partial)
     write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None)
     for path in old:
         if path.name != ROWS:
             path.unlink()
     for path in out.glob("_paths/*.npz"):
-        if path.stem.rpartition("-")[0] in replaced:
+        if path.stem.rpartition("-")[0] in replaced and path.name not in {wanted.name for wanted in paths}:
             path.unlink()
-    for path in new:
-        if paths_beside(path).is_file():
-            (out / "_paths").mkdir(exist_ok=True)
-            shutil.copy2(paths_beside(path), out / "_paths")
 
 
 def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, ...], str]:

@@ -43,11 +43,8 @@ class RunState:
     """Its last line of metrics."""
     reason: str = ""
     """Why it failed, one line."""
-
-    @property
-    def over(self) -> bool:
-        """Nothing is left to train."""
-        return self.state in ("trained", "done")
+    over: bool = False
+    """Nothing is left to train, whoever works on it now."""
 
 
 class SweepFolder:
@@ -87,9 +84,10 @@ class SweepFolder:
         origin = folder.origin()
         steps, total = int(metrics.get("env_steps", 0)), run.config.run.num_timesteps
         failed = self.root / "failed" / f"{run.name}.json"
+        over = bool(origin["completed"]) and (origin["env_steps"] or 0) >= total
         if is_locked(self.lock(run.name)):
             state = "running"
-        elif origin["completed"] and (origin["env_steps"] or 0) >= total:
+        elif over:
             state = "done" if self.evaluated(run) else "trained"
             steps = origin["env_steps"]
         elif failed.is_file():
@@ -97,7 +95,7 @@ class SweepFolder:
         else:
             state = "stopped" if steps else "waiting"
         reason = json.loads(failed.read_text())["reason"] if failed.is_file() and state != "done" else ""
-        return RunState(run.name, state, steps, max(total, steps), metrics, reason)
+        return RunState(run.name, state, steps, max(total, steps), metrics, reason, over)
 
     def asked(self, run: RunSpec) -> EvaluationAsked:
         """The evaluation that the sweep wants of a run."""
@@ -125,7 +123,7 @@ class SweepFolder:
         wanted = self.rows / self.asked(run).file_name(run.name)
         for path in files_of_run(self.rows, run.name) if wanted.is_file() else []:
             if path != wanted:
-                path.unlink()
+                path.unlink(missing_ok=True)  # another sweep of the same name may do the same
                 paths_beside(path).unlink(missing_ok=True)
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:

@@ -55,17 +55,20 @@ class Outcome:
     """Runs left to somebody else who works on them."""
 
     def exit_code(self, done: str) -> int:
-        """0: every run got to `done`; 1: some were given up; 3: stopped by the time limit; 128 + signal.
+        """0: every run got to `done`, or is worked on elsewhere; 1: not; 3: stopped by the time limit; 128 + signal.
 
         Args:
-            done: state to reach, trained or done.
+            done: state to reach, trained or done; unfinished: as far as each is, it is to be evaluated.
         """
         if self.stopped_by:
             return 128 + self.stopped_by
-        left = [s for s in self.states if s.state != "done" and not (done == "trained" and s.state == "trained")]
+        enough = {"done": (), "trained": ("trained",), "unfinished": ("trained", "stopped", "waiting")}[done]
+        left = [s for s in self.states if s.state not in ("done", *enough)]
         if any(s.reason for s in left):
             return 1
-        return 3 if left and self.timed_out else 0
+        if self.timed_out:
+            return 3 if left else 0
+        return 1 if any(s.state != "running" for s in left) else 0
 
 
 class Display(Protocol):
@@ -154,11 +157,11 @@ class Scheduler:
                 states = self._start(states)
             self._display.update(states, self._busy)
             waiting = [] if self._stopping else self._waiting(states)
-            if not self._busy and all(name in self._not_before for name in waiting):
+            elsewhere = {s.name for s in states if s.state == "running" and s.name in self._not_before}
+            if not self._busy and elsewhere >= set(waiting):
                 break
             time.sleep(poll_s)
-        elsewhere = sum(name in self._not_before for name in ([] if self._stopping else self._waiting(states)))
-        return Outcome(tuple(states), stops[0] if stops else None, timed_out, elsewhere)
+        return Outcome(tuple(states), stops[0] if stops else None, timed_out, len(elsewhere.intersection(waiting)))
 
     def _states(self) -> list[RunState]:
         return [self._folder.state(run) for run in self._runs.values()]
@@ -241,7 +244,8 @@ class Scheduler:
         for name in job.runs:
             self._busy.pop(name, None)
         if code == LOCKED:
-            for name in job.runs:
+            held = [name for name in job.runs if self._folder.state(self._runs[name]).state == "running"]
+            for name in held or job.runs:  # the others go on without them
                 self._not_before[name] = self._clock() + ELSEWHERE_S
             self._display.event(f"{job.name}: somebody else works on it, looking again later", "yellow")
             return

@@ -187,7 +187,7 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
         else:
             made[key] = value
     made["name"] = made.get("name") or default_name
-    if made["name"] != Path(made["name"]).name:
+    if made["name"] != Path(made["name"]).name or made["name"] == "..":
         raise ConfigError(f"{where}: name is {made['name']!r}, expected one folder name (out_dir says where it lies)")
     if not made.get("preset"):
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
@@ -254,7 +254,10 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
         axis, equals, text = word.partition("=")
         if not equals:
             raise ConfigError(f"--where {word!r}: expected setting=value[,value], for example env.robot=fetch")
-        chosen = [yaml.safe_load(item) for item in text.split(",")]
+        try:
+            chosen = [yaml.safe_load(item) for item in text.split(",")]
+        except yaml.YAMLError:
+            raise ConfigError(f"--where {word!r}: not readable, expected setting=value[,value]") from None
         wanted = _where({axis: chosen}, sweep.config, f"--where {word}")
         runs = [run for run in runs if _matches(wanted, run.values)]
     if shard is not None:

@@ -14,6 +14,7 @@ from train import checkpoint
 from train.row_files import paths_beside
 from train.rows import read_notes, read_rows, write_parquet
 from train.run_folder import PACKED_METRICS, read_metrics
+from train.sweep import export as export_module
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.export import thinned
@@ -87,3 +88,28 @@ def test_what_is_kept(swept, tmp_path, capsys):
         path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
         learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}})
         np.testing.assert_array_equal(learner["params"]["w"], [1.0] * 3)
+
+
+def test_rows_that_are_kept_are_never_without_their_paths(swept, tmp_path, monkeypatch):
+    """Killed at any point, what lies there are the old rows or the new ones, each with its paths."""
+    out = tmp_path / "results"
+    (rows,) = swept.rows.glob("k_int1-seed0-*.parquet")
+    paths_beside(rows).parent.mkdir()
+    paths_beside(rows).write_bytes(b"where it went")
+    old = out / "rows" / "k_int1-seed0-01234567.parquet"
+    write_parquet(run_rows("turtlebot", "ppo", 1.0, 0, 0.7, (0.5, 0.5)), old)
+    paths_beside(old).parent.mkdir()
+    paths_beside(old).write_bytes(b"where it went before")
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export_module, "write_parquet", killed)
+    with pytest.raises(KeyboardInterrupt):
+        export_module.export(swept, out)
+    assert old.is_file() and paths_beside(old).is_file()
+    assert (out / "rows" / "_paths" / paths_beside(rows).name).read_bytes() == b"where it went"
+    monkeypatch.undo()
+    export_module.export(swept, out)
+    assert [path.name for path in (out / "rows" / "_paths").iterdir()] == [paths_beside(rows).name]
+    assert [path.name for path in (out / "rows").glob("*.parquet")] == ["episodes.parquet"]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ import yaml
 from rich.console import Console
 
 from interactive_nav_common.locks import is_locked, take_lock
-from train.sweep import spec
+from train.sweep import jobs, spec
 from train.sweep.__main__ import main
 from train.sweep.devices import Gpu, Machine, find_gpus, parse_gpus, share_env
 from train.sweep.folder import RunState, SweepFolder, last_line
@@ -230,6 +232,88 @@ def test_a_run_that_somebody_else_works_on_is_left_alone(tmp_path):
     assert outcome.exit_code("done") == 0 and outcome.elsewhere == 0
 
 
+def test_a_lock_that_is_free_again_is_tried_again(tmp_path, monkeypatch):
+    """Whoever held the lock for an instant does not work on the run: it is not left to him."""
+    refused = []
+
+    def once_held(path):
+        if len(refused) < 1:
+            refused.append(path)
+            return None
+        return take_lock(path)
+
+    monkeypatch.setattr(jobs, "take_lock", once_held)
+    clock = itertools.count(0.0, 2.0)
+    alone = write_sweep(tmp_path, grid={"env.k_int": [0.0], "run.seed": [0]})
+    outcome, printed, folder = sweep(alone, clock=lambda: next(clock))
+    assert printed.count("somebody else works on it") == 1
+    assert outcome.exit_code("done") == 0 and outcome.elsewhere == 0
+    assert {s.state for s in outcome.states} == {"done"} and set(tries(folder).values()) == {1}
+
+
+def test_one_held_lock_does_not_keep_the_others_from_evaluation(tmp_path, monkeypatch):
+    """Four runs are to be evaluated by one process when somebody takes one of them."""
+    path = write_sweep(tmp_path)
+    sweep(path, stages=("train",))
+    theirs = []
+
+    def taken_before(path):
+        if path.name == "k_int0-seed1" and not theirs:
+            theirs.append(take_lock(path))
+        return take_lock(path)
+
+    monkeypatch.setattr(jobs, "take_lock", taken_before)
+    outcome, printed, folder = sweep(path)
+    states = {s.name: s.state for s in outcome.states}
+    assert states.pop("k_int0-seed1") == "running" and set(states.values()) == {"done"}
+    assert outcome.elsewhere == 1 and outcome.exit_code("done") == 0 and set(tries(folder).values()) == {1}
+    os.close(theirs[0])
+
+
+def test_what_is_neither_done_nor_worked_on_is_no_success(tmp_path):
+    path = write_sweep(tmp_path)
+    outcome, _, _ = sweep(path, stages=("evaluate",))  # nothing is trained yet
+    assert {s.state for s in outcome.states} == {"waiting"} and outcome.exit_code("done") == 1
+    done, running = RunState("a", "done", 9, 9, {}), RunState("b", "running", 3, 9, {})
+    assert Outcome((done, running), None, False, 1).exit_code("done") == 0
+    stopped = RunState("c", "stopped", 3, 9, {})
+    assert Outcome((done, stopped), None, False, 0).exit_code("done") == 1
+    assert Outcome((done, stopped), None, False, 0).exit_code("unfinished") == 0
+    failed = RunState("d", "failed", 3, 9, {}, "evaluate: x")
+    assert Outcome((done, failed), None, False, 0).exit_code("unfinished") == 1
+
+
+def test_two_identical_sweeps_share_the_work(tmp_path):
+    """Both begin in an empty folder at the same time: every run is trained once, and both end well."""
+    path = write_sweep(tmp_path)
+    with ThreadPoolExecutor(2) as pool:
+        ended = list(pool.map(lambda _: sweep(path), range(2)))
+    for outcome, printed, _ in ended:
+        assert outcome.exit_code("done") == 0 and "ended with" not in printed
+    folder = ended[0][2]
+    assert set(tries(folder).values()) == {1}
+    assert {folder.state(run).state for run in folder.sweep.runs} == {"done"}
+    assert len(list(folder.rows.iterdir())) == 4 and len(list((folder.root / "configs").iterdir())) == 4
+
+
+def test_a_run_whose_next_stage_another_sweep_has_begun_did_not_fail(tmp_path, monkeypatch):
+    """Its lock is held again before the first sweep looks: it was trained all the same."""
+    held = []
+    usual = LocalLauncher.ended
+
+    def ended(self):
+        over = usual(self)
+        held.extend(take_lock(job.locks[0]) for job, _ in over if job.kind == "train")
+        return over
+
+    monkeypatch.setattr(LocalLauncher, "ended", ended)
+    outcome, printed, _ = sweep(write_sweep(tmp_path))
+    assert printed.count(": done") == 4 and "tried again" not in printed
+    assert outcome.elsewhere == 4 and outcome.exit_code("done") == 0
+    for descriptor in held:
+        os.close(descriptor)
+
+
 def test_shares_of_a_machine():
     listing = "0, GPU-aa, 143771\n1, GPU-bb, 143771\nnonsense\n"
     gpus = parse_gpus(listing, None)
@@ -275,6 +359,17 @@ def test_status_prints_every_run_and_does_nothing(tmp_path, capsys):
     assert main([str(path), "--resume"]) == 2
     assert "holds no sweep; leave --resume out" in capsys.readouterr().err
     assert find_gpus() is not None
+
+
+def test_impossible_words_are_one_line(tmp_path, capsys):
+    path = str(write_sweep(tmp_path))
+    for words, message in (
+        (["--time-limit", "nan"], "--time-limit is nan, expected a positive number of seconds"),
+        (["--where", "env.k_int=["], "--where 'env.k_int=[': not readable"),
+    ):
+        assert main([path, *words], FAKE) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
 
 
 def test_unfinished_runs_can_be_evaluated_as_far_as_they_are(tmp_path):

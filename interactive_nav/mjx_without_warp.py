@@ -1,0 +1,43 @@
+"""MJX's import without the optional Warp: quiet.
+
+`mujoco.mjx.warp` prints `Failed to import warp: ...` on stdout wherever that package is not installed, which is what
+a base install is. Brax imports it too, so the modules of this package that use MJX are no place to catch it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+NOISY = "mujoco.mjx.warp"
+
+
+class _QuietPrint:
+    """Finds and loads `NOISY` as always, with a `print` of its own that says nothing."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
+        if name != NOISY:
+            return None
+        sys.meta_path.remove(self)  # type: ignore[arg-type]
+        spec = importlib.util.find_spec(name)
+        if spec is not None:
+            self._loader, spec.loader = spec.loader, self  # type: ignore[assignment]
+        return spec
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return None
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__dict__["print"] = lambda *_: None
+        self._loader.exec_module(module)  # type: ignore[union-attr]
+        del module.__dict__["print"]
+
+
+def hush() -> None:
+    """Lets MJX be imported without a word about Warp where that is not installed; one that is broken still tells."""
+    if NOISY not in sys.modules and importlib.util.find_spec("warp") is None:
+        sys.meta_path.insert(0, _QuietPrint())  # type: ignore[arg-type]

@@ -1,0 +1,49 @@
+"""`python -m train.record RUN_DIR --episode K -o out.mp4`: an episode of a run played once more, and a video of it.
+
+`python -m train.replay`, then `python -m interactive_nav.record` of the replay.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from interactive_nav.record import add_picture_words, check_picture_words, record
+from train import replay
+from train.config import EnvConfig
+from train.run import make_env
+
+
+def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
+    """Plays and draws; 0 when done, 2 on a user's error, 130 when interrupted."""
+    made = argparse.ArgumentParser(prog="python -m train.record", description="Makes a video of an episode of a run.")
+    made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
+    add_picture_words(made)
+    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
+    made.add_argument("overrides", nargs="*", metavar="env.key=value", help="environment settings to change")
+    arguments = made.parse_intermixed_args(argv)
+    played = ["--episodes", str(arguments.episode), "--policies", arguments.policy]
+    try:
+        check_picture_words(arguments)
+        words = [arguments.run, *played, "--checkpoint", arguments.checkpoint, *arguments.overrides]
+        refused = replay.main(words, build_env)
+        if refused:
+            return refused
+        path = replay.replay_path(Path(arguments.run), arguments.policy, arguments.episode)
+        record(path, arguments, Console())
+    except (ValueError, OSError) as error:
+        print(f"train.record: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("train.record: stopped; no video was written", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
