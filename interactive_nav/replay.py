@@ -77,6 +77,12 @@ class Replay:
     """[T] bool."""
     metrics: dict[str, float]
     """The episode's scores, `EPISODE_METRICS`."""
+    small_objects: str = "train"
+    """Whose models the small objects are; this and what follows is not in older files."""
+    segmentation_classes: int = 4
+    """As in `NavConfig`."""
+    success_distance_m: float | None = None
+    """Of the goal; None, in older files: not known, taken for the robot's width."""
 
     @property
     def num_steps(self) -> int:
@@ -179,6 +185,9 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         touches_movable=counts["interaction_steps"],
         touches_structure=counts["structure_steps"],
         metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
+        small_objects=env.config.small_objects,
+        segmentation_classes=env.config.segmentation_classes,
+        success_distance_m=env.success_distance_m,
     )
 
 

@@ -54,7 +54,8 @@ class Sensors:
         model = world.models[0]
         self._joints = _own_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
-        self.boxes = build_boxes(world, config.segmentation_classes == 5)
+        self.five_classes = config.segmentation_classes == 5
+        self.boxes = build_boxes(world, self.five_classes)
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
         self.renderer = make_renderer(self.boxes, self.lens, config.renderer, backend) if self._images else None

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.categories import OBJECT_CATEGORIES
 
 SCHEMA_VERSION = 1
-CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy")
+CATEGORIES = OBJECT_CATEGORIES
 SPLITS = ("train", "test")
 
 
