@@ -210,11 +210,15 @@ def test_a_replay_of_before_can_be_read(played, tmp_path):
 
 
 def test_importing_and_drawing_leave_matplotlibs_backend_alone():
-    code = (
-        "import matplotlib; matplotlib.use('svg'); import interactive_nav.topdown as t; from matplotlib import pyplot;"
-    )
-    code += "from interactive_nav.robots import get_robot, picture as p; p._with_matplotlib(*p.stage(get_robot('turtlebot')));"
-    code += "print(matplotlib.get_backend(), pyplot.get_fignums())"
+    code = """
+import matplotlib
+matplotlib.use("svg")
+from matplotlib import pyplot
+import interactive_nav.topdown
+from interactive_nav.robots import get_robot, picture
+picture._with_matplotlib(*picture.stage(get_robot("turtlebot")))
+print(matplotlib.get_backend(), pyplot.get_fignums())
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip().splitlines()[-1].lower() == "svg []"
 
