@@ -8,6 +8,7 @@ of start and goal at the distances that were asked for.
 from __future__ import annotations
 
 import math
+import zlib
 
 import jax
 import jax.numpy as jnp
@@ -52,9 +53,10 @@ def _draw_pair(
 ) -> tuple[jax.Array, jax.Array]:
     """The first of uniform pairs of start and goal that is as far apart as asked; else the nearest to it."""
 
+    start_places = tables.start_xy_w[scene], tables.num_starts[scene], tables.fine_m
+    goal_places = tables.goal_xy_w[scene], tables.num_goals[scene], tables.fine_m
+
     def candidates(key_start, key_goal, count):
-        start_places = tables.start_xy_w[scene], tables.num_starts[scene], tables.fine_m
-        goal_places = tables.goal_xy_w[scene], tables.num_goals[scene], tables.fine_m
         return _uniform_places(key_start, (count,), *start_places), _uniform_places(key_goal, (count,), *goal_places)
 
     def best(starts, goals):
@@ -68,14 +70,15 @@ def _draw_pair(
 
     def again(carry):
         i, old = carry
-        keys = (jax.random.fold_in(key, i) for key in (key_start, key_goal))
-        starts, goals = candidates(*keys, WIDER_CANDIDATES)
+        starts, goals = candidates(jax.random.fold_in(wider[0], i), jax.random.fold_in(wider[1], i), WIDER_CANDIDATES)
         straight = jnp.linalg.norm(starts - goals, axis=-1)
         # No way is shorter than the straight line: what is too far already need not be measured.
         kept = jnp.nonzero((straight >= least_m) & (straight <= largest_m), size=PAIR_CANDIDATES, fill_value=0)[0]
         new = best(starts[kept], goals[kept])
         return i + 1, jax.tree.map(lambda a, b: jnp.where(new[2] < old[2], a, b), new, old)
 
+    # By name, not by a small number, which would be one of the keys that `candidates` splits off.
+    wider = [jax.random.fold_in(key, zlib.crc32(b"wider")) for key in (key_start, key_goal)]
     first = best(*candidates(key_start, key_goal, PAIR_CANDIDATES))
     _, (start, goal, _) = jax.lax.while_loop(unmet, again, (jnp.zeros((), jnp.int32), first))
     return start, goal
