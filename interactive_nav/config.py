@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from interactive_nav_common.errors import ConfigError
 
 BACKENDS = ("auto", "warp", "jax", "native")
 OBSERVATIONS = ("goal", "velocity", "waypoints")
@@ -33,6 +36,21 @@ CHOICES = {
     "scene_choice": ("episode", "slot"),
 }
 """Settings that are one of a few words."""
+_IDLE: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
+    ("active_furniture active_small active_doors active_walls", "backend auto, jax or warp, or 0 (all)",
+     lambda c: c.backend != "native"),
+    ("contacts_per_env constraints_per_env", "backend auto or warp", lambda c: c.backend in ("auto", "warp")),
+    ("threads", "backend auto or native", lambda c: c.backend in ("auto", "native")),
+    ("image_size image_dtype renderer", "depth or segmentation among observations",
+     lambda c: any(name in c.observations for name in IMAGES)),
+    ("depth_range_m depth_dropout depth_noise", "depth among observations", lambda c: "depth" in c.observations),
+    ("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar among observations",
+     lambda c: "lidar" in c.observations),
+    ("odometry_noise", "odometry among observations", lambda c: "odometry" in c.observations),
+    ("small_objects", "num_objects above 0", lambda c: c.num_objects > 0),
+)  # fmt: skip
+"""Settings that change nothing but where something holds: their names, what, and the test of it. With backend auto,
+settings of all backends may stand side by side."""
 ORIGINAL_CODE: dict[str, Any] = {
     "episode_steps": 500,
     "success_in_3d": True,
@@ -255,6 +273,7 @@ class NavConfig:
             )
         if self.success_distance_m is not None and not self.success_distance_m > 0:
             refuse("success_distance_m", "a positive number or none")
+        _refuse_idle(self)
         ratio = self.control_dt_s / self.sim_dt_s
         if abs(ratio - round(ratio)) > 1e-6:
             refuse("sim_dt_s", f"a divisor of control_dt_s ({self.control_dt_s} s)")
@@ -268,6 +287,17 @@ class NavConfig:
     def needs_contacts(self) -> bool:
         """Whether an option looks at single contacts, not just at each body's net force."""
         return self.interaction_with == "anything" or self.force_part == "normal" or self.force_sum == "contacts"
+
+
+def _refuse_idle(config: NavConfig) -> None:
+    """Raises `ConfigError` for a setting that is not its default and has no effect beside the others."""
+    default = {field.name: field.default for field in dataclasses.fields(NavConfig)}
+    for names, needs, used in _IDLE:
+        for name in names.split():
+            value = getattr(config, name)
+            all_of_them = name.startswith("active_") and value == 0
+            if value != default[name] and not all_of_them and not used(config):
+                raise ConfigError(f"{name} is {value!r}, which changes nothing here: expected {needs}; or leave it out")
 
 
 def original_code(**settings: Any) -> NavConfig:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 
-from interactive_nav import metrics as scores
 from interactive_nav.config import NavConfig
+from interactive_nav.episode_scores import EPISODE_METRICS, episode_scores, score_mass_kg
 from interactive_nav.navigation import cell_centre, geodesic_at, goal_field, grid_waypoints_at, waypoints_at
 from interactive_nav.observation import advance_odometry, rotation_from_quat, waypoints_in_body, wrap_angle
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
@@ -25,7 +25,7 @@ from interactive_nav.scene import Scene
 from interactive_nav.sensors import Sensors
 from interactive_nav.tables import build_tables, furniture_map, rest_poses
 from interactive_nav.types import EpisodeStart, GoalField, NavInfo
-from interactive_nav.world import World, build_world, parking_spot
+from interactive_nav.world import build_world, parking_spot
 
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
@@ -36,27 +36,6 @@ SETTLE_STEPS = 5
 LIFT_M = 0.2
 """A base that rises this far above its standing height has left the floor (the original's early failure)."""
 
-EPISODE_METRICS = (
-    "success",
-    "path_efficiency",
-    "effort_efficiency",
-    "kinematic_effort",
-    "dynamic_effort",
-    "ins_0.5",
-    "robot_path_m",
-    "shortest_path_m",
-    "object_displacement_kg_m",
-    "force_sum_n",
-    "episode_steps",
-    "nonfinite",
-    "interaction_steps",
-    "structure_steps",
-    "overflow_steps",
-    "left_out_steps",
-    "unconverged_steps",
-    "objects_dropped",
-    "lifted",
-)
 REWARD_TERMS = ("reward/success", "reward/potential", "reward/interaction")
 
 
@@ -92,7 +71,7 @@ class InteractiveNav(Env):
         self.physics = make_physics(self.world, config)
         self.sensors = Sensors(self.world, config, self.physics.name)
         self.success_distance_m = config.success_distance_m or robot.body_width_m
-        self.score_mass_kg = _score_mass(self.world, config)
+        self.score_mass_kg = score_mass_kg(self.world, config)
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
         self._num_small = len(self.world.small_objects)
         self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
@@ -258,7 +237,7 @@ class InteractiveNav(Env):
         )
         timed_out = ~success & ~broken & ~lost & ~lifted & (nav.step_count >= self.config.episode_steps)
         done = (success | timed_out | lifted | broken | lost).astype(jnp.float32)
-        values = self._scores(nav, success, broken)
+        values = episode_scores(nav, self.config, self.tables, self.score_mass_kg, success, broken)
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
         truncated = timed_out | lost if self.config.bootstrap_at_time_limit else lost
@@ -374,45 +353,6 @@ class InteractiveNav(Env):
             ),
             touching=~broken & jnp.stack([touches, hits_wall]),
         )
-
-    def _scores(self, nav: NavInfo, success: jax.Array, broken: jax.Array) -> dict[str, jax.Array]:
-        masses = self.tables.mass_kg[nav.scene_index].at[0].set(self.score_mass_kg)
-        paths = jnp.concatenate([nav.robot_path_m[None], nav.object_path_m])
-        config = self.config
-        p_eff = scores.path_efficiency(success, nav.shortest_path_m, nav.robot_path_m, config.clip_path_efficiency)
-        kinematic = scores.kinematic_effort(masses, paths)
-        dynamic = scores.dynamic_effort(self.score_mass_kg, nav.force_sum_n, nav.step_count, config.score_gravity_m_s2)
-        counts = 1.0 if config.effort_on_failure else jnp.asarray(success, jnp.float32)
-        kinematic, dynamic = counts * kinematic, counts * dynamic
-        e_eff = 0.5 * (kinematic + dynamic)
-        values = {
-            "success": success,
-            "path_efficiency": p_eff,
-            "effort_efficiency": e_eff,
-            "kinematic_effort": kinematic,
-            "dynamic_effort": dynamic,
-            "ins_0.5": scores.interactive_navigation_score(p_eff, e_eff, 0.5),
-            "robot_path_m": nav.robot_path_m,
-            "shortest_path_m": nav.shortest_path_m,
-            "object_displacement_kg_m": jnp.sum(masses[1:] * nav.object_path_m),
-            "force_sum_n": nav.force_sum_n,
-            "episode_steps": nav.step_count,
-            "nonfinite": broken,
-            "interaction_steps": nav.interaction_steps,
-            "structure_steps": nav.structure_steps,
-            "overflow_steps": nav.overflow_steps,
-            "left_out_steps": nav.left_out_steps,
-            "unconverged_steps": nav.unconverged_steps,
-            "objects_dropped": nav.objects_dropped,
-            "lifted": nav.lifted_steps > 0,
-        }
-        return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
-
-
-def _score_mass(world: World, config: NavConfig) -> float:
-    """m_0 as the scores take it, kg."""
-    total, base = world.robot_mass_kg, float(world.models[0].body_mass[world.layout.robot_bodies[0]])
-    return {"total": total, "links": total - world.robot.root_link_kg, "base": base}[config.robot_mass]
 
 
 def _yaw(rotation: jax.Array) -> jax.Array:

@@ -2,8 +2,9 @@
 
 `python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
 
-A file names its scenes by the digest of their content, so the same file means the same episodes on every
-machine and backend; with other scenes, another robot or other objects it is refused.
+A file names its scenes by the digest of what decides the task in them (`Scene.task_digest`), so the same file means
+the same episodes on every machine and backend; with other scenes, another robot or other objects it is refused.
+Files made before that digest was there name the digest of scene.xml and maps.npz, and are held to that.
 """
 
 from __future__ import annotations
@@ -39,11 +40,12 @@ class EpisodeFile:
     robot: str
     seed: int
     scenes: tuple[tuple[str, str], ...]
-    """(name, digest) of each scene."""
+    """(name, digest) of each scene: `Scene.task_digest`, in old files `Scene.digest`."""
     objects: tuple[str, ...]
     """Categories of the small objects, in order."""
     objects_digest: str
-    """SHA-256 of the small objects' shapes, masses and friction."""
+    """`TASK_DIGEST` and SHA-256 of the small objects' boxes, masses, friction and categories; in old files without it,
+    and of their looks too."""
     episodes: tuple[dict[str, Any], ...]
     """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
     that found no place) and shortest_path_m; metres and radians, world frame."""
@@ -94,9 +96,9 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     return EpisodeFile(
         robot=env.robot.name,
         seed=seed,
-        scenes=tuple((scene.name, scene.digest) for scene in env.scenes),
+        scenes=tuple((scene.name, scene.task_digest) for scene in env.scenes),
         objects=tuple(o.category for o in env.world.small_objects),
-        objects_digest=_objects_digest(env),
+        objects_digest=_objects_digests(env)[0],
         episodes=tuple(rows),
     )
 
@@ -108,8 +110,20 @@ def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart
     return start, geodesic_at(env.tables, start.scene_index, field, start.start_xy_w)
 
 
-def _objects_digest(env: InteractiveNav) -> str:
-    return hashlib.sha256(repr(env.world.small_objects).encode()).hexdigest()
+def _objects_digests(env: InteractiveNav) -> tuple[str, str]:
+    """Of what decides the task, and as old files have it."""
+    from interactive_nav.scene import TASK_DIGEST
+
+    small = env.world.small_objects
+    task = [
+        (o.category, o.segmentation_id, o.mass_kg, o.friction, [dataclasses.astuple(b) for b in o.boxes]) for o in small
+    ]
+    new, old = (hashlib.sha256(repr(content).encode()).hexdigest() for content in (task, small))
+    return TASK_DIGEST + new, old
+
+
+def _short(digest: str) -> str:
+    return digest.rpartition(":")[2][:12]
 
 
 def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -> EpisodeStart:
@@ -128,6 +142,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     import jax.numpy as jnp
     import numpy as np
 
+    from interactive_nav.scene import TASK_DIGEST
     from interactive_nav.types import EpisodeStart
 
     if file.robot != env.robot.name:
@@ -135,22 +150,24 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
             f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
             "make the episodes again for it"
         )
-    ours = {scene.digest: i for i, scene in enumerate(env.scenes)}
-    by_name = {scene.name: scene.digest for scene in env.scenes}
+    # Each file is held to digests of the kind that it has; no digest of one kind is one of the other.
+    ours = {digest: i for i, scene in enumerate(env.scenes) for digest in (scene.digest, scene.task_digest)}
+    by_name = {scene.name: scene for scene in env.scenes}
     for name, digest in file.scenes:
         if digest in ours:
             continue
         if name in by_name:
+            has = by_name[name].task_digest if digest.startswith(TASK_DIGEST) else by_name[name].digest
             raise EpisodeFileError(
-                f"{where}: scene '{name}' has digest {digest[:12]}, the environment's '{name}' has "
-                f"{by_name[name][:12]}: its content changed since; use the scene it was made from or make the "
+                f"{where}: scene '{name}' has digest {_short(digest)}, the environment's '{name}' has "
+                f"{_short(has)}: its content changed since; use the scene it was made from or make the "
                 "episodes again"
             )
         raise EpisodeFileError(
-            f"{where}: needs scene '{name}' (digest {digest[:12]}), the environment has {', '.join(by_name)}; "
+            f"{where}: needs scene '{name}' (digest {_short(digest)}), the environment has {', '.join(by_name)}; "
             "add it to --scenes"
         )
-    if file.objects_digest != _objects_digest(env):
+    if file.objects_digest not in _objects_digests(env):
         raise EpisodeFileError(
             f"{where}: made with {len(file.objects)} small objects ({', '.join(file.objects) or 'none'}), the "
             f"environment has {len(env.world.small_objects)} or other models; set num_objects={len(file.objects)} and "

@@ -6,7 +6,8 @@
 
 Ids are InteractiveNav-<Robot>-v0, one for each name in `robot_names()`. `make` gives one environment,
 `make_vec` a batch that steps as one compiled program. Keyword arguments are those of `interactive_nav.make`.
-Environment i of a batch reset with seed s plays the episodes of a single environment reset with seed s + i.
+Environment i of a batch reset with seed s plays the episodes of a single environment reset with seed s + i; with
+`scene_choice="slot"` it keeps scene i modulo their number, as a single one made with `slot=i`.
 """
 
 from __future__ import annotations
@@ -26,9 +27,12 @@ from gymnasium.vector.utils import batch_space
 
 import interactive_nav
 from interactive_nav.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
+from interactive_nav.gym_steps import STEPS, reset_all, reset_where
 from interactive_nav.robots import robot_names
 from interactive_nav.torch_bridge import to_jax, to_torch
 from interactive_nav.views import ThirdPerson
+from interactive_nav.wrappers import scene_of_slot
+from interactive_nav_common.errors import ConfigError
 
 ARRAYS = ("numpy", "jax", "torch")
 VERSION = 0
@@ -55,14 +59,21 @@ def register_envs() -> None:
 
 
 def observation_space_of(env: InteractiveNav) -> spaces.Space:
-    """A `Box` for a flat observation, a `Dict` of boxes for one in parts; unbounded, float32."""
+    """A `Box` for a flat observation, a `Dict` of boxes for one in parts.
+
+    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 to 1 in their own type.
+    """
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     obs = jax.eval_shape(env.reset, key).obs
 
-    def box(x: Any) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, x.shape, np.dtype(x.dtype).type)
+    def box(name: str, x: Any) -> spaces.Box:
+        image, dtype = name.startswith("pixels/"), np.dtype(x.dtype)
+        high = 255 if dtype == np.uint8 else 1.0 if image else np.inf
+        return spaces.Box(0 if image else -np.inf, high, x.shape, dtype.type)
 
-    return spaces.Dict({name: box(x) for name, x in obs.items()}) if isinstance(obs, Mapping) else box(obs)
+    if isinstance(obs, Mapping):
+        return spaces.Dict({name: box(name, x) for name, x in obs.items()})
+    return box("state", obs)
 
 
 def action_space_of(env: InteractiveNav) -> spaces.Box:
@@ -100,24 +111,33 @@ class InteractiveNavEnv(gymnasium.Env):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    def __init__(self, robot: str, scenes: Sequence[str], render_mode: str | None = None, **settings: Any):
+    def __init__(
+        self,
+        robot: str,
+        scenes: Sequence[str],
+        render_mode: str | None = None,
+        slot: int | None = None,
+        **settings: Any,
+    ):
         """Builds it.
 
         Args:
             robot: a name from `robot_names()`.
             scenes: scene folders; each episode draws one.
             render_mode: none, or "rgb_array": `render` returns a third-person view.
+            slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
             **settings: fields of `NavConfig`.
 
         Raises:
-            ValueError: as `interactive_nav.make`.
+            ValueError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
         """
         self.env = interactive_nav.make(robot, scenes, **settings)
+        kept = _checked_slot(self.env, slot)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space = observation_space_of(self.env)
         self.action_space = action_space_of(self.env)
-        self._reset = jax.jit(self.env.reset)
+        self._reset = jax.jit(lambda key: self.env.reset(key, kept))
         self._reset_to = jax.jit(self.env.reset_to)
         self._step = jax.jit(self.env.step)
         self._state: Any = None
@@ -209,10 +229,10 @@ class InteractiveNavVectorEnv(VectorEnv):
         self.single_action_space = action_space_of(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._reset = jax.jit(jax.vmap(self.env.reset))
+        self._reset = jax.jit(functools.partial(reset_all, self.env))
         self._reset_to = jax.jit(jax.vmap(self.env.reset_to))
-        self._reset_where = jax.jit(functools.partial(_reset_where, self.env))
-        self._step = jax.jit(functools.partial(_STEPS[self.autoreset_mode], self.env))
+        self._reset_where = jax.jit(functools.partial(reset_where, self.env))
+        self._step = jax.jit(functools.partial(STEPS[self.autoreset_mode], self.env))
         self._state: Any = None
         self._ended = jnp.zeros(num_envs, bool)
 
@@ -329,44 +349,19 @@ def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.n
     return out
 
 
-def _where(mask: jax.Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
-
-
-def _reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Array) -> Any:
-    return _where(mask, jax.vmap(env.reset)(keys), state)
-
-
-def _outcome(state: Any) -> tuple[Any, ...]:
-    truncated = state.info["truncation"] > 0
-    return state.obs, state.reward, (state.done > 0) & ~truncated, truncated, dict(state.metrics)
-
-
-def _step_same(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
-    stepped = jax.vmap(env.step)(state, actions)
-    done = stepped.done > 0
-    new = jax.lax.cond(done.any(), lambda s: _reset_where(env, s, s.info["rng"], done), lambda s: s, stepped)
-    return new, jnp.zeros_like(done), _outcome(stepped)
-
-
-def _step_next(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
-    stepped = jax.vmap(env.step)(state, actions)
-    new = jax.lax.cond(
-        ended.any(), lambda s: _where(ended, jax.vmap(env.reset)(state.info["rng"]), s), lambda s: s, stepped
-    )
-    return new, ended, _outcome(new)
-
-
-def _step_only(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
-    stepped = jax.vmap(env.step)(state, actions)
-    return stepped, jnp.zeros_like(ended), _outcome(stepped)
-
-
-_STEPS = {
-    AutoresetMode.SAME_STEP: _step_same,
-    AutoresetMode.NEXT_STEP: _step_next,
-    AutoresetMode.DISABLED: _step_only,
-}
+def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
+    """The scene that a single environment keeps; None: each episode draws one."""
+    chosen, count = env.config.scene_choice == "slot", len(env.scenes)
+    if slot is not None and (not chosen or slot < 0):
+        raise ConfigError(
+            f"slot is {slot} with scene_choice={env.config.scene_choice!r}, expected 0 or more, with 'slot'"
+        )
+    if chosen and slot is None and count > 1:
+        raise ConfigError(
+            f"scene_choice is 'slot' for one environment of {count} scenes, expected its number in a batch: give "
+            "slot=I, make a batch (gymnasium.make_vec), or set scene_choice='episode'"
+        )
+    return scene_of_slot(env, jnp.asarray(slot or 0, jnp.int32))
 
 
 def _checked_render_mode(mode: str | None) -> str | None:

@@ -65,8 +65,8 @@ class Compositor:
         check_scene(replay, scene)
         self.replay, self.height = replay, height
         robot = get_robot(replay.robot)
-        self._goal_radius_m = robot.body_width_m
-        self._view = SceneView(robot, scene, replay.small)
+        self._goal_radius_m = replay.success_distance_m or robot.body_width_m
+        self._view = SceneView(robot, scene, replay.small, replay.segmentation_classes)
         yaw = np.unwrap(yaw_of(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")

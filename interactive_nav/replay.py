@@ -79,9 +79,13 @@ class Replay:
     metrics: dict[str, float]
     """The episode's scores, `EPISODE_METRICS`."""
     small_objects: str = "train"
-    """Whose models the small objects are."""
+    """Whose models the small objects are; this and what follows is not in older files."""
     objects: tuple[str, ...] = ()
     """Their folders, absolute, where they are not the built-in ones."""
+    segmentation_classes: int = 4
+    """As in `NavConfig`."""
+    success_distance_m: float | None = None
+    """Of the goal; None, in older files: not known, taken for the robot's width."""
 
     @property
     def small(self) -> tuple[SmallObject, ...]:
@@ -195,6 +199,8 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
         small_objects=env.config.small_objects,
         objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
+        segmentation_classes=env.config.segmentation_classes,
+        success_distance_m=env.success_distance_m,
     )
 
 

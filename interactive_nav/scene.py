@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 from pathlib import Path
 
@@ -10,6 +11,11 @@ import mujoco
 import numpy as np
 
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+
+TASK_DIGEST = "task-1:"
+"""Begins a digest of what decides a task, and says how it was made; what does not begin so is `Scene.digest`."""
+_DECIMALS = 9
+"""Numbers are rounded before they are hashed: what MuJoCo computes differs between machines in its last bits."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,12 +65,48 @@ class Scene:
     name: str
     split: str
     digest: str
-    """SHA-256 of scene.xml and maps.npz."""
+    """SHA-256 of the files scene.xml and maps.npz."""
     manifest: SceneManifest
     maps: SceneMaps
     walls: np.ndarray
     """[n, 10]: world centre, quaternion, half sizes."""
     movables: tuple[Movable, ...]
+
+    @functools.cached_property
+    def task_digest(self) -> str:
+        """`TASK_DIGEST` and SHA-256 of what decides the task: map, walls, and the movables' places, shapes, masses,
+        friction and categories. Names, textures, colours and other looks are not in it."""
+        maps = self.maps
+        parts = [maps.traversable.shape, np.packbits(maps.traversable).tobytes().hex()]
+        parts += [_rounded([maps.resolution_m, *maps.origin_w]), _rounded(self.walls)]
+        hulls = _hull_sources(self) if any(m.hulls for m in self.movables) else {}
+        for movable in self.movables:
+            numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
+            for name in ("name", "hulls", "hinge", "category"):
+                del numbers[name]
+            hinge = movable.hinge and [_rounded(v) for v in dataclasses.astuple(movable.hinge) if v is not None]
+            parts += [movable.category, {name: _rounded(value) for name, value in numbers.items()}, hinge]
+            parts.append(hulls.get(movable.name, []))
+        return TASK_DIGEST + hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _rounded(value: object) -> list:
+    # Adding 0 turns -0 into 0.
+    return (np.round(np.asarray(value, float), _DECIMALS) + 0.0).tolist()
+
+
+def _hull_sources(scene: Scene) -> dict[str, list]:
+    """Body name -> what its colliding meshes are made from: MuJoCo turns and centres the vertices themselves."""
+    spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
+    found: dict[str, list] = {}
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (geom.contype or geom.conaffinity):
+            mesh = spec.mesh(geom.meshname)
+            path = scene.path / spec.meshdir / mesh.file
+            content = path.read_bytes() if mesh.file else np.asarray(mesh.uservert).tobytes()
+            numbers = [_rounded(v) for v in (geom.pos, geom.quat, mesh.scale, mesh.refpos, mesh.refquat)]
+            found.setdefault(geom.parent.name, []).append([hashlib.sha256(content).hexdigest(), numbers])
+    return found
 
 
 def _quat_rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -16,6 +16,8 @@ and the step alone.
 
 from __future__ import annotations
 
+import zlib
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -33,8 +35,15 @@ from interactive_nav.world import World
 
 LIDAR_NEAR_M = 0.05
 """Beams begin this far from the scanner (iGibson)."""
-_DEPTH_KEY, _LIDAR_KEY, _ODOMETRY_KEY = 1, 2, 3
-"""Folded into the episode's key, so that each sensor has a stream of its own."""
+
+
+def stream(rng: jax.Array, name: str, step_count: jax.Array) -> jax.Array:
+    """A sensor's key of one control step.
+
+    Its name is folded into the episode's key, so that each sensor has a stream of its own. A small number would not
+    do: `fold_in(key, 1)` is `split(key)[1]`, which the next episode is drawn from.
+    """
+    return jax.random.fold_in(jax.random.fold_in(rng, zlib.crc32(name.encode())), step_count)
 
 
 class Sensors:
@@ -54,7 +63,8 @@ class Sensors:
         model = world.models[0]
         self._joints = _own_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
-        self.boxes = build_boxes(world, config.segmentation_classes == 5)
+        self.five_classes = config.segmentation_classes == 5
+        self.boxes = build_boxes(world, self.five_classes)
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
         self.renderer = make_renderer(self.boxes, self.lens, config.renderer, backend) if self._images else None
@@ -119,7 +129,7 @@ class Sensors:
         """(2,) relative errors of a step's distance and angle."""
         if not self._config.odometry_noise:
             return jnp.zeros(2)
-        key = jax.random.fold_in(jax.random.fold_in(rng, _ODOMETRY_KEY), step_count)
+        key = stream(rng, "odometry", step_count)
         return self._config.odometry_noise * jax.random.normal(key, (2,))
 
     def _vector(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array:
@@ -154,11 +164,11 @@ class Sensors:
         beams = rotate(rotation, jnp.asarray(self._beams_b))
         distance = cast_fan(self.boxes, nav.scene_index, physics.qpos, origin, beams)
         scan = jnp.clip(distance / config.lidar_range_m, LIDAR_NEAR_M / config.lidar_range_m, 1.0)
-        key = jax.random.fold_in(jax.random.fold_in(rng, _LIDAR_KEY), nav.step_count)
+        key = stream(rng, "lidar", nav.step_count)
         return _noisy(scan, config.lidar_noise, config.lidar_dropout, 1.0, key)
 
     def _noisy_depth(self, depth: jax.Array, nav: NavInfo, rng: jax.Array) -> jax.Array:
-        key = jax.random.fold_in(jax.random.fold_in(rng, _DEPTH_KEY), nav.step_count)
+        key = stream(rng, "depth", nav.step_count)
         return _noisy(depth, self._config.depth_noise, self._config.depth_dropout, 0.0, key)
 
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -30,14 +31,14 @@ class ShardedEnv(Env):
         """Wraps an environment.
 
         Args:
-            env: natively batched, such as `AutoResetEnv`.
+            env: natively batched, such as `AutoResetEnv`; its `reset` takes keys and the environments' numbers.
             devices: default: all devices of all processes.
         """
         self.env = env
         self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
         self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
         spec = PartitionSpec(AXIS)
-        self._reset = jax.shard_map(env.reset, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)
+        self._reset = jax.shard_map(env.reset, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
         self._step = jax.shard_map(env.step, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
 
     @property
@@ -76,7 +77,9 @@ class ShardedEnv(Env):
                 f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
                 f"take {self.num_devices * max(1, rng.shape[0] // self.num_devices)}"
             )
-        return self._reset(jax.lax.with_sharding_constraint(rng, self.sharding))
+        # Each device sees its share alone: which environments these are, it must be told.
+        whole = rng, jnp.arange(rng.shape[0])
+        return self._reset(*(jax.lax.with_sharding_constraint(x, self.sharding) for x in whole))
 
     def step(self, state: State, action: jax.Array) -> State:
         """N states and [N, A] actions to N states."""

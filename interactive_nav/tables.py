@@ -6,12 +6,14 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
 
 from interactive_nav.config import NavConfig
 from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
+from interactive_nav.navigation import geodesic_at, goal_field
 from interactive_nav.placement import CLEARANCE_M
 from interactive_nav.scene import Scene
 from interactive_nav.types import SceneTables
@@ -20,6 +22,8 @@ from scenes_mjcf.schema import SceneError
 
 FINE_CELLS = 2
 """Fine cells along the side of a navigation cell: corners and places are 0.05 m fine, nodes 0.1 m apart."""
+GOALS_TRIED = 256
+"""Goals of each scene that `check_distances` looks from."""
 SIGHT_STEP_CELLS = 2.0
 """Fine cells between samples of a line of sight inside jit. What is blocked for the robot's centre is at least a
 robot wide, so nothing is stepped over; a corner clipped between two samples is cut by centimetres at most."""
@@ -127,6 +131,41 @@ def _scene_places(
     return graph, starts, goals, clutter
 
 
+def check_distances(world: World, tables: SceneTables, config: NavConfig) -> None:
+    """Refuses scenes without a start and a goal at the distances that are asked for.
+
+    The planar distance alone is settled with the places. Here a sample of goals is held against every start: where
+    none has one, drawing pairs at random would find none either.
+
+    Raises:
+        SceneError: a scene with no such pair.
+    """
+    if not math.isfinite(config.max_goal_distance_m):
+        return
+
+    # Places are anywhere in their cells: two of them may be nearer or farther than the middles by this.
+    slack_m = math.sqrt(2) * tables.fine_m
+
+    @jax.jit
+    def some_fit(scene: jax.Array, goal: jax.Array) -> jax.Array:
+        starts = tables.start_xy_w[scene]
+        field = goal_field(tables, scene, goal)
+        way_m = jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(starts)
+        far = jnp.linalg.norm(starts - goal, axis=-1) >= config.min_goal_distance_m - slack_m
+        fits = far & (way_m <= config.max_goal_distance_m + slack_m)
+        return (fits & (jnp.arange(len(starts)) < tables.num_starts[scene])).any()
+
+    for i, scene in enumerate(world.scenes):
+        goals = tables.goal_xy_w[i]
+        sample = np.unique(np.linspace(0, int(tables.num_goals[i]) - 1, GOALS_TRIED).astype(int))
+        if not any(bool(some_fit(jnp.asarray(i), goals[k])) for k in sample):
+            raise SceneError(
+                f"{scene.path}: no start and goal of robot '{world.robot.name}' are at least "
+                f"{config.min_goal_distance_m} m apart and at most {config.max_goal_distance_m} m by the way; "
+                "raise max_goal_distance_m or lower min_goal_distance_m"
+            )
+
+
 def _farthest(a: np.ndarray, b: np.ndarray) -> float:
     """Largest distance between points [p, 2] and [g, 2], to within 4 %: by their extent along 16 directions."""
     angle = np.arange(16) * np.pi / 16
@@ -179,7 +218,7 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
     """Solves navigation for every scene and stacks all constants on the device.
 
     Raises:
-        SceneError: a scene with no room for the robot, or for a start and a goal.
+        SceneError: a scene with no room for the robot, or for a start and a goal as far apart as asked.
     """
     with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
         places = list(pool.map(lambda i: _scene_places(world, i, config), range(len(world.scenes))))
@@ -204,7 +243,7 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
     def i32(value) -> jnp.ndarray:
         return jnp.asarray(value, jnp.int32)
 
-    return SceneTables(
+    tables = SceneTables(
         rest_qpos=f32(world.rest_qpos),
         mass_kg=f32(mass),
         com_m=f32(com),
@@ -220,3 +259,5 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
         clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
         num_clutter=i32([len(p[3]) for p in places]),
     )
+    check_distances(world, tables, config)
+    return tables

@@ -13,13 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
@@ -102,7 +99,7 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
         axis.plot(*np.stack([place, nose]).T, color="k", linewidth=1, linestyle=style, zorder=6)
     goal = Circle(
         (float(replay.goal_xy_w[0]), float(replay.goal_xy_w[1])),
-        robot.body_width_m,
+        replay.success_distance_m or robot.body_width_m,
         color="#009e73",
         alpha=0.35,
         linewidth=0,
@@ -138,7 +135,8 @@ def panels(replays: Sequence[Replay], scenes: dict[str, Scene], colour_by: str =
     shapes = [scenes[r.scene].maps.traversable.shape for r in replays]
     aspect = float(np.clip(max(n / m for n, m in shapes), 0.4, 1.6))
     size = (3.9 * columns + (0.6 if colour_by == "time" else 0.0), (3.5 * aspect + 0.75) * rows + 0.5)
-    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
     for axis in grid.flat[len(replays) :]:
         axis.set_axis_off()
     for axis, replay in zip(grid.flat, replays, strict=False):
@@ -146,7 +144,7 @@ def panels(replays: Sequence[Replay], scenes: dict[str, Scene], colour_by: str =
     handles: list[Any] = []
     if colour_by == "time":
         longest = max(r.num_steps * r.control_dt_s for r in replays)
-        shades = plt.cm.ScalarMappable(Normalize(0, longest), "viridis")
+        shades = ScalarMappable(Normalize(0, longest), "viridis")
         figure.colorbar(shades, ax=grid, label="time [s]", shrink=0.7, pad=0.01)
         for axis in grid.flat:
             for line in axis.collections:

@@ -20,26 +20,14 @@ from scipy.spatial import cKDTree
 
 from interactive_nav.env import InteractiveNav
 from interactive_nav.objects import SmallObject
+from interactive_nav.rendering.boxes import class_id
 from interactive_nav.replay import world_poses
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scene import Scene
+from scenes_mjcf.categories import CLASS_COLOURS, CLASSES, TABLE
 
-COLOURS: dict[str, tuple[float, float, float]] = {
-    "structure": (0.87, 0.86, 0.84),
-    "robot": (0.16, 0.20, 0.27),
-    "chair": (0.36, 0.55, 0.75),
-    "sofa": (0.45, 0.65, 0.53),
-    "table": (0.78, 0.62, 0.42),
-    "desk": (0.68, 0.52, 0.36),
-    "door": (0.66, 0.60, 0.72),
-    "basket": (0.90, 0.58, 0.20),
-    "shoe": (0.80, 0.28, 0.30),
-    "pot": (0.55, 0.34, 0.56),
-    "toy": (0.93, 0.78, 0.24),
-    "other": (0.60, 0.60, 0.60),
-}
-"""RGB in [0, 1] by class, in colour and mask pictures alike."""
-CLASSES = tuple(COLOURS)
+COLOURS = {category.name: category.colour for category in TABLE}
+"""RGB in [0, 1] by category, in colour and mask pictures alike."""
 GOAL_COLOUR = (0.30, 0.72, 0.36)
 TRAIL_COLOUR = (0.16, 0.47, 0.84)
 FLOOR_COLOUR = (0.80, 0.78, 0.74)
@@ -89,7 +77,7 @@ class Image:
     depth_m: np.ndarray
     """[rows, columns] f32 along the optical axis; infinite where there is nothing."""
     classes: np.ndarray
-    """[rows, columns] u8 index into `CLASSES`, or `NOTHING`."""
+    """[rows, columns] u8 segmentation ids, as the observation's: index into `CLASSES`; or `NOTHING`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,21 +94,21 @@ class FloorPaint:
 class SceneView:
     """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
 
-    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject]):
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], segmentation_classes: int = 4):
         """Compiles the model to look at.
 
         Args:
             robot: its collision shapes are drawn, or its visual ones where it has any.
             scene: its visual meshes are drawn.
             small: the small objects.
+            segmentation_classes: as in `NavConfig`.
         """
         self.robot = robot
         self.model = _compile(robot, scene, small)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
-        self._class = _geom_classes(self.model, robot, scene)
-        shades = np.array([COLOURS[name] for name in CLASSES])
-        self._colour = shades[self._class]
+        self._class, kinds = _geom_classes(self.model, robot, scene, small, segmentation_classes == 5)
+        self._colour = np.array([COLOURS[kind] for kind in kinds])
         # Things of one kind differ a little, so that two chairs can be told apart.
         for g in range(self.model.ngeom):
             body = int(self.model.geom_bodyid[g])
@@ -241,7 +229,10 @@ class ThirdPerson:
 
     def __init__(self, env: InteractiveNav, rows: int = 360, columns: int = 480):
         self.env, self.rows, self.columns = env, rows, columns
-        self._view = functools.cache(lambda scene: SceneView(env.robot, env.scenes[scene], env.world.small_objects))
+        config, small = env.config, env.world.small_objects
+        self._view = functools.cache(
+            lambda scene: SceneView(env.robot, env.scenes[scene], small, config.segmentation_classes)
+        )
 
     def frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
         """[rows, columns, 3] u8.
@@ -266,9 +257,9 @@ def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:
 
 
 def mask_picture(classes: np.ndarray) -> np.ndarray:
-    """[rows, columns] classes to [rows, columns, 3] u8 in `COLOURS`; nothing is black."""
+    """[rows, columns] classes to [rows, columns, 3] u8 in `CLASS_COLOURS`; nothing is black."""
     table = np.zeros((256, 3), np.uint8)
-    table[: len(CLASSES)] = np.array([COLOURS[name] for name in CLASSES]) * 255
+    table[: len(CLASSES)] = np.array(CLASS_COLOURS) * 255
     return table[classes]
 
 
@@ -352,14 +343,16 @@ def _compile(robot: RobotSpec, scene: Scene, small: Sequence[SmallObject]) -> mu
     return spec.compile()
 
 
-def _geom_classes(model: mujoco.MjModel, robot: RobotSpec, scene: Scene) -> np.ndarray:
-    """[ngeom] index into `CLASSES`."""
-    category = {m.name: m.category for m in scene.movables}
+def _geom_classes(
+    model: mujoco.MjModel, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], five: bool
+) -> tuple[np.ndarray, list[str]]:
+    """[ngeom] segmentation ids, and each geom's category."""
+    known = {m.name: (class_id(m.category, five), m.category) for m in scene.movables}
+    known |= {f"{o.category}_small_{i}": (o.segmentation_id, o.category) for i, o in enumerate(small)}
     base = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.base_body)
-    out = np.zeros(model.ngeom, np.uint8)
-    for g in range(model.ngeom):
-        body = int(model.geom_bodyid[g])
-        name = model.body(body).name
-        kind = category.get(name, name.split("_small_")[0] if "_small_" in name else "structure")
-        out[g] = CLASSES.index("robot" if model.body_rootid[body] == base else kind)
-    return out
+    robot_row, structure = ((class_id(kind), kind) for kind in ("robot", "structure"))
+    rows = []
+    for body in model.geom_bodyid:
+        own = model.body_rootid[body] == base
+        rows.append(robot_row if own else known.get(model.body(int(body)).name, structure))
+    return np.array([number for number, _ in rows], np.uint8), [kind for _, kind in rows]

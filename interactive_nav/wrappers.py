@@ -16,6 +16,11 @@ DRAW_SHARE = 16
 """New episodes are drawn for this fraction of the batch at a time."""
 
 
+def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
+    """[...] scenes that environments with these numbers in their batch keep; None where each episode draws one."""
+    return slot % len(env.scenes) if env.config.scene_choice == "slot" else None
+
+
 class AutoResetEnv(Env):
     """N environments as one natively batched Brax environment (`wrap_env=False` for Brax's learners).
 
@@ -48,12 +53,16 @@ class AutoResetEnv(Env):
         """The single environment."""
         return self.env
 
-    def reset(self, rng: jax.Array) -> State:
-        """[N, 2] keys to N states."""
-        if self.env.config.scene_choice == "slot":
-            state = jax.vmap(self.env.reset)(rng, jnp.arange(rng.shape[0]) % len(self.env.scenes))
-        else:
-            state = jax.vmap(self.env.reset)(rng)
+    def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
+        """[N, 2] keys to N states.
+
+        Args:
+            rng: the keys.
+            slot: [N] i32 numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
+        """
+        slot = jnp.arange(rng.shape[0]) if slot is None else slot
+        scene = scene_of_slot(self.env, slot)
+        state = jax.vmap(self.env.reset)(rng) if scene is None else jax.vmap(self.env.reset)(rng, scene)
         zero = jnp.zeros(rng.shape[0])
         info = {
             **state.info,

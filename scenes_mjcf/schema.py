@@ -16,9 +16,10 @@ from typing import Any, get_origin, get_type_hints
 import numpy as np
 
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.categories import OBJECT_CATEGORIES
 
 SCHEMA_VERSION = 1
-CATEGORIES = ("chair", "desk", "door", "sofa", "table", "basket", "shoe", "pot", "toy", "other")
+CATEGORIES = OBJECT_CATEGORIES
 SPLITS = ("train", "test")
 JSON_TYPES: dict[Any, tuple[tuple[type, ...], str]] = {
     str: ((str,), "a string"),

@@ -63,7 +63,7 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
         observations=("localisation",),
         episode_steps=10**8,
         num_waypoints=1,
-        threads=usable_cores(),
+        threads=usable_cores() if backend in ("auto", "native") else 0,
     )
     spec = get_robot(robot, CONTROL)
     if radius_m is not None:

@@ -18,29 +18,10 @@ import numpy as np
 from interactive_nav.observation import rotation_from_quat
 from interactive_nav.scene import Movable
 from interactive_nav.world import World, sorted_movables
+from scenes_mjcf.categories import CATEGORIES, TABLE
 
-CLASS_IDS = {
-    "structure": 0,
-    "robot": 1,
-    "chair": 2,
-    "sofa": 3,
-    "table": 4,
-    "desk": 4,
-    "door": 5,
-    "basket": 6,
-    "pot": 7,
-    "toy": 9,
-    "shoe": 10,
-    "other": 0,
-}
-"""Segmentation ids of Interactive Gibson's code (reference benchmark, section 1.4); the second basket model is 8.
-
-The kinds of ids 7 and 10 are not public (a shoe and a pot, in some order). What has no class is as the structure.
-"""
-NUM_CLASSES = 11
-"""Divides a class id into the observation's [0, 1], as the original does."""
-DESK_ID = 11
-"""Id of desks with `segmentation_classes=5`, the paper's chair, desk, door, sofa and table."""
+NUM_CLASSES = max(number for category in TABLE for number in category.segmentation_ids) + 1
+"""Divides a class id into the observation's [0, 1], as the original does (11): desks apart (`five`) are 1."""
 
 
 @flax.struct.dataclass
@@ -92,11 +73,11 @@ def class_id(category: str, five: bool = False) -> int:
     Raises:
         ValueError: a category without an id.
     """
-    if category not in CLASS_IDS:
-        near = difflib.get_close_matches(category, CLASS_IDS, 1)
+    if category not in CATEGORIES:
+        near = difflib.get_close_matches(category, CATEGORIES, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ValueError(f"category '{category}' has no segmentation id; {hint}known: {', '.join(CLASS_IDS)}")
-    return DESK_ID if five and category == "desk" else CLASS_IDS[category]
+        raise ValueError(f"category '{category}' has no segmentation id; {hint}known: {', '.join(CATEGORIES)}")
+    return CATEGORIES[category].segmentation_id(five)
 
 
 def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
@@ -220,7 +201,7 @@ def with_robot(tables: BoxTables, world: World) -> BoxTables:
         pos_b=add(tables.pos_b, [0.0, 0.0, half_height], tables.num_boxes),
         axes_b=add(tables.axes_b, eye, tables.num_boxes),
         half_m=add(tables.half_m, [0.8 * radius, 0.8 * radius, half_height], tables.num_boxes),
-        class_id=add(tables.class_id, CLASS_IDS["robot"], tables.num_boxes),
+        class_id=add(tables.class_id, class_id("robot"), tables.num_boxes),
         hinge_pos_w=add(tables.hinge_pos_w, [0.0] * 3, slots),
         hinge_axes_w=add(tables.hinge_axes_w, eye, slots),
         hinge_axis_b=add(tables.hinge_axis_b, [0.0] * 3, slots),

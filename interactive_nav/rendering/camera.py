@@ -91,7 +91,7 @@ class Camera:
             )
         scene = int(state.info["nav"].scene_index)
         if scene not in self._visual:
-            self._visual[scene] = build_visual(self._env.world, scene)
+            self._visual[scene] = build_visual(self._env.world, scene, self._env.sensors.five_classes)
         visual = self._visual[scene]
         data = visual.pose(qpos)
         pose, fov = self._pose(visual, data, qpos, scene, view, width / height)

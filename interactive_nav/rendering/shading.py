@@ -10,28 +10,12 @@ import numpy as np
 
 from interactive_nav.rendering.base import CameraPose, Lens
 from interactive_nav.rendering.boxes import BoxTables, box_poses, rotate
+from scenes_mjcf.categories import CLASS_COLOURS
 
-PALETTE = np.array(
-    [
-        [0.82, 0.79, 0.74],  # walls
-        [0.20, 0.22, 0.25],  # robot
-        [0.85, 0.45, 0.18],  # chair
-        [0.24, 0.45, 0.66],  # sofa
-        [0.62, 0.42, 0.26],  # table
-        [0.46, 0.56, 0.38],  # door
-        [0.90, 0.76, 0.30],  # basket
-        [0.72, 0.25, 0.30],  # shoe
-        [0.95, 0.86, 0.52],  # basket
-        [0.30, 0.66, 0.62],  # toy
-        [0.55, 0.36, 0.60],  # pot
-        [0.42, 0.30, 0.22],  # desk
-        [0.56, 0.50, 0.43],  # floor
-        [0.93, 0.95, 0.97],  # nothing
-    ],
-    np.float32,
-)
+FLOOR_COLOUR, BACKGROUND_COLOUR = (0.56, 0.50, 0.43), (0.93, 0.95, 0.97)
+PALETTE = np.array([*CLASS_COLOURS, FLOOR_COLOUR, BACKGROUND_COLOUR], np.float32)
 """Colours by class id, then the floor's and the background's."""
-FLOOR, BACKGROUND = 12, 13
+FLOOR, BACKGROUND = len(CLASS_COLOURS), len(CLASS_COLOURS) + 1
 _LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
 
 

@@ -7,9 +7,10 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from interactive_nav.rendering.boxes import CLASS_IDS, class_id
-from interactive_nav.rendering.shading import PALETTE
+from interactive_nav.rendering.boxes import class_id
+from interactive_nav.rendering.shading import FLOOR_COLOUR, PALETTE
 from interactive_nav.world import World
+from scenes_mjcf.categories import CATEGORIES
 
 VISUAL_GROUP, ROBOT_GROUP = 2, 5
 """Geom groups: what is always drawn, and the robot, which is not in its own view."""
@@ -39,13 +40,16 @@ class VisualModel:
         return data
 
 
-def build_visual(world: World, scene: int) -> VisualModel:
+def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
     """Compiles a scene's own `scene.xml` with the robot and the small objects added.
 
     Args:
         world: of the environment.
         scene: index of the scene.
+        five: desks have a segmentation id of their own, as with `segmentation_classes=5`.
     """
+    ids_of = {m.name: class_id(m.category, five) for m in world.scenes[scene].movables}
+    ids_of |= {f"{o.category}_small_{i}": o.segmentation_id for i, o in enumerate(world.small_objects)}
     spec = mujoco.MjSpec.from_file(str(world.scenes[scene].path / "scene.xml"))
     with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
     for geom in list(spec.geoms):
@@ -54,16 +58,15 @@ def build_visual(world: World, scene: int) -> VisualModel:
         bare = geom.parent.name not in with_mesh
         geom.group = VISUAL_GROUP if shown or (bare and geom.type == mujoco.mjtGeom.mjGEOM_BOX) else 4
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
-            geom.rgba = [0.56, 0.50, 0.43, 1.0]
+            geom.rgba = [*FLOOR_COLOUR, 1.0]
         elif bare and geom.group == VISUAL_GROUP:
-            category = geom.parent.name.rsplit("_", 1)[0]
-            geom.rgba = [*PALETTE[CLASS_IDS.get(category, 0)], 1.0]
+            geom.rgba = [*PALETTE[ids_of.get(geom.parent.name, 0)], 1.0]
     before = {b.name for b in spec.bodies}
     world.robot.add_to(spec)
     for body in spec.bodies:
         if body.name not in before:
             for geom in body.geoms:
-                geom.group, geom.rgba = ROBOT_GROUP, [*PALETTE[1], 1.0]
+                geom.group, geom.rgba = ROBOT_GROUP, [*CATEGORIES["robot"].colour, 1.0]
     for i, obj in enumerate(world.small_objects):
         body = spec.worldbody.add_body(name=f"{obj.category}_small_{i}")
         body.add_freejoint(name=f"{obj.category}_small_{i}_joint")
@@ -74,7 +77,7 @@ def build_visual(world: World, scene: int) -> VisualModel:
                 quat=box.quat,
                 size=box.half_m,
                 group=VISUAL_GROUP,
-                rgba=[*PALETTE[class_id(obj.category)], 1.0],
+                rgba=[*PALETTE[obj.segmentation_id], 1.0],
             )
     spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
     for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
@@ -98,11 +101,9 @@ def build_visual(world: World, scene: int) -> VisualModel:
             at = model.jnt_qposadr[model.body(name).jntadr[0]]
             link(at, layout.slot_qpos[slot], 1 if layout.slot_kind[slot] == "hinge" else 7)
     ids, colour = np.zeros(model.ngeom, np.uint8), np.zeros((model.ngeom, 3), np.float32)
-    small = {f"{o.category}_small_{i}": class_id(o.category) for i, o in enumerate(world.small_objects)}
-    category = {m.name: class_id(m.category) for m in world.scenes[scene].movables}
     for g in range(model.ngeom):
         name = model.body(model.geom_bodyid[g]).name
-        ids[g] = 1 if model.geom_group[g] == ROBOT_GROUP else category.get(name, small.get(name, 0))
+        ids[g] = class_id("robot") if model.geom_group[g] == ROBOT_GROUP else ids_of.get(name, 0)
         colour[g] = _colour(model, g)
     return VisualModel(model, np.concatenate(targets), np.concatenate(sources), ids, colour)
 

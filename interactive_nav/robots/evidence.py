@@ -160,13 +160,27 @@ def _manoeuvres(robot: RobotSpec) -> tuple[_Manoeuvre, ...]:
     )
 
 
-def _front_m(world: World) -> float:
-    """How far the robot's collision geoms reach ahead of its base frame at home."""
-    model, layout = world.models[0], world.layout
+def _at_home(world: World) -> mujoco.MjData:
+    """The robot at home with its base frame at the world's."""
+    model, at = world.models[0], world.layout.robot_qpos
     data = mujoco.MjData(model)
     data.qpos[:] = world.rest_qpos[0]
-    data.qpos[layout.robot_qpos : layout.robot_qpos + 7] = [0, 0, 0, 1, 0, 0, 0]
+    data.qpos[at : at + 7] = [0, 0, 0, 1, 0, 0, 0]
     mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _axle_b(robot: RobotSpec, world: World) -> np.ndarray:
+    """(2,) m: middle of the driven wheels in the base frame, about which a wheeled robot turns."""
+    model, data = world.models[0], _at_home(world)
+    bodies = [int(model.jnt_bodyid[model.actuator(name).trnid[0]]) for name in robot.actuators]
+    wheels = [data.xpos[b, :2] for b in bodies if model.body(b).name in robot.rolling_bodies]
+    return np.mean(wheels, 0) if wheels else np.zeros(2)
+
+
+def _front_m(world: World) -> float:
+    """How far the robot's collision geoms reach ahead of its base frame at home."""
+    model, layout, data = world.models[0], world.layout, _at_home(world)
     reach = 0.0
     for geom in range(model.ngeom):
         if model.geom_bodyid[geom] in layout.robot_bodies and model.geom_contype[geom]:
@@ -243,7 +257,11 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
         return float(rate[steady, index[run]].mean() / asked)
 
     straight, turn, corner, stand = (index[n] for n in ("straight", "turn", "corner", "stand"))
-    centre = xy[:, [turn, index["half turn"]]]
+    turns = [turn, index["half turn"]]
+    # The base frame may lie off the axle, and then goes round it.
+    axle, cos, sin = _axle_b(robot, world), np.cos(yaw[:, turns]), np.sin(yaw[:, turns])
+    offset = np.stack([cos * axle[0] - sin * axle[1], sin * axle[0] + cos * axle[1]], -1)
+    centre = xy[:, turns] + offset - offset[:1]
     # Four wheels that skid wander with the last bits of their contacts: by up to a twentieth of the robot's length.
     turn_limit_m = max(0.03, 0.05 * robot.size_m[0]) if robot.size_m else 0.03
     checks = [

@@ -134,13 +134,12 @@ def _faces(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
 
 
 def _with_matplotlib(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    figure = plt.figure(figsize=(_SIZE[0] / 100, _SIZE[1] / 100), dpi=100)
+    figure = Figure(figsize=(_SIZE[0] / 100, _SIZE[1] / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot(projection="3d")
     light = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
     faces, colours = [], []
@@ -159,10 +158,8 @@ def _with_matplotlib(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     axes.view_init(elev=-_VIEW_ELEVATION_DEG, azim=_VIEW_AZIMUTH_DEG - 180)
     axes.set_axis_off()
     figure.subplots_adjust(0, 0, 1, 1)
-    figure.canvas.draw()
-    image = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # pyright: ignore[reportAttributeAccessIssue]
-    plt.close(figure)
-    return image
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def picture(robot: RobotSpec, renderer: str = "auto") -> np.ndarray:
@@ -203,14 +200,10 @@ def save_figure(evidence: dict[str, Evidence | None], path: Path) -> None:
         evidence: robot -> what was measured; none: a picture only.
         path: of the PNG.
     """
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(
-        len(evidence), 4, figsize=(17, 2.9 * len(evidence)), width_ratios=(1, 1.3, 1.3, 2.6), squeeze=False
-    )
+    figure = Figure(figsize=(17, 2.9 * len(evidence)))
+    axes = figure.subplots(len(evidence), 4, width_ratios=(1, 1.3, 1.3, 2.6), squeeze=False)
     for (image, straight, turn, table), (name, own) in zip(axes, evidence.items(), strict=True):
         robot = get_robot(name)
         image.imshow(picture(robot))
@@ -247,4 +240,3 @@ def save_figure(evidence: dict[str, Evidence | None], path: Path) -> None:
                 )
     figure.tight_layout()
     figure.savefig(path, dpi=80)
-    plt.close(figure)

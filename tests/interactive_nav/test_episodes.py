@@ -1,7 +1,11 @@
 """Episode files: the same episodes for everybody, and one clear line for each way a file does not fit."""
 
 import dataclasses
+import hashlib
 import json
+import shutil
+import types
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,6 +14,8 @@ import pytest
 import interactive_nav
 from interactive_nav import episodes
 from interactive_nav.episodes import EpisodeFileError
+from interactive_nav.scene import load_scene
+from scenes_mjcf.schema import load_maps, save_maps
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +63,64 @@ def test_scenes_are_found_by_content_not_by_place(env, made, room, two_rooms):
     turned = interactive_nav.make("turtlebot", [two_rooms, room], backend="native", num_objects=3)
     starts = episodes.starts_of(made, turned)
     np.testing.assert_array_equal(starts.scene_index, [1 - row["scene"] for row in made.episodes])
+
+
+def _changed(folder, copy, name, before, after):
+    """A scene in a copy of the folder, in whose file `name` the text `before` has become `after`."""
+    shutil.copytree(folder, copy)
+    text = (copy / name).read_text()
+    assert before in text
+    (copy / name).write_text(text.replace(before, after))
+    return load_scene(copy)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after", "same"),
+    [
+        ("scene.json", '"friction": 0.5', '"friction": 0.05', False),
+        ("scene.xml", 'density="', 'density="1', False),
+        ("scene.xml", "0.2 0.2 0.2", "0.2 0.2 0.25", False),
+        ("scene.xml", 'pos="0.7 0', 'pos="0.8 0', False),
+        ("scene.json", '"category": "chair"', '"category": "sofa"', False),
+        ("scene.xml", '<body name="chair_0"', '<!-- repainted --> <body name="chair_0"', True),
+        ("scene.xml", 'name="chair_0_box_0"', 'name="chair_0_box_0" rgba="1 0 0 1"', True),
+        ("scene.json", "CC0-1.0", "CC-BY-4.0", True),
+    ],
+)
+def test_a_scenes_task_is_told_by_what_decides_it_not_by_looks(room, tmp_path, name, before, after, same):
+    assert (_changed(room, tmp_path / "room", name, before, after).task_digest == load_scene(room).task_digest) is same
+
+
+def test_hulls_and_maps_are_part_of_the_task(room, tmp_path):
+    source = Path(__file__).parents[2] / "scenes_mjcf" / "apartment_0"
+    first = load_scene(source).task_digest
+    # As it was when files with it were made: a new way to compute it needs a new prefix.
+    assert first == "task-1:0abb63e83942bd5301b9ea98992b675ff87287e19d3d4155a3556927a6fcfa9d"
+    shutil.copytree(source, tmp_path / "apartment_0")
+    (tmp_path / "apartment_0" / "assets" / "chair_0.png").write_bytes((source / "assets" / "chair_1.png").read_bytes())
+    assert load_scene(tmp_path / "apartment_0").task_digest == first
+    hull = tmp_path / "apartment_0" / "assets" / "chair_0_hull_0.obj"
+    hull.write_bytes((source / "assets" / "chair_1_hull_0.obj").read_bytes())
+    assert load_scene(tmp_path / "apartment_0").task_digest != first
+    shutil.copytree(room, tmp_path / "room")
+    maps = load_maps(room)
+    save_maps(dataclasses.replace(maps, traversable=maps.traversable & (np.arange(maps.traversable.shape[1]) > 5)),
+              tmp_path / "room")  # fmt: skip
+    assert load_scene(tmp_path / "room").task_digest != load_scene(room).task_digest
+
+
+def test_less_friction_is_refused_and_files_of_before_still_load(env, made, room, two_rooms, tmp_path):
+    slippery = _changed(room, tmp_path / "room", "scene.json", '"friction": 0.5', '"friction": 0.05')
+    other = types.SimpleNamespace(robot=env.robot, world=env.world, tables=env.tables,
+                                  scenes=(slippery, *env.scenes[1:]))  # fmt: skip
+    with pytest.raises(EpisodeFileError, match="scene 'room' has digest .*: its content changed since"):
+        episodes.starts_of(made, other)  # pyright: ignore[reportArgumentType]
+    old = dataclasses.replace(
+        made,
+        scenes=tuple((s.name, s.digest) for s in env.scenes),
+        objects_digest=hashlib.sha256(repr(env.world.small_objects).encode()).hexdigest(),
+    )
+    np.testing.assert_array_equal(episodes.starts_of(old, env).goal_xy_w, episodes.starts_of(made, env).goal_xy_w)
 
 
 def test_files_that_do_not_fit_are_refused(env, made, room):

@@ -14,6 +14,7 @@ import interactive_nav
 from interactive_nav import gym_env
 from interactive_nav.env import EPISODE_METRICS, REWARD_TERMS
 from interactive_nav.gym_env import InteractiveNavVectorEnv, env_id
+from interactive_nav_common.errors import ConfigError
 
 ID = "InteractiveNav-TurtleBot-v0"
 N, STEPS = 3, 9
@@ -226,3 +227,38 @@ def test_gymnasiums_statistics_wrapper_counts_our_episodes(same_step):
         info = envs.step(action)[4]
     assert info["_episode"].all()
     np.testing.assert_array_equal(info["episode"]["l"], 4)
+
+
+@pytest.mark.parametrize(("dtype", "high"), [("float32", 1.0), ("float16", 1.0), ("uint8", 255)])
+def test_images_are_bounded_in_their_own_type(room, dtype, high):
+    env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0, image_size=8, image_dtype=dtype,
+                               observations=("goal", "depth", "segmentation"))  # fmt: skip
+    space = gym_env.observation_space_of(env)
+    assert isinstance(space, gymnasium.spaces.Dict)
+    for name in ("pixels/depth", "pixels/segmentation"):
+        assert space[name] == gymnasium.spaces.Box(0, high, (8, 8, 1), np.dtype(dtype).type)
+    assert space["state"] == gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+
+def test_each_environment_of_a_batch_keeps_its_scene(room, two_rooms):
+    settings = {"scenes": [room, two_rooms], "backend": "native", "num_objects": 0, "episode_steps": 2}
+    settings["scene_choice"] = "slot"
+    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
+        envs = InteractiveNavVectorEnv("turtlebot", num_envs=3, autoreset_mode=mode, **settings)
+        envs.reset(seed=1)
+        goals = []
+        for action in actions(4):
+            nav = envs._state.info["nav"]
+            assert nav.scene_index.tolist() == [0, 1, 0]
+            goals.append(np.asarray(nav.goal_xy_w))
+            envs.step(action)
+        assert envs._state.info["nav"].scene_index.tolist() == [0, 1, 0]
+        assert (goals[0] != goals[-1]).any(1).all()  # new episodes did begin
+    one = gym_env.InteractiveNavEnv("turtlebot", slot=1, **settings)
+    for seed in range(3):
+        one.reset(seed=seed)
+        assert one._state.info["nav"].scene_index == 1
+    with pytest.raises(ConfigError, match="scene_choice is 'slot' for one environment of 2 scenes"):
+        gym_env.InteractiveNavEnv("turtlebot", **settings)
+    with pytest.raises(ConfigError, match="slot is 1 with scene_choice='episode'"):
+        gym_env.InteractiveNavEnv("turtlebot", slot=1, **{**settings, "scene_choice": "episode"})

@@ -16,6 +16,7 @@ from interactive_nav.contacts import from_sensors, rolling_geoms, sensor_address
 from interactive_nav.env import SETTLE_STEPS
 from interactive_nav.types import EpisodeStart
 from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav_common.errors import ConfigError
 from tests.toys import write_room
 
 N = 3
@@ -329,3 +330,27 @@ def test_desks_are_tables_in_the_mask_unless_five_classes_are_asked_for(tmp_path
         assert set(np.round(mask).astype(int).ravel()) == ids
         if classes == 5:  # y to the left: the desk is in the left half of the picture
             assert (np.round(mask) == 11)[:, :10].any() and not (np.round(mask) == 11)[:, 10:].any()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"backend": "native", "active_furniture": 3}, "active_furniture is 3, .*: expected backend auto, jax or warp"),
+        ({"backend": "jax", "threads": 2}, "threads is 2, .*: expected backend auto or native"),
+        ({"backend": "native", "contacts_per_env": 50}, "contacts_per_env is 50, .*: expected backend auto or warp"),
+        ({"image_dtype": "uint8"}, "image_dtype is 'uint8', .*: expected depth or segmentation among observations"),
+        ({"observations": ("segmentation",), "depth_noise": 0.1}, "depth_noise is 0.1, .*: expected depth among"),
+        ({"lidar_rays": 3}, "lidar_rays is 3, .*: expected lidar among observations; or leave it out"),
+        ({"odometry_noise": 0.1}, "odometry_noise is 0.1, .*: expected odometry among observations"),
+        ({"num_objects": 0, "small_objects": "test"}, "small_objects is 'test', .*: expected num_objects above 0"),
+    ],
+)
+def test_a_setting_that_changes_nothing_is_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        make_config(**settings)
+
+
+def test_settings_that_say_what_holds_anyway_are_taken():
+    make_config(backend="native", active_furniture=0, threads=2)
+    make_config(active_furniture=3, contacts_per_env=50, threads=2)  # auto: for whichever it becomes
+    make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=20)

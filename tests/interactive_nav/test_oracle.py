@@ -124,7 +124,7 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
         "structure_steps": structure,
         "lifted": lifted,
     }
-    scores |= dict.fromkeys(("nonfinite", "overflow_steps", "left_out_steps", "objects_dropped"), 0.0)
+    scores |= dict.fromkeys(("nonfinite", "overflow_steps", "left_out_steps", "objects_dropped", "off_distance"), 0.0)
     return {name: float(value) for name, value in scores.items()}, rewards
 
 

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import interactive_nav
 from interactive_nav import geodesic
 from interactive_nav.config import NavConfig
-from interactive_nav.placement import CLEARANCE_M, draw_episode
+from interactive_nav.placement import CLEARANCE_M, draw_episode, miss_m
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from interactive_nav.tables import build_tables
+from interactive_nav.types import EpisodeStart
 from interactive_nav.world import build_world
+from scenes_mjcf.schema import SceneError
 
 DRAWS = 10_000
 CONFIG = NavConfig(num_objects=10)
@@ -171,3 +174,57 @@ def test_a_largest_distance_holds(built):
         c, r = np.floor((drawn.start_xy_w[i] - origin) / tables.fine_m).astype(int)
         assert distances[r, c] <= 2.0 * 1.02 + 0.05
     assert np.linalg.norm(drawn.start_xy_w - drawn.goal_xy_w, axis=-1).min() >= 1.0
+
+
+def draw_pairs(tables, count, least_m, largest_m):
+    def draw(key):
+        start = draw_episode(key, tables, jnp.zeros(0), 0.3, least_m, largest_m)
+        miss = miss_m(tables, start.scene_index, start.start_xy_w, start.goal_xy_w, least_m, largest_m)
+        return start.start_xy_w, start.goal_xy_w, miss
+
+    return map(np.asarray, jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(2), count)))
+
+
+def test_rare_distances_are_met_too_and_uniformly(built):
+    """Across a room of 5 x 4 m so few pairs qualify that the first 64 mostly hold none."""
+    _, tables = built
+    starts, goals, miss = draw_pairs(tables, 300, 4.4, 4.6)
+    assert (miss == 0).all()
+    straight = np.linalg.norm(starts - goals, axis=-1)
+    assert straight.min() >= 4.4 and straight.max() <= 4.6
+    places = [np.asarray(getattr(tables, n))[0] for n in ("start_xy_w", "goal_xy_w")]
+    counts = int(tables.num_starts[0]), int(tables.num_goals[0])
+    rng = np.random.default_rng(0)
+    a, b = (xy[rng.integers(0, n, 200_000)] for xy, n in zip(places, counts, strict=True))
+    apart = np.linalg.norm(a - b, axis=-1)
+    share = ((apart >= 4.4) & (apart <= 4.6)).mean()
+    assert 0 < 64 * share < 1.0, share
+    # Either end is the start as often: the pairs are uniform.
+    assert stats.binomtest(int((starts[:, 0] > goals[:, 0]).sum()), 300).pvalue > 1e-3
+
+
+def test_what_cannot_be_met_is_taken_for_nearest_and_told(built):
+    _, tables = built
+    starts, goals, miss = draw_pairs(tables, 3, 20.0, np.inf)
+    np.testing.assert_allclose(miss, 20.0 - np.linalg.norm(starts - goals, axis=-1), atol=1e-4)
+
+
+def test_distances_that_no_pair_has_are_refused(two_rooms):
+    # From corner to corner the straight line would be 5.6 m, but the partition's gap is a way round of 5.8 m.
+    config = NavConfig(num_objects=0, min_goal_distance_m=5.6, max_goal_distance_m=5.62)
+    world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), config)
+    with pytest.raises(SceneError, match="no start and goal of robot 'turtlebot' are at least 5.6 m apart and at most"):
+        build_tables(world, config)
+
+
+def test_an_episode_off_its_distances_is_counted(room):
+    env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0, episode_steps=1,
+                               max_goal_distance_m=1.5)  # fmt: skip
+
+    def start(x):
+        return EpisodeStart(jnp.asarray(0), jnp.asarray([-1.5, -1.0]), jnp.asarray(0.0), jnp.asarray([x, -1.0]),
+                            jnp.zeros((0, 2)), jnp.zeros(0), jnp.zeros(0, bool))  # fmt: skip
+
+    reset, step = jax.jit(env.reset_to), jax.jit(env.advance)
+    off = [step(reset(start(x), jax.random.PRNGKey(0)), jnp.zeros(2)).metrics["off_distance"] for x in (-1.0, 0.0, 0.5)]
+    assert [float(v) for v in off] == [1.0, 0.0, 1.0]

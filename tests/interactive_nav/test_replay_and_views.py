@@ -1,7 +1,10 @@
 """Replays against the environment's own bookkeeping; rays against geometry by hand; videos and maps read back."""
 
 import dataclasses
+import json
 import math
+import subprocess
+import sys
 
 import imageio_ffmpeg
 import jax
@@ -172,6 +175,52 @@ def test_goal_and_path_are_painted_on_the_floor(view):
     assert changed.mean() == pytest.approx(share, rel=0.1)
     ring = painted[20, 20 + round(0.18 / (2 * 3.0 * math.tan(0.15)) * 41)] / 255
     assert np.argmax(ring) == np.argmax(GOAL_COLOUR)
+
+
+def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, monkeypatch):
+    told = dataclasses.replace(played, small_objects="test", segmentation_classes=5, success_distance_m=0.7)
+    replay.save(told, tmp_path / "a.npz")
+    told = replay.load(tmp_path / "a.npz")
+    assert (told.small_objects, told.segmentation_classes, told.success_distance_m) == ("test", 5, 0.7)
+    names = [f"{o.category}_small_{i}" for i, o in enumerate(pick(3, "test"))]
+    shown = {name: rows for name, (_, rows) in topdown.outlines(told, load_scene(room)).items()}
+    view = record.Compositor(told, load_scene(room), height=120)._view
+    for name, obj in zip(names, pick(3, "test"), strict=True):
+        halves = [box.half_m for box in obj.boxes]
+        np.testing.assert_allclose(shown[name][:, 7:], halves)
+        body = view.model.body(name)
+        np.testing.assert_allclose(view.model.geom_size[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]], halves)
+    painted = []
+    monkeypatch.setattr(record, "FloorPaint", lambda goal, radius, trail: painted.append(radius))
+    for each, radius in ((told, 0.7), (dataclasses.replace(told, success_distance_m=None), 0.333)):
+        record.Compositor(each, load_scene(room), height=120).frame(0)
+        axis = topdown.panels([each], {str(room): load_scene(room)}).axes[0]
+        assert painted.pop() == pytest.approx(radius, abs=1e-3)
+        assert any(getattr(patch, "radius", 0) == pytest.approx(radius, abs=1e-3) for patch in axis.patches)
+
+
+def test_a_replay_of_before_can_be_read(played, tmp_path):
+    fields = {f.name: getattr(played, f.name) for f in dataclasses.fields(played)}
+    later = ("small_objects", "segmentation_classes", "success_distance_m")
+    header = {n: v for n, v in fields.items() if n not in (*replay._ARRAYS, *later)} | {"format": 1}
+    arrays = {name: fields[name] for name in replay._ARRAYS}
+    np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
+    old = replay.load(tmp_path / "old.npz")
+    assert (old.small_objects, old.segmentation_classes, old.success_distance_m) == ("train", 4, None)
+
+
+def test_importing_and_drawing_leave_matplotlibs_backend_alone():
+    code = """
+import matplotlib
+matplotlib.use("svg")
+from matplotlib import pyplot
+import interactive_nav.topdown
+from interactive_nav.robots import get_robot, picture
+picture._with_matplotlib(*picture.stage(get_robot("turtlebot")))
+print(matplotlib.get_backend(), pyplot.get_fignums())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().splitlines()[-1].lower() == "svg []"
 
 
 def test_a_body_that_is_not_there_is_refused(view):

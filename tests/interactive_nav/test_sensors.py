@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import zlib
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from interactive_nav.observation import advance_odometry
 from interactive_nav.physics import PhysicsState
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
-from interactive_nav.sensors import Sensors
+from interactive_nav.sensors import Sensors, stream
 from interactive_nav.types import NavInfo
 from interactive_nav.world import build_world
 from interactive_nav.wrappers import AutoResetEnv
@@ -192,3 +193,17 @@ def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         NavConfig(**settings)
+
+
+def test_no_sensor_uses_the_key_that_the_next_episode_is_drawn_from():
+    key, step = jax.random.PRNGKey(7), jnp.asarray(0)
+    names = ("depth", "lidar", "odometry")
+    bases = [jax.random.fold_in(key, zlib.crc32(name.encode())) for name in names]
+    used = [*bases, *(stream(key, name, step) for name in names)]
+    drawn = [*jax.random.split(key), key, *jax.random.split(jax.random.split(key)[1], 6)]
+    rows = np.stack([np.asarray(k) for k in (*used, *drawn)])
+    assert len(np.unique(rows, axis=0)) == len(rows)
+    for name, base in zip(names, bases, strict=True):
+        np.testing.assert_array_equal(stream(key, name, step), jax.random.fold_in(base, 0))
+    # What a small number does: the base of the depth's stream was the next episode's key.
+    np.testing.assert_array_equal(jax.random.fold_in(key, 1), jax.random.split(key)[1])

@@ -40,6 +40,9 @@ assert sharded.num_devices == 2
 state, split = run(sharded)
 assert len(state.obs.sharding.device_set) == 2 and state.obs.addressable_shards[0].data.shape == (2, 29)
 np.testing.assert_allclose(split, run(env)[1], atol=1e-6)
+kept = interactive_nav.make("turtlebot", sys.argv[1:3], backend="native", num_objects=1, scene_choice="slot")
+index = jax.jit(ShardedEnv(AutoResetEnv(kept)).reset)(keys).info["nav"].scene_index
+assert index.tolist() == [0, 1, 0, 1], index
 print("equal")
 """
 
@@ -74,9 +77,13 @@ def scene(tmp_path_factory):
 
 @pytest.mark.heavy
 @pytest.mark.slow
-def test_two_devices_step_as_one(scene):
+def test_two_devices_step_as_one(scene, room):
     done = subprocess.run(
-        [sys.executable, "-c", ONE_PROCESS, str(scene)], cwd=ROOT, env=_environment(2), capture_output=True, text=True
+        [sys.executable, "-c", ONE_PROCESS, str(scene), str(room)],
+        cwd=ROOT,
+        env=_environment(2),
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.strip().endswith("equal")
@@ -102,11 +109,34 @@ def test_two_processes_share_one_batch(scene):
 class _Nothing:
     """Stands where an environment would: construction reads no more of it."""
 
-    def reset(self, rng):
+    def reset(self, rng, slot):
         return rng
 
     def step(self, state, action):
         return state
+
+
+class _Told:
+    """Says which environments it is told that it has."""
+
+    def reset(self, rng, slot):
+        return slot
+
+    def step(self, state, action):
+        return state
+
+
+TOLD = """
+import jax
+from interactive_nav.sharding import ShardedEnv
+from tests.interactive_nav.test_sharding import _Told
+print(ShardedEnv(_Told()).reset(jax.random.split(jax.random.PRNGKey(0), 4)).tolist())
+"""
+
+
+def test_each_device_is_told_which_environments_it_has():
+    done = subprocess.run([sys.executable, "-c", TOLD], cwd=ROOT, env=_environment(2), capture_output=True, text=True)
+    assert done.stdout.strip().endswith("[0, 1, 2, 3]"), done.stderr[-3000:]
 
 
 def test_a_batch_that_does_not_divide_is_refused():

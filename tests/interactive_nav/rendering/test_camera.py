@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig
+from interactive_nav.objects import pick
 from interactive_nav.rendering.base import Lens, look_along
 from interactive_nav.rendering.camera import STREAMS, Camera
 from interactive_nav.rendering.rays import RayRenderer
 from interactive_nav.rendering.shading import FLOOR, PALETTE, colours, normals
+from interactive_nav.robots import get_robot
+from interactive_nav.scene import load_scene
 from interactive_nav.sensors import Sensors
+from interactive_nav.views import CLASSES, SceneView
+from interactive_nav.world import build_world
+from scenes_mjcf.categories import CLASS_COLOURS
+from tests.toys import write_room
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +64,30 @@ def test_the_robots_own_view_is_the_sensors_view(scene_and_state):
     # The toy scene's furniture is drawn as its boxes; its walls have no visual mesh but themselves.
     assert np.mean(np.abs(frame["depth"] - depth[0]) < 0.01) > 0.99
     assert np.mean(frame["segmentation"] == ids[0]) > 0.99
+
+
+@pytest.mark.parametrize("classes", [4, 5])
+def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes):
+    """The second basket is 8 to both, and a desk 4 or, apart from tables, 11."""
+    room = write_room(tmp_path / "room", blocks=(("desk", 0.7, 0.5, 9.0, 0.5),))
+    config = NavConfig(num_objects=6, segmentation_classes=classes)
+    world = build_world(get_robot("turtlebot"), (load_scene(room),), config)
+    env = types.SimpleNamespace(world=world, scenes=world.scenes, sensors=Sensors(world, config, "native"))
+    qpos = world.rest_qpos[0].copy()
+    for slot, kind in enumerate(world.layout.slot_kind):
+        if kind == "small":
+            qpos[world.layout.slot_qpos[slot] : world.layout.slot_qpos[slot] + 2] = [-1.5 + 0.6 * slot, -0.5]
+    qpos[world.layout.robot_qpos : world.layout.robot_qpos + 2] = [-1.2, 1.0]
+    state = types.SimpleNamespace(
+        pipeline_state=types.SimpleNamespace(qpos=qpos), info={"nav": types.SimpleNamespace(scene_index=0)}
+    )
+    seen = set(np.unique(Camera(env, "rays").frame(state, 160, 120, ("segmentation",), view="top")["segmentation"]))
+    observed = set(np.unique(env.sensors.boxes.class_id[0]))
+    assert seen == observed | {1} and {6, 8, 4 if classes == 4 else 11} <= seen
+    view = SceneView(get_robot("turtlebot"), world.scenes[0], pick(6), classes)
+    assert set(np.unique(view._class)) == seen
+    assert CLASSES[8] == "basket" and CLASSES[7] == "pot" and CLASSES[10] == "shoe"
+    np.testing.assert_allclose(PALETTE[: len(CLASS_COLOURS)], CLASS_COLOURS, atol=1e-6)
 
 
 def test_the_follower_sees_the_robot(scene_and_state):

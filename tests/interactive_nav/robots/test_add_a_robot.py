@@ -87,6 +87,18 @@ def test_a_urdf_keeps_its_masses_and_limits_and_gets_its_figures_from_its_shapes
     np.testing.assert_allclose(data.xaxis[model.joint("porter_right_wheel_joint").id], [0, 1, 0], atol=1e-4)
 
 
+@pytest.mark.heavy
+def test_a_base_frame_off_the_axle_is_no_failure(tmp_path, registry):
+    """The porter's frame is 5 cm behind its axle: everything stands that much further ahead."""
+    text = re.sub(r'<origin xyz="(\S+) ', lambda x: f'<origin xyz="{float(x[1]) + 0.05:g} ', URDF)
+    robots.register("porter", _from_file(_write(tmp_path, text), **PORTER))
+    own = {check.name: check for check in evidence.measure("porter").checks}
+    failed = [f"{c.name}: {c.value:.4g}, limits {c.low:.3g} to {c.high:.3g}" for c in own.values() if not c.passed]
+    assert not failed, "; ".join(failed)
+    # It does go round the axle: 0.1 m from one side to the other, where the limit is 0.03 m.
+    assert own["turn: centre moves m"].value < 0.02
+
+
 CART = """<mujoco model="cart"><compiler angle="degree"/><option timestep="0.001"/>
 <default><geom friction="0.4"/></default>
 <worldbody><light pos="0 0 3"/><geom name="ground" type="plane" size="5 5 0.1"/>
