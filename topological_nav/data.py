@@ -28,7 +28,7 @@ from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import CameraConfig, DataConfig
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.passages import Passages, draw_passages, held_out
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.rooms import Rooms, agreement, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
 from topological_nav.shards import ShardWriter, read_shards
@@ -145,8 +145,10 @@ def make_dataset(
     Raises:
         DatasetError: `out` holds a dataset of other scenes or settings.
         SceneError, SpaceError: a scene cannot be used.
+        UserError: the engine is not installed.
     """
     scenes = [load_scene(folder) for folder in scene_folders]
+    need_engine(config.engine)
     names = [scene.name for scene in scenes]
     if len(set(names)) != len(names) or not names:
         raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")

@@ -31,7 +31,7 @@ from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.expert import CONTROL_S, Terrain, way_field
 from topological_nav.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.graph import place_nodes
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.rooms import find_rooms, recorded_rooms
 from topological_nav.routes import draw_routes, drivable
 from topological_nav.settings import overlaid
@@ -186,8 +186,10 @@ def simulate_drives(
     Raises:
         DatasetError: `out` holds drives of other scenes or settings.
         SceneError, SpaceError: a scene cannot be used.
+        UserError: the engine that will draw them is not installed.
     """
     scenes = [load_scene(folder) for folder in scene_folders]
+    need_engine(config.engine)
     names = [scene.name for scene in scenes]
     if len(set(names)) != len(names) or not names:
         raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
