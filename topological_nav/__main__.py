@@ -127,6 +127,7 @@ def parser() -> argparse.ArgumentParser:
         )
         sub.add_argument(
             "--domain",
+            default="clean",
             metavar="NAME",
             help="camera that the navigator sees by, goals included: clean (default), lens, light, noise, blur or "
             "camera; maps of its images: `adapt map`",
@@ -381,7 +382,7 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
         truth=arguments.truth,
         policy=arguments.policy or PASSAGE_POLICY,
         ppo=getattr(arguments, "ppo", None),
-        domain=arguments.domain or "clean",
+        domain=arguments.domain,
     )
     _refuse_unused(arguments, contest)
     if arguments.truth or not {"dense", "sparse"} & set(contenders):
@@ -420,7 +421,9 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
     )
     if not names & {"dense", "sparse"}:
         navigators = {f.name for f in dataclasses.fields(NavigatorConfig)} - {"limit_s", "run_s"}
-        refuse_unused(arguments, "--truth --maps --localiser --detector --policy --domain supersample", who)
+        refuse_unused(arguments, "--truth --maps --localiser --detector --policy supersample", who)
+        if arguments.domain != "clean":
+            refuse_unused(arguments, "--domain", who)
         refuse_unused(arguments, " ".join(sorted(navigators)), who)
     if "sparse" not in names:
         refuse_unused(arguments, "thinned", who)

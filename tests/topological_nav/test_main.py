@@ -112,7 +112,7 @@ def test_mistakes_are_one_line(words, told, capsys):
         (["evaluate", "S", "--contenders", "expert", "--truth"], "--truth"),
         (["evaluate", "S", "--contenders", "expert", "--maps", "M"], "--maps"),
         (["evaluate", "S", "--contenders", "expert", "--policy", "passage"], "--policy"),
-        (["evaluate", "S", "--contenders", "expert", "--domain", "clean"], "--domain"),
+        (["evaluate", "S", "--contenders", "expert", "--domain", "light"], "--domain"),
         (["evaluate", "S", "--contenders", "expert", "swings=3"], "swings"),
         (["evaluate", "S", "--contenders", "dense", "--ppo", "R"], "--ppo"),
         (["evaluate", "S", "--contenders", "dense", "thinned=0.3"], "thinned"),
