@@ -235,7 +235,7 @@ class _Pictures:
             poses = np.concatenate([xy, heading[:, None]], 1).astype(float)
             kept = self._parts / f"{hashlib.sha256(self._of + poses.tobytes()).hexdigest()[:16]}.npy"
             if kept.is_file():
-                with contextlib.suppress(ValueError, EOFError):  # a damaged one is drawn again
+                with contextlib.suppress(ValueError, EOFError, OSError):  # a damaged or vanished one is drawn again
                     return np.load(kept)
         images = self._renderer.draw(camera_pose(self._robot, xy, heading, np.zeros(len(xy))))
         if kept is not None:
@@ -247,7 +247,7 @@ class _Pictures:
 def forget(parts: Path) -> None:
     """Removes the images that `build_map` kept, once the map is written."""
     for path in parts.glob("*.npy"):
-        path.unlink()
+        path.unlink(missing_ok=True)  # by another process that made the same map
     with contextlib.suppress(OSError):
         parts.rmdir()
 

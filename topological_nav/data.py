@@ -26,7 +26,7 @@ from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
 from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import CameraConfig, DataConfig
-from topological_nav.errors import DatasetError, SpaceError
+from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.passages import Passages, draw_passages, held_out
 from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.rooms import Rooms, agreement, find_rooms, recorded_rooms
@@ -232,11 +232,9 @@ def read_versioned(path: Path, version: int, none: str, again: str) -> dict[str,
     """
     if not path.is_file():
         raise DatasetError(none)
-    try:
+    with readable(path, DatasetError, f"delete the folder and {again}"):
         header = json.loads(path.read_text(encoding="utf-8"))
         found = header["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); delete the folder and {again}") from None
     if found != version:
         raise DatasetError(f"{path}: format {found}, expected {version}; {again}")
     return header
@@ -296,13 +294,10 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
         DatasetError: missing or damaged.
     """
     path = Path(folder) / scene / "plan.npz"
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
-            passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
-            return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); run 'data' again") from None
+    with readable(path, DatasetError, "run 'data' again"), np.load(path, allow_pickle=False) as arrays:
+        rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
+        passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
+        return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
 
 
 def _plan_arrays(plan: ScenePlan) -> dict[str, np.ndarray]:

@@ -27,7 +27,7 @@ from interactive_nav.scene import Scene, load_scene
 from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data import draw_sheets, lens_of, read_versioned
-from topological_nav.errors import DatasetError, SpaceError
+from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.expert import CONTROL_S, Terrain, way_field
 from topological_nav.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.graph import place_nodes
@@ -327,11 +327,9 @@ def load_drives(folder: Path) -> Drives:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); delete it and run 'data --drives' again") from None
+    remedy = "delete it and run 'data --drives' again"
+    with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
 
 
 def _write_batch(path: Path, driven: Driven, count: int) -> None:

@@ -29,7 +29,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import PITCHES, TrainConfig
 from topological_nav.data import PassageImages, RoomImages, load_passages, load_rooms, read_header
-from topological_nav.errors import RunError
+from topological_nav.errors import RunError, readable
 from topological_nav.learning import (
     Learner,
     in_batches,
@@ -50,6 +50,7 @@ from topological_nav.runs import (
     claim,
     cut_metrics,
     read_checkpoint,
+    read_description,
     read_weights,
     restored,
     run_epochs,
@@ -238,16 +239,15 @@ def load_trained(run: Path) -> Trained:
         RunError: no such run, or it is not finished, damaged, or a passage detector of one length without saying which.
     """
     run = Path(run)
-    if not (run / DESCRIPTION).is_file():
-        raise RunError(f"{run}: holds no trained network; finish it: python -m topological_nav train TASK -o {run}")
-    about = json.loads((run / DESCRIPTION).read_text())
+    about = read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:
         raise RunError(
             f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
             "its dataset again and train it again"
         )
-    network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
-    template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
+    with readable(run / DESCRIPTION, RunError, "train again"):
+        network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
+        template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
     return Trained(network, read_weights(run, template, about), about)
 
 
