@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import lzma
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import yaml
 
 from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.locks import locked
 from topological_nav.errors import RunError, readable
 from topological_nav.learning import Learner
 from train.run_folder import read_metrics
@@ -27,6 +29,29 @@ PACKED_WEIGHTS = f"{WEIGHTS}.xz"
 """Of an exported run."""
 SAVE_EVERY_S = 60.0
 """Between two checkpoints; one is written at the end of a phase and on a stop as well."""
+
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Makes a folder and keeps other processes out of it for the block.
+
+    Raises:
+        FileError: another one works there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out / LOCK, f"{out}: {{holder}} works there; wait for it or choose another folder (-o)"):
+        yield
+
+
+@contextlib.contextmanager
+def claimed(out: Path, settings: dict[str, Any]) -> Iterator[None]:
+    """A run folder for the block: of these settings (see `claim`), and of this process alone."""
+    with alone_in(out):
+        claim(out, settings)
+        yield
 
 
 def claim(out: Path, settings: dict[str, Any]) -> None:
@@ -130,8 +155,7 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
         raise RunError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")
     with readable(path, RunError, "train again"):
         about = json.loads(path.read_text())
-        about["task"], about["digest"]  # noqa: B018
-        return about
+        return {**about, "task": about["task"], "digest": about["digest"]}
 
 
 def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:

@@ -8,8 +8,8 @@ import pytest
 from interactive_nav_common.errors import UserError
 from topological_nav.__main__ import main
 from topological_nav.data import load_plan
-from topological_nav.driving import load_policy
 from topological_nav.drives import _read as read_batch
+from topological_nav.driving import load_policy
 from topological_nav.graph import load_map
 from topological_nav.packaged import Choice, fitting_map
 from topological_nav.runs import claim
