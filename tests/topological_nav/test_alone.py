@@ -12,10 +12,9 @@ from topological_nav.runs import alone_in, claimed
 
 def test_a_folder_in_use_is_refused_and_named(tmp_path):
     out = tmp_path / "run"
-    with claimed(out, {"seed": 1}):
-        with pytest.raises(FileError, match=f"run: process {os.getpid()} on .* works there; wait for it"):
-            with alone_in(out):
-                pass
+    busy = f"run: process {os.getpid()} on .* works there; wait for it"
+    with claimed(out, {"seed": 1}), pytest.raises(FileError, match=busy), alone_in(out):
+        pass
     with claimed(out, {"seed": 1}):  # free again
         pass
 
