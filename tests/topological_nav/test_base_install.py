@@ -19,7 +19,7 @@ for words in (
     ["navigate", cedar],
     ["data", cedar, "-o", "data"],
     ["data", "--drives", cedar, "-o", "drives"],
-    ["evaluate", cedar, "--truth", "--contenders", "expert", "backend=warp", "-o", "rows"],
+    ["evaluate", cedar, "--contenders", "expert", "backend=warp", "-o", "rows"],
 ):
     print("exit", main(words))
 """
