@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -29,11 +30,15 @@ from topological_nav.config import (
     EvaluationConfig,
     ExportConfig,
     MapConfig,
+    NavigatorConfig,
     PolicyConfig,
     passage_config,
     room_config,
 )
-from topological_nav.settings import overridden, settings_help
+from topological_nav.settings import overridden, refuse_unused, settings_help
+
+if TYPE_CHECKING:
+    from topological_nav.contest import Contest
 
 DATASET, DRIVES = RUNS / "data", RUNS / "drives"
 TASKS = {"rooms": room_config, "passages": passage_config}
@@ -79,9 +84,11 @@ def parser() -> argparse.ArgumentParser:
     )
     train.add_argument("task", choices=[*TASKS, "policy"], help="passages differ in: batch=32 epochs=20")
     train.add_argument("--data", type=Path, metavar="DIR", help=f"dataset (default {DATASET}; policy: {DRIVES})")
-    train.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="policy: embeds images")
     train.add_argument(
-        "--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="policy: embeds them too"
+        "--localiser", type=Path, metavar="RUN", help=f"policy: embeds images (default {RUNS / 'rooms'})"
+    )
+    train.add_argument(
+        "--detector", type=Path, metavar="RUN", help=f"policy: embeds them too (default {RUNS / 'passages'})"
     )
     train.add_argument("--grid", action="store_true", help="policy: train with every alpha and lambda of the report")
     train.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"run folder (default {RUNS}/TASK)")
@@ -241,7 +248,12 @@ def _drives(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     if arguments.task == "policy":
         return _policy(arguments)
+    refuse_unused(arguments, "--localiser --detector --grid", f"in 'train {arguments.task}'")
+    if arguments.task == "passages":
+        refuse_unused(arguments, "hidden pitch label_smoothing", "in 'train passages'")
     config = overridden(TASKS[arguments.task](), arguments.settings)
+    if config.init != "selfsup":
+        refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
     from topological_nav.figures import curves_figure, save
     from topological_nav.training import train
@@ -273,6 +285,8 @@ def _train(arguments: argparse.Namespace) -> None:
 
 def _policy(arguments: argparse.Namespace) -> None:
     config = overridden(PolicyConfig(), arguments.settings)
+    if arguments.grid:
+        refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
     from topological_nav.drive_figures import policy_figure
     from topological_nav.figures import save
@@ -284,7 +298,7 @@ def _policy(arguments: argparse.Namespace) -> None:
 
     with _stops() as stops:
         halt = lambda: bool(stops)  # noqa: E731
-        runs = (arguments.localiser, arguments.detector)
+        runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
         frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell, halt)
         learn = train_grid if arguments.grid else train_policy
         results = None if frames is None else learn(frames, out, config, tell, halt)
@@ -370,6 +384,7 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
         ppo=getattr(arguments, "ppo", None),
         domain=arguments.domain,
     )
+    _refuse_unused(arguments, contest)
     if arguments.truth or not {"dense", "sparse"} & set(contenders):
         return contest
     from interactive_nav.scene import load_scene
@@ -398,12 +413,33 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     )
 
 
+def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
+    """Refuses what changes nothing for these contenders."""
+    names, who = (
+        set(contest.contenders),
+        f"without a contender that needs it (contenders: {', '.join(contest.contenders)})",
+    )
+    if not names & {"dense", "sparse"}:
+        navigators = {f.name for f in dataclasses.fields(NavigatorConfig)} - {"limit_s", "run_s"}
+        refuse_unused(arguments, "--truth --maps --localiser --detector --policy supersample", who)
+        if arguments.domain != "clean":
+            refuse_unused(arguments, "--domain", who)
+        refuse_unused(arguments, " ".join(sorted(navigators)), who)
+    if "sparse" not in names:
+        refuse_unused(arguments, "thinned", who)
+    if arguments.truth:
+        refuse_unused(arguments, "--maps --localiser --detector match supersample", "with --truth")
+    if not contest.config.glance:
+        refuse_unused(arguments, "watch_s", "with glance=false")
+
+
 def _navigate(arguments: argparse.Namespace) -> None:
     from topological_nav.figures import save
     from topological_nav.journey import drive_episode, film
 
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
+    refuse_unused(arguments, "batch", "in 'navigate', which drives one episode")
     contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
@@ -432,6 +468,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
+    if "ppo" not in names:
+        refuse_unused(arguments, "--ppo", f"without contender ppo (--contenders {arguments.contenders})")
     contest = _contest(arguments, arguments.scenes, names, arguments.out)
     with _stops() as stops, _bar() as tell:
 

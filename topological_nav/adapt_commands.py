@@ -10,7 +10,8 @@ from pathlib import Path
 from interactive_nav_common.errors import ConfigError
 from topological_nav.adapt_config import AdaptConfig
 from topological_nav.config import PITCHES
-from topological_nav.settings import overridden
+from topological_nav.settings import overridden, refuse_unused
+from train.config_io import field_docs
 
 Asked = Callable[[], bool]
 
@@ -31,12 +32,12 @@ def add_to(command: Callable[[str, str, object], argparse.ArgumentParser], datas
         "collected in the target domain",
     )
     adapt.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
-    adapt.add_argument("--data", type=Path, default=dataset, metavar="DIR", help=f"source (default {dataset})")
+    adapt.add_argument("--data", type=Path, metavar="DIR", help=f"source (default {dataset})")
     adapt.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
     adapt.add_argument("--localiser", type=Path, metavar="RUN", help=f"embeds images (default {runs}, or packaged)")
     adapt.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
     adapt.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {runs}/adapted/WHAT, a map SCENE.npz")
-    adapt.set_defaults(adapted=runs / "adapted")
+    adapt.set_defaults(adapted=runs / "adapted", dataset=dataset)
 
 
 def run(arguments: argparse.Namespace, should_stop: Asked) -> bool:
@@ -48,15 +49,34 @@ def run(arguments: argparse.Namespace, should_stop: Asked) -> bool:
     config = overridden(AdaptConfig(), arguments.settings)
     if (arguments.what == "map") != bool(arguments.scene):
         raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
+    _refuse_unused(arguments)
+    arguments.data = arguments.data or arguments.dataset
     arguments.target = arguments.target or arguments.data
     from topological_nav.packaged import choose
 
-    needs = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}[arguments.what]
+    needs = _NEEDS[arguments.what]
     chosen = choose(arguments.localiser, arguments.detector, needs=needs)
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
     if chosen.said:
         print(chosen.said, file=sys.stderr, flush=True)
     return _RUNS[arguments.what](arguments, config, should_stop)
+
+
+def _refuse_unused(arguments: argparse.Namespace) -> None:
+    """Refuses what other adaptations look at; the settings' docstrings say whose they are."""
+    what = arguments.what
+    why = f"in 'adapt {what}'"
+    docs = field_docs(AdaptConfig)
+    others = [name for name, doc in docs.items() if doc.partition(":")[0] in _NEEDS and not doc.startswith(f"{what}:")]
+    refuse_unused(arguments, " ".join(others), why)
+    if what == "map":
+        refuse_unused(arguments, "seed", why)
+    if "rooms" not in _NEEDS[what]:
+        refuse_unused(arguments, "--localiser", why)
+    if "passages" not in _NEEDS[what]:
+        refuse_unused(arguments, "--detector", why)
+    elif arguments.target:
+        refuse_unused(arguments, "--data", f"{why} with --target")
 
 
 def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
@@ -128,4 +148,5 @@ def _tell(line: str) -> None:
     print(line, flush=True)
 
 
+_NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}
 _RUNS = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}

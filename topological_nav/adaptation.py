@@ -32,7 +32,7 @@ from topological_nav.errors import RunError
 from topological_nav.learning import compiled_epoch, initial
 from topological_nav.localise import localisation_scores
 from topological_nav.networks import Network, joined, normalised
-from topological_nav.runs import METRICS, RESULTS, claim, read_checkpoint, restored
+from topological_nav.runs import METRICS, RESULTS, claimed, read_checkpoint, restored
 from topological_nav.training import Trained, load_trained, save_trained
 from train.config_io import to_dict
 from train.run_folder import read_metrics, versions
@@ -184,36 +184,36 @@ def adapt_features(
     near, far = load_rooms(source), target_rooms(target, config)
     headers = [read_header(folder)[0] for folder in (source, target)]
     data = {name: digest_of(header) for name, header in zip(("source", "target"), headers, strict=True)}
-    claim(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data})
-    write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
-    size = near.images.shape[3:]
-    learned = near.images[~near.test].reshape(-1, *size)
-    unlabelled = far.images[~far.test].reshape(-1, *far.images.shape[3:])
-    embedded = trained.embed(learned)
-    state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
-    epoch = adversarial_epoch(trained.network, critic, config)
-    on_device = jnp.asarray(unlabelled), jnp.asarray(embedded)
-    state, done = resumable_epochs(
-        out, "features", state, lambda learner, key: epoch(learner, *on_device, key), config.epochs, config.seed, tell,
-        should_stop,
-    )  # fmt: skip
-    if not done:
-        return None
-    variables = {"params": state.params, "batch_stats": state.batch_stats}
-    about = {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
-    adapted = save_trained(out, Trained(trained.network, variables, about))
-    fitted = target_statistics(trained, unlabelled, config.batch)
-    same = headers[0]["scenes"] == headers[1]["scenes"]
-    results = {
-        "target_images": len(unlabelled),
-        "nodes": "of the source" if same else "of the target",
-        "source": localisation_between(trained, near, trained, near),
-    }
-    for name, network in (("before", trained), ("statistics", fitted), ("after", adapted)):
-        nodes = (trained, near) if same else (network, far)
-        results[name] = localisation_between(*nodes, network, far)
-    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-    return results
+    with claimed(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        size = near.images.shape[3:]
+        learned = near.images[~near.test].reshape(-1, *size)
+        unlabelled = far.images[~far.test].reshape(-1, *far.images.shape[3:])
+        embedded = trained.embed(learned)
+        state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
+        epoch = adversarial_epoch(trained.network, critic, config)
+        on_device = jnp.asarray(unlabelled), jnp.asarray(embedded)
+        state, done = resumable_epochs(
+            out, "features", state, lambda learner, key: epoch(learner, *on_device, key), config.epochs,
+            config.seed, tell, should_stop,
+        )  # fmt: skip
+        if not done:
+            return None
+        variables = {"params": state.params, "batch_stats": state.batch_stats}
+        about = {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
+        adapted = save_trained(out, Trained(trained.network, variables, about))
+        fitted = target_statistics(trained, unlabelled, config.batch)
+        same = headers[0]["scenes"] == headers[1]["scenes"]
+        results = {
+            "target_images": len(unlabelled),
+            "nodes": "of the source" if same else "of the target",
+            "source": localisation_between(trained, near, trained, near),
+        }
+        for name, network in (("before", trained), ("statistics", fitted), ("after", adapted)):
+            nodes = (trained, near) if same else (network, far)
+            results[name] = localisation_between(*nodes, network, far)
+        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+        return results
 
 
 def digest_of(header: dict[str, Any]) -> str:

@@ -21,7 +21,7 @@ from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data import headings, lens_of
 from topological_nav.errors import MapError, SpaceError
 from topological_nav.graph import TopologicalMap, assemble, lengths, place_nodes
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.settings import overlaid
 from topological_nav.sight import NetworkSight, Sight
@@ -173,7 +173,11 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
     Args:
         data: what the networks learned from.
         supersample: as asked for; None: as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
+
+    Raises:
+        UserError: the engine that they learned from is not installed.
     """
+    need_engine(data.engine)
     if supersample is None:
         most = CPU_SUPERSAMPLE if jax.default_backend() == "cpu" else data.supersample
         supersample = min(data.supersample, most)
@@ -231,7 +235,7 @@ class _Pictures:
             poses = np.concatenate([xy, heading[:, None]], 1).astype(float)
             kept = self._parts / f"{hashlib.sha256(self._of + poses.tobytes()).hexdigest()[:16]}.npy"
             if kept.is_file():
-                with contextlib.suppress(ValueError, EOFError):  # a damaged one is drawn again
+                with contextlib.suppress(ValueError, EOFError, OSError):  # a damaged or vanished one is drawn again
                     return np.load(kept)
         images = self._renderer.draw(camera_pose(self._robot, xy, heading, np.zeros(len(xy))))
         if kept is not None:
@@ -243,7 +247,7 @@ class _Pictures:
 def forget(parts: Path) -> None:
     """Removes the images that `build_map` kept, once the map is written."""
     for path in parts.glob("*.npy"):
-        path.unlink()
+        path.unlink(missing_ok=True)  # by another process that made the same map
     with contextlib.suppress(OSError):
         parts.rmdir()
 

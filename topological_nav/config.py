@@ -357,8 +357,8 @@ class ExpertConfig:
 class DriveConfig(ExpertConfig, CameraConfig):
     """Drives of the expert along edges of each scene's graph, seen from the robot."""
 
-    backend: str = "auto"
-    """Physics: native (CPU), warp (NVIDIA), jax, or auto."""
+    backend: Literal["auto", "warp", "jax", "native"] = "auto"
+    """Physics: as in `interactive_nav`."""
     batch: int = 256
     """Drives at once: what an interrupted simulation loses at most."""
     drives: int = 400

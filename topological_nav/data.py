@@ -11,11 +11,12 @@ What is decided depends on scene and settings only. Drawing goes file by file an
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,11 @@ from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene, load_scene
 from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import CameraConfig, DataConfig
-from topological_nav.errors import DatasetError, SpaceError
+from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.passages import Passages, draw_passages, held_out
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.rooms import Rooms, agreement, find_rooms, recorded_rooms
+from topological_nav.runs import alone_in
 from topological_nav.settings import overlaid
 from topological_nav.shards import ShardWriter, read_shards
 from topological_nav.space import FreeSpace, free_space, spread
@@ -145,8 +147,10 @@ def make_dataset(
     Raises:
         DatasetError: `out` holds a dataset of other scenes or settings.
         SceneError, SpaceError: a scene cannot be used.
+        UserError: the engine is not installed.
     """
     scenes = [load_scene(folder) for folder in scene_folders]
+    need_engine(config.engine)
     names = [scene.name for scene in scenes]
     if len(set(names)) != len(names) or not names:
         raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
@@ -160,25 +164,27 @@ def make_dataset(
         "camera_m": list(robot.camera.pos_m),
         "scenes": [_about(scene, plan) for scene, plan in zip(scenes, plans, strict=True)],
     }
-    _claim(out, header)
-    for scene, plan in zip(scenes, plans, strict=True):
-        (out / scene.name).mkdir(exist_ok=True)
-        with whole_file(out / scene.name / "plan.npz") as partial, open(partial, "wb") as file:
-            np.savez_compressed(file, **_plan_arrays(plan))  # type: ignore[arg-type]
-    total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
-    done = 0
-    with ShardWriter(config.quality) as writer:
+    with _claimed(out, header):
         for scene, plan in zip(scenes, plans, strict=True):
-            renderer: SceneRenderer | None = None
-            for path, poses in _shards(out / scene.name, plan, robot, config):
-                done += sum(len(pose.pos_w) for pose in poses)
-                told = functools.partial(progress, scene.name, done, total)
-                if path.is_file():
-                    writer.skip(told)
-                    continue
-                renderer = renderer or SceneRenderer(scene, lens_of(config, robot), config.supersample, config.engine)
-                writer.put(path, draw_sheets(renderer, poses), told)
-    return header
+            (out / scene.name).mkdir(exist_ok=True)
+            with whole_file(out / scene.name / "plan.npz") as partial, open(partial, "wb") as file:
+                np.savez_compressed(file, **_plan_arrays(plan))  # type: ignore[arg-type]
+        total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
+        done = 0
+        with ShardWriter(config.quality) as writer:
+            for scene, plan in zip(scenes, plans, strict=True):
+                renderer: SceneRenderer | None = None
+                for path, poses in _shards(out / scene.name, plan, robot, config):
+                    done += sum(len(pose.pos_w) for pose in poses)
+                    told = functools.partial(progress, scene.name, done, total)
+                    if path.is_file():
+                        writer.skip(told)
+                        continue
+                    renderer = renderer or SceneRenderer(
+                        scene, lens_of(config, robot), config.supersample, config.engine
+                    )
+                    writer.put(path, draw_sheets(renderer, poses), told)
+        return header
 
 
 def draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
@@ -230,11 +236,9 @@ def read_versioned(path: Path, version: int, none: str, again: str) -> dict[str,
     """
     if not path.is_file():
         raise DatasetError(none)
-    try:
+    with readable(path, DatasetError, f"delete the folder and {again}"):
         header = json.loads(path.read_text(encoding="utf-8"))
         found = header["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); delete the folder and {again}") from None
     if found != version:
         raise DatasetError(f"{path}: format {found}, expected {version}; {again}")
     return header
@@ -294,13 +298,10 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
         DatasetError: missing or damaged.
     """
     path = Path(folder) / scene / "plan.npz"
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
-            passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
-            return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); run 'data' again") from None
+    with readable(path, DatasetError, "run 'data' again"), np.load(path, allow_pickle=False) as arrays:
+        rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
+        passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
+        return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
 
 
 def _plan_arrays(plan: ScenePlan) -> dict[str, np.ndarray]:
@@ -332,25 +333,27 @@ def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
     }
 
 
-def _claim(out: Path, header: dict[str, Any]) -> None:
-    """Writes dataset.json of a new dataset, or checks that the one there is the same."""
-    path = out / "dataset.json"
-    if path.is_file():
-        there, _ = read_header(out)
-        for name, value in header["settings"].items():
-            if name in there["settings"] and there["settings"][name] != value:
+@contextlib.contextmanager
+def _claimed(out: Path, header: dict[str, Any]) -> Iterator[None]:
+    """Writes dataset.json of a new dataset, or checks that the one there is the same; nobody else works there."""
+    with alone_in(out):
+        path = out / "dataset.json"
+        if path.is_file():
+            there, _ = read_header(out)
+            for name, value in header["settings"].items():
+                if name in there["settings"] and there["settings"][name] != value:
+                    raise DatasetError(
+                        f"{out}: the dataset there has {name} = {there['settings'][name]!r}, this one {value!r}; "
+                        "choose another folder or delete it"
+                    )
+            if there["scenes"] != header["scenes"]:
                 raise DatasetError(
-                    f"{out}: the dataset there has {name} = {there['settings'][name]!r}, this one {value!r}; "
-                    "choose another folder or delete it"
+                    f"{out}: the dataset there is of {', '.join(s['name'] for s in there['scenes'])} as they were; "
+                    "the scenes differ: choose another folder or delete it"
                 )
-        if there["scenes"] != header["scenes"]:
-            raise DatasetError(
-                f"{out}: the dataset there is of {', '.join(s['name'] for s in there['scenes'])} as they were; "
-                "the scenes differ: choose another folder or delete it"
-            )
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(header, indent=1) + "\n")
+        else:
+            write_text(path, json.dumps(header, indent=1) + "\n")
+        yield
 
 
 def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.ndarray:

@@ -12,6 +12,7 @@ drawn. What is decided depends on scenes and settings only. Simulating and drawi
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -27,13 +28,14 @@ from interactive_nav.scene import Scene, load_scene
 from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data import draw_sheets, lens_of, read_versioned
-from topological_nav.errors import DatasetError, SpaceError
+from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.expert import CONTROL_S, Terrain, way_field
 from topological_nav.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.graph import place_nodes
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.rooms import find_rooms, recorded_rooms
 from topological_nav.routes import draw_routes, drivable
+from topological_nav.runs import alone_in
 from topological_nav.settings import overlaid
 from topological_nav.shards import ShardWriter, read_shards
 from topological_nav.space import FreeSpace, free_space
@@ -186,8 +188,10 @@ def simulate_drives(
     Raises:
         DatasetError: `out` holds drives of other scenes or settings.
         SceneError, SpaceError: a scene cannot be used.
+        UserError: the engine that will draw them is not installed.
     """
     scenes = [load_scene(folder) for folder in scene_folders]
+    need_engine(config.engine)
     names = [scene.name for scene in scenes]
     if len(set(names)) != len(names) or not names:
         raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
@@ -199,32 +203,32 @@ def simulate_drives(
         "camera_m": list(robot.camera.pos_m),
         "scenes": [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes],
     }
-    _claim(out, header)
-    total = len(scenes) * config.drives
-    files = [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
-    if all(path.is_file() for path in (*files, out / "plan.npz")):
-        progress("drives", total, total)
+    with _claimed(out, header):
+        total = len(scenes) * config.drives
+        files = [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
+        if all(path.is_file() for path in (*files, out / "plan.npz")):
+            progress("drives", total, total)
+            return load_drives(out)
+        plan = plan_drives(scenes, config)
+        with whole_file(out / "plan.npz") as partial, open(partial, "wb") as file:
+            last = plan.tasks.goals_w[:, -1]
+            np.savez_compressed(file, scene=plan.tasks.scene, test=plan.test, goal_w=last)
+        fleet: Fleet | None = None
+        for i, path in enumerate(files):
+            mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
+            if not path.is_file():
+                fleet = fleet or Fleet(make_env(scene_folders, config), plan.terrain, config)
+                # Padded by its last drive: one size, one program.
+                rows = np.minimum(np.arange(i * config.batch, (i + 1) * config.batch), total - 1)
+                before, most = int(mine[0]), len(mine) - 1  # the padding's ends are no news
+
+                def told(ended: int, before: int = before, most: int = most) -> None:
+                    progress("drives", before + min(ended, most), total)
+
+                driven = fleet.drive(plan.tasks.take(rows), told)
+                _write_batch(path, driven, len(mine))
+            progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
-    plan = plan_drives(scenes, config)
-    with whole_file(out / "plan.npz") as partial, open(partial, "wb") as file:
-        last = plan.tasks.goals_w[:, -1]
-        np.savez_compressed(file, scene=plan.tasks.scene, test=plan.test, goal_w=last)
-    fleet: Fleet | None = None
-    for i, path in enumerate(files):
-        mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
-        if not path.is_file():
-            fleet = fleet or Fleet(make_env(scene_folders, config), plan.terrain, config)
-            # Padded by its last drive: one size, one program.
-            rows = np.minimum(np.arange(i * config.batch, (i + 1) * config.batch), total - 1)
-            before, most = int(mine[0]), len(mine) - 1  # the padding's ends are no news
-
-            def told(ended: int, before: int = before, most: int = most) -> None:
-                progress("drives", before + min(ended, most), total)
-
-            driven = fleet.drive(plan.tasks.take(rows), told)
-            _write_batch(path, driven, len(mine))
-        progress("drives", int(mine[-1]) + 1, total)
-    return load_drives(out)
 
 
 def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = lambda *_: None) -> None:
@@ -325,11 +329,9 @@ def load_drives(folder: Path) -> Drives:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path}: not readable ({error}); delete it and run 'data --drives' again") from None
+    remedy = "delete it and run 'data --drives' again"
+    with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
 
 
 def _write_batch(path: Path, driven: Driven, count: int) -> None:
@@ -367,22 +369,26 @@ def drives_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in Path(folder).rglob("*.npz"))
 
 
-def _claim(out: Path, header: dict[str, Any]) -> None:
-    """Writes drives.json of a new folder, or checks that the one there is the same."""
-    path = out / "drives.json"
-    if path.is_file():
-        there, _ = read_drives_header(out)
-        for name, value in header["settings"].items():
-            if there["settings"].get(name) != value:
+@contextlib.contextmanager
+def _claimed(out: Path, header: dict[str, Any]) -> Iterator[None]:
+    """Writes drives.json of a new folder, or checks that the one there is the same; nobody else works there."""
+    with alone_in(out):
+        path = out / "drives.json"
+        if path.is_file():
+            there, _ = read_drives_header(out)
+            for name, value in header["settings"].items():
+                if there["settings"].get(name) != value:
+                    raise DatasetError(
+                        f"{out}: the drives there have {name} = {there['settings'].get(name)!r}, these {value!r}; "
+                        "choose another folder or delete it"
+                    )
+            if [(s["name"], s["digest"]) for s in there["scenes"]] != [
+                (s["name"], s["digest"]) for s in header["scenes"]
+            ]:
                 raise DatasetError(
-                    f"{out}: the drives there have {name} = {there['settings'].get(name)!r}, these {value!r}; "
-                    "choose another folder or delete it"
+                    f"{out}: the drives there are in {', '.join(s['name'] for s in there['scenes'])} as they were; "
+                    "the scenes differ: choose another folder or delete it"
                 )
-        if [(s["name"], s["digest"]) for s in there["scenes"]] != [(s["name"], s["digest"]) for s in header["scenes"]]:
-            raise DatasetError(
-                f"{out}: the drives there are in {', '.join(s['name'] for s in there['scenes'])} as they were; "
-                "the scenes differ: choose another folder or delete it"
-            )
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(header, indent=1) + "\n")
+        else:
+            write_text(path, json.dumps(header, indent=1) + "\n")
+        yield

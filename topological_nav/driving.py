@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +12,7 @@ import numpy as np
 from topological_nav.errors import RunError
 from topological_nav.imitation import fresh_params, load_networks
 from topological_nav.policy import Forward, Policy
-from topological_nav.runs import DESCRIPTION, read_weights
+from topological_nav.runs import read_description, read_weights
 from topological_nav.training import Trained
 
 
@@ -87,9 +86,7 @@ def load_policy(
             adapted from them.
     """
     run = Path(run_folder)
-    if not (run / DESCRIPTION).is_file():
-        raise RunError(f"{run}: holds no trained policy; finish it: python -m topological_nav train policy -o {run}")
-    about = json.loads((run / DESCRIPTION).read_text())
+    about = read_description(run, "policy", "policy")
     if about["task"] != "policy":
         raise RunError(f"{run}: was trained for '{about['task']}', expected a run of 'train policy'")
     recorded = [run / network["run"] for network in about["networks"]]

@@ -1,5 +1,9 @@
 """What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
 from interactive_nav_common.errors import UserError
 
 
@@ -17,3 +21,23 @@ class RunError(UserError):
 
 class MapError(UserError):
     """A topological map that is damaged, of another version, or of another scene."""
+
+
+@contextlib.contextmanager
+def readable(path: Path, kind: type[UserError], remedy: str) -> Iterator[None]:
+    """Whatever goes wrong in the block that reads a file is told as one line.
+
+    Zip, npy, msgpack, WebP and JSON readers raise many kinds for a damaged file.
+
+    Args:
+        path: of the file.
+        kind: of the error.
+        remedy: what to do about it.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        told = " ".join(repr(error).split())[:200]
+        raise kind(f"{path}: not readable ({told}); {remedy}") from None

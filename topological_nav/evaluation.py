@@ -116,12 +116,14 @@ def draw_journeys(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
     """
     parts, _ = components(space.clearance_m >= CONNECTED_M)  # type: ignore[misc]
     places = space.centres(config.clearance_m)
+    if len(places) < 2:
+        raise SpaceError(f"{len(places)} places are {config.clearance_m} m from obstacles; ask for less clearance_m")
     cell = _cells(space, places)
     part, room = parts[cell[:, 0], cell[:, 1]], rooms.of(places)
     rng = np.random.default_rng([config.seed, 17, int(digest[:8], 16)])
     pairs, yaws, tries = [], [], 0
     while len(pairs) < count:
-        a, b = rng.integers(len(places), size=2) if len(places) else (0, 0)
+        a, b = rng.integers(len(places), size=2)
         yaw = rng.uniform(-np.pi, np.pi)
         tries += 1
         if tries > 2000 * (len(pairs) + 1):

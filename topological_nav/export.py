@@ -17,7 +17,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 from typing import Any
@@ -29,7 +28,7 @@ import numpy as np
 from interactive_nav.robots import get_robot
 from interactive_nav.scene import load_scene
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import whole_folder, write_text
 from topological_nav.build import CHUNK, camera_of, renderer_of
 from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data import headings, load_rooms
@@ -111,10 +110,7 @@ def export(
     networks = _networks(runs["rooms"], runs["passages"])
     driver = load_policy(policy, localiser, detector) if policy else None
     total = len(runs) + len(files) + 1
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as holder:
-        made = Path(holder) / out.name
-        made.mkdir()
+    with whole_folder(out, overwrite=True) as made:
         about: dict[str, Any] = {"format": FORMAT, "precision": PRECISION, "networks": {}, "maps": {}}
         for done, (task, run) in enumerate(runs.items()):
             progress(task, done, total)
@@ -136,9 +132,6 @@ def export(
         sizes = sizes_of(made)
         if sum(sizes.values()) > config.limit_mib * 2**20:
             raise RunError(f"{out}: {size_lines(sizes, config.limit_mib)}")
-        if out.exists():
-            shutil.rmtree(out)
-        os.replace(made, out)
     progress("comparing", total, total)
     return Exported(about, sizes, compared)
 

@@ -17,6 +17,7 @@ from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from topological_nav.config import DriveConfig
 from topological_nav.expert import CONTROL_S, Terrain, command, scan_points
+from topological_nav.rendering import need_engine
 
 SEGMENT = 25
 """Control steps a program; between two of them the host looks whether any drive still goes on."""
@@ -73,8 +74,9 @@ def make_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
     """The environment of the drives: furniture at rest, no small objects, the robot commanded by velocities.
 
     Raises:
-        UserError: the robot takes no velocities.
+        UserError: the robot takes no velocities, or the backend is not installed.
     """
+    need_engine(config.backend)
     if config.robot not in LIDAR_B:
         raise UserError(f"robot is '{config.robot}', expected one with a scanner: {', '.join(LIDAR_B)}")
     return interactive_nav.make(

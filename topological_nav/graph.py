@@ -24,7 +24,7 @@ from scipy.spatial.distance import cdist
 
 from interactive_nav_common.files import whole_file
 from topological_nav.config import MapConfig
-from topological_nav.errors import MapError
+from topological_nav.errors import MapError, readable
 from topological_nav.localise import nearest_node
 from topological_nav.rooms import Rooms
 from topological_nav.space import FreeSpace
@@ -400,13 +400,11 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
     Raises:
         MapError: missing, damaged, of another format, or of another scene.
     """
-    try:
+    with readable(path, MapError, "build the map: python -m topological_nav map SCENE"):
         with np.load(path, allow_pickle=False) as stored:
             header = json.loads(stored["header"].tobytes())
             arrays = {name: stored[name] for name in _ARRAYS}
         version, scene, own, about = (header[k] for k in ("format", "scene", "digest", "about"))
-    except Exception as error:  # noqa: BLE001  (zip, npy and json readers raise many kinds for a damaged file)
-        raise MapError(f"{path}: is no readable map ({error}); build it: python -m topological_nav map SCENE") from None
     if version != FORMAT:
         raise MapError(f"{path}: format {version}, expected {FORMAT}; build the map again")
     if digest is not None and own != digest:

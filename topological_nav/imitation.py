@@ -37,7 +37,7 @@ from topological_nav.runs import (
     DESCRIPTION,
     RESULTS,
     WEIGHTS,
-    claim,
+    claimed,
     cut_metrics,
     read_checkpoint,
     restored,
@@ -206,42 +206,42 @@ def train_policy(
     if config.mirror:
         learned = joined([learned, mirrored(learned, len(drives.command), config)])
     digests = [network.about["digest"] for network in frames.networks]
-    claim(out, {"task": "policy", "dataset": frames.header, "networks": digests, **to_dict(config)})
-    write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+    with claimed(out, {"task": "policy", "dataset": frames.header, "networks": digests, **to_dict(config)}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
 
-    policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
-    forward = Forward(config.forward_hidden)
-    tx, width = optax.adam(config.learning_rate), frames.features.shape[1]
-    params = fresh_params(policy, forward, width, config.seed)
-    used = frames.features[np.unique(learned.rows)].astype(np.float32)
-    spread = used.std(0)
-    # Features that hardly vary here must not become large where they do.
-    scale = {
-        "mean": jnp.asarray(used.mean(0)),
-        "deviation": jnp.asarray(np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)),
-    }
-    learner = Learner(params, scale, tx.init(params))
-    saved = read_checkpoint(out / CHECKPOINT)
-    cut_metrics(out, ("policy",), saved)
-    first = 0
-    if saved:
-        first, learner = saved["epoch"], restored(learner, saved["learner"], out / CHECKPOINT)
-    alone = math.ceil(config.alone * config.epochs - 1e-9)
-    shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(learned))
-    epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]
-    keys, weights = (
-        jax.random.PRNGKey(config.seed),
-        {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)},
-    )
+        policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
+        forward = Forward(config.forward_hidden)
+        tx, width = optax.adam(config.learning_rate), frames.features.shape[1]
+        params = fresh_params(policy, forward, width, config.seed)
+        used = frames.features[np.unique(learned.rows)].astype(np.float32)
+        spread = used.std(0)
+        # Features that hardly vary here must not become large where they do.
+        scale = {
+            "mean": jnp.asarray(used.mean(0)),
+            "deviation": jnp.asarray(np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)),
+        }
+        learner = Learner(params, scale, tx.init(params))
+        saved = read_checkpoint(out / CHECKPOINT)
+        cut_metrics(out, ("policy",), saved)
+        first = 0
+        if saved:
+            first, learner = saved["epoch"], restored(learner, saved["learner"], out / CHECKPOINT)
+        alone = math.ceil(config.alone * config.epochs - 1e-9)
+        shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(learned))
+        epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]
+        keys, weights = (
+            jax.random.PRNGKey(config.seed),
+            {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)},
+        )
 
-    def one(learner, number):
-        labels = {**truth, **weights, "jointly": jnp.float32(number >= alone)}
-        return epoch(learner, shown, labels, jax.random.fold_in(keys, number))
+        def one(learner, number):
+            labels = {**truth, **weights, "jointly": jnp.float32(number >= alone)}
+            return epoch(learner, shown, labels, jax.random.fold_in(keys, number))
 
-    learner, done = run_epochs("policy", learner, one, range(first, config.epochs), out, tell, should_stop)
-    if not done:
-        return None
-    return _finish(frames, out, config, values, learner, policy, forward, every, learned, held_out)
+        learner, done = run_epochs("policy", learner, one, range(first, config.epochs), out, tell, should_stop)
+        if not done:
+            return None
+        return _finish(frames, out, config, values, learner, policy, forward, every, learned, held_out)
 
 
 def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dict[str, Any]:

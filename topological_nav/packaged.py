@@ -18,7 +18,7 @@ from pathlib import Path
 from topological_nav.config import PASSAGE_POLICY, RUNS
 from topological_nav.errors import MapError, RunError
 from topological_nav.graph import load_map
-from topological_nav.runs import DESCRIPTION
+from topological_nav.runs import DESCRIPTION, read_description
 
 ABOUT = "export.json"
 
@@ -106,12 +106,9 @@ def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
         digest: of its files.
 
     Raises:
-        RunError: a run is not finished.
+        RunError: a run is not finished, or damaged.
     """
-    for run in (choice.localiser, choice.detector):
-        if not _finished(run):
-            raise RunError(f"{run}: holds no trained network; finish it: python -m topological_nav train TASK -o {run}")
-    networks = [json.loads((run / DESCRIPTION).read_text())["digest"] for run in (choice.localiser, choice.detector)]
+    networks = [read_description(run, "network", "TASK")["digest"] for run in (choice.localiser, choice.detector)]
     for folder in choice.maps:
         path = folder / f"{scene}.npz"
         if path.is_file():

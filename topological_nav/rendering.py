@@ -7,6 +7,7 @@ learned from the other.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -58,6 +59,22 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
     return look_along(np.asarray(pos, np.float32), np.asarray(forward, np.float32))
 
 
+def need_engine(engine: str) -> None:
+    """Refuses an engine of pictures or physics that is not installed, before any work is done for it.
+
+    Raises:
+        UserError: it is `warp`, and the package warp-lang is not there.
+    """
+    if engine == "warp":
+        try:
+            importlib.import_module("warp")
+        except ImportError as error:
+            raise UserError(
+                f"engine 'warp' does not start here ({error}); install its extra: pip install -e '.[warp]' "
+                "(networks see by the engine that they learned from; what is drawn anew can have engine=gl)"
+            ) from error
+
+
 class SceneRenderer:
     """Draws one scene, its furniture at rest and no robot in it."""
 
@@ -69,7 +86,11 @@ class SceneRenderer:
             lens: of the images returned.
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
+
+        Raises:
+            UserError: the engine does not start here.
         """
+        need_engine(engine)
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
         self._model = _visual_model(scene, self._large)
@@ -111,12 +132,8 @@ class SceneRenderer:
         return self._painters[size]
 
     def _warp_painter(self, size: int) -> Painter:
-        try:
-            from interactive_nav.rendering.warp import WarpColour
-        except ImportError as error:
-            raise UserError(
-                f"engine 'warp' does not start here ({error}); pip install 'interactive-nav[warp]', or engine=gl"
-            ) from error
+        from interactive_nav.rendering.warp import WarpColour
+
         painter = WarpColour(self._model, self._large, size, [_SHOWN])
         xpos = jnp.asarray(np.tile(self._data.geom_xpos, (size, 1, 1)), jnp.float32)
         xmat = jnp.asarray(np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (size, 1, 1, 1)), jnp.float32)

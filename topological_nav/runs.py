@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import lzma
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import numpy as np
 import yaml
 
 from interactive_nav_common.files import whole_file, write_text
-from topological_nav.errors import RunError
+from interactive_nav_common.locks import locked
+from topological_nav.errors import RunError, readable
 from topological_nav.learning import Learner
 from train.run_folder import read_metrics
 
@@ -29,6 +31,29 @@ SAVE_EVERY_S = 60.0
 """Between two checkpoints; one is written at the end of a phase and on a stop as well."""
 
 
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Makes a folder and keeps other processes out of it for the block.
+
+    Raises:
+        FileError: another one works there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out / LOCK, f"{out}: {{holder}} works there; wait for it or choose another folder (-o)"):
+        yield
+
+
+@contextlib.contextmanager
+def claimed(out: Path, settings: dict[str, Any]) -> Iterator[None]:
+    """A run folder for the block: of these settings (see `claim`), and of this process alone."""
+    with alone_in(out):
+        claim(out, settings)
+        yield
+
+
 def claim(out: Path, settings: dict[str, Any]) -> None:
     """Writes config.yaml of a new run, or checks that the run there has the same settings.
 
@@ -37,7 +62,8 @@ def claim(out: Path, settings: dict[str, Any]) -> None:
     """
     path = out / CONFIG
     if path.is_file():
-        there = yaml.safe_load(path.read_text())
+        with readable(path, RunError, "choose another folder (-o) or delete it"):
+            there = dict(yaml.safe_load(path.read_text()))
         for name, value in settings.items():
             if there.get(name) != value:
                 shown = (there.get(name), value) if not isinstance(value, dict) else ("another", "this one")
@@ -113,6 +139,25 @@ def weights_content(run: Path) -> bytes:
     return lzma.decompress(path.read_bytes()) if path.is_file() else (run / WEIGHTS).read_bytes()
 
 
+def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
+    """The network.json of a finished run.
+
+    Args:
+        run: its folder.
+        kind: what it should hold, network or policy, for messages.
+        task: of the command that trains one.
+
+    Raises:
+        RunError: the run is not finished, or the file is damaged.
+    """
+    path = run / DESCRIPTION
+    if not path.is_file():
+        raise RunError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")
+    with readable(path, RunError, "train again"):
+        about = json.loads(path.read_text())
+        return {**about, "task": about["task"], "digest": about["digest"]}
+
+
 def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
     """Variables of a finished run, in the template's precision.
 
@@ -125,12 +170,10 @@ def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
         RunError: weights.msgpack is damaged, another network's, or not what an export wrote.
     """
     path = run / (PACKED_WEIGHTS if (run / PACKED_WEIGHTS).is_file() else WEIGHTS)
-    try:
+    with readable(path, RunError, "train again"):
         content = weights_content(run)
         zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
         found = flax.serialization.from_bytes(zeros, content)
-    except Exception as error:  # noqa: BLE001  (msgpack and flax raise many kinds for a damaged file)
-        raise RunError(f"{path}: not readable ({' '.join(str(error).split())[:200]}); train again") from None
     own = about.get("export", {}).get("weights_digest")
     if own and hashlib.sha256(content).hexdigest() != own:
         raise RunError(f"{path}: is not the file that was exported with its {DESCRIPTION}; export the run again")
@@ -145,10 +188,8 @@ def read_checkpoint(path: Path) -> dict[str, Any] | None:
     """
     if not path.is_file():
         return None
-    try:
+    with readable(path, RunError, "delete it to begin again"):
         return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
-    except Exception as error:  # noqa: BLE001  (msgpack raises many kinds for a damaged file)
-        raise RunError(f"{path}: not readable ({error}); delete it to begin again") from None
 
 
 def restored(template: Learner, state: Any, path: Path) -> Learner:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
@@ -40,6 +41,24 @@ def _told(make: Callable[[], Config]) -> Config:
         return make()
     except ConfigError as error:
         raise ConfigError(str(error)) from None
+
+
+def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
+    """Refuses options and settings that were given but would change nothing.
+
+    Args:
+        arguments: of a command line, its `key=value` words in `settings`; what is None, False or empty was not given.
+        names: `--options` and settings.
+        why: with what they change nothing.
+
+    Raises:
+        ConfigError: one of them was given.
+    """
+    words = {word.partition("=")[0] for word in arguments.settings}
+    for name in names.split():
+        option = name.startswith("--")
+        if getattr(arguments, name[2:].replace("-", "_")) if option else name in words:
+            raise ConfigError(f"{name} has no effect {why}; leave it out")
 
 
 def settings_help(config: Any) -> str:

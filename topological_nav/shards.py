@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from interactive_nav_common.files import whole_file
-from topological_nav.errors import DatasetError
+from topological_nav.errors import DatasetError, readable
 
 COLUMNS = 18
 """Images a row of a sheet."""
@@ -70,7 +70,7 @@ def read_shard(path: Path) -> np.ndarray:
     Raises:
         DatasetError: it is missing or damaged.
     """
-    try:
+    with readable(path, DatasetError, "delete it and run 'data' again"):
         with np.load(path, allow_pickle=False) as arrays:
             data, ends, counts = arrays["data"], arrays["ends"], arrays["counts"]
             height, width = (int(v) for v in arrays["size"])
@@ -78,8 +78,6 @@ def read_shard(path: Path) -> np.ndarray:
         return np.concatenate(
             [decode(data[a:b].tobytes(), int(n), height, width) for a, b, n in zip(starts, ends, counts, strict=True)]
         )
-    except Exception as error:  # noqa: BLE001  (zip, npy and WebP readers raise many kinds for a damaged file)
-        raise DatasetError(f"{path}: not readable ({error}); delete it and run 'data' again") from None
 
 
 class ShardWriter:

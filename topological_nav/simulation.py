@@ -20,7 +20,7 @@ from interactive_nav.env import InteractiveNav
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scene import Scene
 from interactive_nav.types import EpisodeStart
-from topological_nav.rendering import SceneRenderer, camera_pose
+from topological_nav.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.shards import usable_cores
 
 Camera = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -55,7 +55,11 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
         robot: its name; it must know control mode `twist`.
         backend: of physics.
         radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
+
+    Raises:
+        UserError: the backend is not installed.
     """
+    need_engine(backend)
     config = NavConfig(
         backend=backend,
         control_mode=CONTROL,

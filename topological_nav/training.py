@@ -29,7 +29,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav_common.files import whole_file, write_text
 from topological_nav.config import PITCHES, TrainConfig
 from topological_nav.data import PassageImages, RoomImages, load_passages, load_rooms, read_header
-from topological_nav.errors import RunError
+from topological_nav.errors import RunError, readable
 from topological_nav.learning import (
     Learner,
     in_batches,
@@ -47,9 +47,10 @@ from topological_nav.runs import (
     DESCRIPTION,
     RESULTS,
     WEIGHTS,
-    claim,
+    claimed,
     cut_metrics,
     read_checkpoint,
+    read_description,
     read_weights,
     restored,
     run_epochs,
@@ -162,62 +163,62 @@ def train(
     """
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
-    claim(out, {"task": task, "dataset": header, **to_dict(config)})
-    write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
-    shape = (data.height, data.width)
-    network = Network(task, config.network, config.width, config.hidden, work.outputs)
-    tx = optax.adam(config.learning_rate)
-    learner = make_learner(network, shape, tx, config.seed)
-    phases: list[tuple[str, int]] = [("labels", config.epochs)]
-    if config.init == "selfsup":
-        phases.insert(0, ("pairs", config.selfsup_epochs))
-    elif config.init != "scratch":
-        learner = _started_from(learner, Path(config.init))
-    saved = read_checkpoint(out / CHECKPOINT)
-    cut_metrics(out, ("pairs", "labels"), saved)
-    for phase, epochs in phases:
-        if phase == "pairs":
-            contrast, contrast_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
-            current = make_learner(contrast, shape, contrast_tx, config.seed)
-            epoch = paired_epoch(contrast, contrast_tx, config.selfsup_batch)
-            images, labels = work.places, np.zeros(0, np.int32)
-        else:
-            current, images, labels = learner, work.images, work.labels
-            epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
-        first = 0
-        if saved and saved["phase"] == phase:
-            first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
-        elif saved and phase == "pairs":
-            continue  # a checkpoint of the later phase holds this one's outcome
-        shown, truth = jnp.asarray(images), jnp.asarray(labels)
-        keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
+    with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        shape = (data.height, data.width)
+        network = Network(task, config.network, config.width, config.hidden, work.outputs)
+        tx = optax.adam(config.learning_rate)
+        learner = make_learner(network, shape, tx, config.seed)
+        phases: list[tuple[str, int]] = [("labels", config.epochs)]
+        if config.init == "selfsup":
+            phases.insert(0, ("pairs", config.selfsup_epochs))
+        elif config.init != "scratch":
+            learner = _started_from(learner, Path(config.init))
+        saved = read_checkpoint(out / CHECKPOINT)
+        cut_metrics(out, ("pairs", "labels"), saved)
+        for phase, epochs in phases:
+            if phase == "pairs":
+                contrast, contrast_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
+                current = make_learner(contrast, shape, contrast_tx, config.seed)
+                epoch = paired_epoch(contrast, contrast_tx, config.selfsup_batch)
+                images, labels = work.places, np.zeros(0, np.int32)
+            else:
+                current, images, labels = learner, work.images, work.labels
+                epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
+            first = 0
+            if saved and saved["phase"] == phase:
+                first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
+            elif saved and phase == "pairs":
+                continue  # a checkpoint of the later phase holds this one's outcome
+            shown, truth = jnp.asarray(images), jnp.asarray(labels)
+            keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
 
-        def one(learner, number, epoch=epoch, shown=shown, truth=truth, keys=keys):
-            return epoch(learner, shown, truth, jax.random.fold_in(keys, number))
+            def one(learner, number, epoch=epoch, shown=shown, truth=truth, keys=keys):
+                return epoch(learner, shown, truth, jax.random.fold_in(keys, number))
 
-        current, done = run_epochs(phase, current, one, range(first, epochs), out, tell, should_stop)
-        if not done:
-            return None
-        if phase == "pairs":
-            learner = with_backbone(learner, {"params": current.params, "batch_stats": current.batch_stats})
-        else:
-            learner = current
-    variables = {"params": learner.params, "batch_stats": learner.batch_stats}
-    about = {
-        "task": task,
-        "backbone": config.network,
-        "width": config.width,
-        "hidden": config.hidden,
-        "outputs": work.outputs,
-        "names": list(work.names),
-        **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
-        "data": header["settings"],
-        "fov_deg": header["fov_deg"],
-        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
-    }
-    results = _scores(save_trained(out, Trained(network, variables, about)), work)
-    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-    return results
+            current, done = run_epochs(phase, current, one, range(first, epochs), out, tell, should_stop)
+            if not done:
+                return None
+            if phase == "pairs":
+                learner = with_backbone(learner, {"params": current.params, "batch_stats": current.batch_stats})
+            else:
+                learner = current
+        variables = {"params": learner.params, "batch_stats": learner.batch_stats}
+        about = {
+            "task": task,
+            "backbone": config.network,
+            "width": config.width,
+            "hidden": config.hidden,
+            "outputs": work.outputs,
+            "names": list(work.names),
+            **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
+            "data": header["settings"],
+            "fov_deg": header["fov_deg"],
+            "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
+        }
+        results = _scores(save_trained(out, Trained(network, variables, about)), work)
+        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+        return results
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:
@@ -238,16 +239,15 @@ def load_trained(run: Path) -> Trained:
         RunError: no such run, or it is not finished, damaged, or a passage detector of one length without saying which.
     """
     run = Path(run)
-    if not (run / DESCRIPTION).is_file():
-        raise RunError(f"{run}: holds no trained network; finish it: python -m topological_nav train TASK -o {run}")
-    about = json.loads((run / DESCRIPTION).read_text())
+    about = read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:
         raise RunError(
             f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
             "its dataset again and train it again"
         )
-    network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
-    template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
+    with readable(run / DESCRIPTION, RunError, "train again"):
+        network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
+        template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
     return Trained(network, read_weights(run, template, about), about)
 
 

@@ -34,7 +34,7 @@ from topological_nav.graph import assemble, lengths, near_pairs
 from topological_nav.learning import Learner, labelled_epoch, make_learner
 from topological_nav.localise import localisation_scores
 from topological_nav.passages import balanced
-from topological_nav.runs import RESULTS, claim
+from topological_nav.runs import RESULTS, claimed
 from topological_nav.space import free_space
 from topological_nav.training import Trained, length_scores, load_trained, save_trained
 from train.config_io import to_dict
@@ -82,32 +82,32 @@ def passage_configurations(
     learned, tested = _labelled(target, trained.about["lengths_m"], config)
     header, _ = read_header(target)
     about = {"run": trained.about["digest"][:12], "target": digest_of(header)}
-    claim(out, {"task": "transfer", **to_dict(config), **about})
-    write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
-    network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
-    shape = (trained.about["data"]["height"], trained.about["data"]["width"])
-    fresh = make_learner(network, shape, tx, config.seed)
-    epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
-    images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free)
-    results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
-    for name, (from_source, tunes) in CONFIGURATIONS.items():
-        # A copy: an epoch gives its argument's memory away.
-        learner = jax.tree.map(jnp.array, _of(trained, tx) if from_source else fresh)
-        if tunes:
-            learner, done = resumable_epochs(
-                out, name, learner, lambda state, key: epoch(state, images, labels, key), config.fine_tune_epochs,
-                config.seed, tell, should_stop,
-            )  # fmt: skip
-            if not done:
-                return None
-        variables = {"params": learner.params, "batch_stats": learner.batch_stats}
-        tuned = Trained(network, variables, trained.about)
-        results[name] = _scores(tuned, tested)
-        if name == "D":
-            about = {"adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
-            save_trained(out, dataclasses.replace(tuned, about={**trained.about, **about}))
-    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-    return results
+    with claimed(out, {"task": "transfer", **to_dict(config), **about}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
+        shape = (trained.about["data"]["height"], trained.about["data"]["width"])
+        fresh = make_learner(network, shape, tx, config.seed)
+        epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
+        images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free)
+        results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
+        for name, (from_source, tunes) in CONFIGURATIONS.items():
+            # A copy: an epoch gives its argument's memory away.
+            learner = jax.tree.map(jnp.array, _of(trained, tx) if from_source else fresh)
+            if tunes:
+                learner, done = resumable_epochs(
+                    out, name, learner, lambda state, key: epoch(state, images, labels, key), config.fine_tune_epochs,
+                    config.seed, tell, should_stop,
+                )  # fmt: skip
+                if not done:
+                    return None
+            variables = {"params": learner.params, "batch_stats": learner.batch_stats}
+            tuned = Trained(network, variables, trained.about)
+            results[name] = _scores(tuned, tested)
+            if name == "D":
+                about = {"adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
+                save_trained(out, dataclasses.replace(tuned, about={**trained.about, **about}))
+        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+        return results
 
 
 def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):

@@ -18,6 +18,7 @@ from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.robots.ttbot import ttbot
 from interactive_nav.robots.turtlebot import turtlebot
+from interactive_nav_common.errors import ConfigError
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "ant": ant,
@@ -48,12 +49,12 @@ def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
         control_mode: one of the robot's `control_modes`; `native` is the original benchmark's action.
 
     Raises:
-        ValueError: unknown name or mode; the message lists the known ones.
+        ConfigError: unknown name (a mode: ValueError); the message lists the known ones.
     """
     if name not in _FACTORIES:
         near = difflib.get_close_matches(str(name), _FACTORIES, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ValueError(f"unknown robot '{name}'; {hint}known robots: {', '.join(robot_names())}")
+        raise ConfigError(f"unknown robot '{name}'; {hint}known robots: {', '.join(robot_names())}")
     return _FACTORIES[name](control_mode)
 
 

@@ -259,6 +259,7 @@ def test_the_commands_draw_and_tell(first, toy, capsys, tmp_path):
     assert "| expert | toy | 4 | 1.00 [0.51, 1.00] |" in (contest.out / "summary.md").read_text()
     assert (contest.out / "toy.png").stat().st_size > 20_000
     out, film = tmp_path / "one.png", tmp_path / "one.mp4"
+    words.remove("batch=4")
     assert main(["navigate", str(toy), "--episode", "2", "-o", str(out), "--video", str(film), *words]) == 0
     told = capsys.readouterr().out
     row = next(r for r in rows.to_pylist() if r["contender"] == "dense" and r["episode"] == 2)

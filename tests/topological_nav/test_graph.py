@@ -118,7 +118,7 @@ def test_a_map_is_one_file_and_of_one_scene(tmp_path):
     ):
         graph.load_map(path, "e" * 64)
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(MapError, match="is no readable map"):
+    with pytest.raises(MapError, match="not readable"):
         graph.load_map(path)
 
 

@@ -13,6 +13,7 @@ from topological_nav.__main__ import main
 from topological_nav.graph import load_map
 from topological_nav.localise import nearest_node
 from topological_nav.rendering import SceneRenderer
+from topological_nav.ros.__main__ import main as nodes
 
 
 def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
@@ -95,6 +96,61 @@ def test_mistakes_are_one_line(words, told, capsys):
     assert main(words) == 2
     error = capsys.readouterr().err
     assert error.startswith("topological_nav: ") and told in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "unused"),
+    [
+        (["navigate", "S", "--truth", "--localiser", "R"], "--localiser"),
+        (["navigate", "S", "--truth", "--detector", "R"], "--detector"),
+        (["navigate", "S", "--truth", "--maps", "M"], "--maps"),
+        (["navigate", "S", "--truth", "supersample=2"], "supersample"),
+        (["navigate", "S", "--truth", "match=nearest"], "match"),
+        (["navigate", "S", "thinned=0.3"], "thinned"),
+        (["navigate", "S", "batch=3"], "batch"),
+        (["navigate", "S", "--truth", "glance=false", "watch_s=2"], "watch_s"),
+        (["evaluate", "S", "--contenders", "expert", "--truth"], "--truth"),
+        (["evaluate", "S", "--contenders", "expert", "--maps", "M"], "--maps"),
+        (["evaluate", "S", "--contenders", "expert", "--policy", "passage"], "--policy"),
+        (["evaluate", "S", "--contenders", "expert", "--domain", "light"], "--domain"),
+        (["evaluate", "S", "--contenders", "expert", "swings=3"], "swings"),
+        (["evaluate", "S", "--contenders", "dense", "--ppo", "R"], "--ppo"),
+        (["evaluate", "S", "--contenders", "dense", "thinned=0.3"], "thinned"),
+        (["train", "rooms", "--localiser", "R"], "--localiser"),
+        (["train", "rooms", "--grid"], "--grid"),
+        (["train", "rooms", "selfsup_epochs=3"], "selfsup_epochs"),
+        (["train", "passages", "--detector", "R"], "--detector"),
+        (["train", "passages", "hidden=3"], "hidden"),
+        (["train", "policy", "--grid", "alpha=3"], "alpha"),
+        (["adapt", "map", "S", "epochs=5"], "epochs"),
+        (["adapt", "map", "S", "seed=5"], "seed"),
+        (["adapt", "map", "S", "--data", "D", "--target", "T"], "--data"),
+        (["adapt", "features", "--detector", "R"], "--detector"),
+        (["adapt", "features", "passable=0.4"], "passable"),
+        (["adapt", "passages", "--localiser", "R"], "--localiser"),
+        (["adapt", "passages", "epochs=5"], "epochs"),
+    ],
+)
+def test_what_would_change_nothing_is_refused(words, unused, capsys):
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"topological_nav: {unused} has no effect ") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "unused"),
+    [
+        (["all", "S", "--map", "M"], "--map"),
+        (["navigator", "--goal", "G"], "--goal"),
+        (["navigator", "--policy", "passage"], "--policy"),
+        (["check", "seed=1"], "seed"),
+        (["record", "B", "width=1"], "width"),
+    ],
+)
+def test_what_a_node_would_not_look_at_is_refused(words, unused, capsys):
+    assert nodes(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"topological_nav.ros: {unused} has no effect ") and error.count("\n") == 1
 
 
 def test_a_stop_before_the_work_begins_is_one_line(monkeypatch, capsys):

@@ -22,7 +22,7 @@ from scenes_mjcf.schema import SceneError
 from topological_nav.config import RUNS, NavigatorConfig
 from topological_nav.ros import debian, launch
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
-from topological_nav.settings import overridden, settings_help
+from topological_nav.settings import overridden, refuse_unused, settings_help
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
 """Driver -> its settings."""
@@ -54,8 +54,9 @@ def parser() -> argparse.ArgumentParser:
     for sub in (everything, alone):
         sub.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
         sub.add_argument("--port", type=int, metavar="N", help="a master of its own on this port; 0: a free one")
-        sub.add_argument("--lockstep", action="store_true", help="each picture waits for its velocity command")
-        sub.add_argument("--factor", type=float, default=1.0, help="simulated seconds a second; 0: no waiting")
+        pace = sub.add_mutually_exclusive_group()
+        pace.add_argument("--lockstep", action="store_true", help="each picture waits for its velocity command")
+        pace.add_argument("--factor", type=float, default=1.0, help="simulated seconds a second; 0: no waiting")
         sub.add_argument("--limit", type=float, default=1800.0, metavar="S", help="simulated seconds of an episode")
     alone.add_argument("--recorded", action="store_true", help="begin when every topic has a listener")
     everything.add_argument("--bag", type=Path, metavar="PATH", help="record all topics there")
@@ -81,11 +82,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     run = {"all": _all, "sim": _sim, "navigator": _navigator, "record": _record, "master": _master, "check": _check}
     with stop_signals() as stops:
         try:
+            _refuse_unused(arguments)
             run[arguments.command](arguments, stops)
         except (UserError, SceneError) as error:
             print(f"topological_nav.ros: {error}", file=sys.stderr)
             return 2
         return 128 + stops[0] if stops and arguments.command not in ("record", "master") else 0
+
+
+def _refuse_unused(arguments: argparse.Namespace) -> None:
+    """Refuses what the chosen driver, or the command, does not look at."""
+    if arguments.command in ("record", "master", "check"):
+        named = " ".join(word.partition("=")[0] for word in arguments.settings)
+        refuse_unused(arguments, named, f"in '{arguments.command}', which has no settings")
+    elif arguments.command != "sim" and arguments.driver == "heading":
+        options = "--map --localiser --detector --policy --goal --goal-heading"
+        refuse_unused(arguments, options, "with --driver heading, only with --driver topological")
 
 
 def _add_journey(sub: argparse.ArgumentParser) -> None:
@@ -133,8 +145,8 @@ def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
         from topological_nav.ros.pilot import goal_words
 
         journey = list(goal_words(_journey(arguments)))
-    pace = ["--factor", str(arguments.factor), "--limit", str(arguments.limit)]
-    pace += ["--lockstep"] * arguments.lockstep + ["--recorded"] * bool(arguments.bag)
+    pace = ["--lockstep"] if arguments.lockstep else ["--factor", str(arguments.factor)]
+    pace += ["--limit", str(arguments.limit), *(["--recorded"] if arguments.bag else [])]
     heading = ["--heading-from", arguments.heading_from, "--heading-offset", str(arguments.heading_offset)]
     with launch.some_master(ros, arguments.port) as uri, launch.Nodes() as nodes:
         print(f"master: {uri}", file=sys.stderr, flush=True)

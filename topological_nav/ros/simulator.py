@@ -20,7 +20,7 @@ from interactive_nav.rendering.base import Lens
 from interactive_nav.rendering.camera import Camera
 from interactive_nav.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
-from topological_nav.rendering import shrink
+from topological_nav.rendering import need_engine, shrink
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.space import free_space
 
@@ -69,8 +69,9 @@ class Simulator:
 
         Raises:
             SceneError: the scene cannot be used.
-            UserError: the start is not free.
+            UserError: the start is not free, or the engine is not installed.
         """
+        need_engine(config.engine)
         self.config = config
         self._env = interactive_nav.make(
             ROBOT,

@@ -1,0 +1,29 @@
+"""One process at a time works in a run folder or a dataset."""
+
+import os
+
+import pytest
+
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.locks import release, take_lock
+from topological_nav.__main__ import main
+from topological_nav.runs import alone_in, claimed
+
+
+def test_a_folder_in_use_is_refused_and_named(tmp_path):
+    out = tmp_path / "run"
+    busy = f"run: process {os.getpid()} on .* works there; wait for it"
+    with claimed(out, {"seed": 1}), pytest.raises(FileError, match=busy), alone_in(out):
+        pass
+    with claimed(out, {"seed": 1}):  # free again
+        pass
+
+
+def test_a_dataset_that_another_process_makes(painted, tmp_path, capsys):
+    for words in (["data"], ["data", "--drives"]):
+        held = take_lock(tmp_path / ".lock")
+        assert held is not None
+        assert main([*words, str(painted), "-o", str(tmp_path), "supersample=1"]) == 2
+        release(held)
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and f"process {os.getpid()} on " in error and "works there" in error
