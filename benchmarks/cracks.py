@@ -14,16 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.cut import cut_furniture
-from converters.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
-from converters.fill import Filled, fill_planes, wall_planes
-from converters.floor import level_floor
-from converters.holes import hidden_surfaces
-from converters.join import OpenBorder, open_border
-from converters.maps import main_direction, make_floor_plan
-from converters.objects import Hull, name_objects, place_object
-from converters.pipeline import align_objects, read_source
-from converters.propose import floor_of
+from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
+from converters.bodies.objects import name_objects, place_object
+from converters.fill.holes import hidden_surfaces
+from converters.fill.join import OpenBorder, open_border
+from converters.fill.patches import Filled, fill_planes, wall_planes
+from converters.geometry.boxes import Hull
+from converters.pipeline import align_objects
+from converters.propose.report import floor_of
+from converters.read.source import read_source
+from converters.structure.cut import cut_furniture
+from converters.structure.floor import level_floor
+from converters.structure.maps import main_direction, make_floor_plan
 
 NARROW_M, WIDE_M = 0.02, 0.10
 

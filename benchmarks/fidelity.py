@@ -28,11 +28,11 @@ from rich.table import Table
 
 from benchmarks.steps_per_second import _commit, _versions
 from interactive_nav.config import NavConfig
-from interactive_nav.objects import SmallObject
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot, robot_names
-from interactive_nav.scene import Movable, Scene, load_scene
-from interactive_nav.world import World, build_world
+from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.scene import Movable, Scene, load_scene
+from interactive_nav.scenes.world import World, build_world
 
 SCENE = "scenes_mjcf/apartment_0"
 RESULTS = Path("benchmarks/results/fidelity.jsonl")

@@ -26,7 +26,7 @@ from rich.table import Table
 
 import interactive_nav
 from benchmarks.steps_per_second import MODES, _commit, _versions, step_of
-from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav.task.wrappers import AutoResetEnv
 
 PARTS = (
     ("rendering", r"render|bvh"),

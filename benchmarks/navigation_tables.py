@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav import navigation
 from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
-from interactive_nav.scene import load_scene
-from interactive_nav.tables import navigation_tables
+from interactive_nav.navigation import lookup
+from interactive_nav.navigation.tables import navigation_tables
+from interactive_nav.scenes.scene import load_scene
 from interactive_nav.types import SceneTables
 
 RADIUS_M, FINE_M, CELL_M = 0.18, 0.05, 0.1
@@ -116,8 +116,8 @@ def accuracy(rooms: int) -> None:
         want, sure = reference(seed, xy, goal)
         sure &= np.linalg.norm(xy - goal, axis=-1) >= 1.0
         scene = jnp.asarray(0)
-        field = navigation.goal_field(tables, scene, jnp.asarray(goal))
-        at = jax.vmap(navigation.geodesic_at, (None, None, None, 0))
+        field = lookup.goal_field(tables, scene, jnp.asarray(goal))
+        at = jax.vmap(lookup.geodesic_at, (None, None, None, 0))
         got = np.asarray(at(tables, scene, field, jnp.asarray(xy)))
         error = np.abs(got[sure] / want[sure] - 1.0)
         worst, compared = max(worst, float(error.max(initial=0.0))), compared + int(sure.sum())
@@ -143,13 +143,13 @@ def look_up_ms(values: dict[str, Any], graphs: list[CornerGraph], rounds: int = 
     scene = np.arange(BATCH) % len(graphs)
     points = np.stack([graphs[s].node_xy_w[rng.integers(len(graphs[s].node_xy_w), size=2)] for s in scene])
     index, start, goal = jnp.asarray(scene), jnp.asarray(points[:, 0]), jnp.asarray(points[:, 1])
-    fields = jax.jit(jax.vmap(lambda s, g: navigation.goal_field(tables, s, g)))(index, goal)
+    fields = jax.jit(jax.vmap(lambda s, g: lookup.goal_field(tables, s, g)))(index, goal)
 
     @jax.jit
     @jax.vmap
     def look(s, field, xy):
-        near = navigation.geodesic_at(tables, s, field, xy)
-        return near, navigation.waypoints_at(tables, s, field, xy, 10, 0.2)
+        near = lookup.geodesic_at(tables, s, field, xy)
+        return near, lookup.waypoints_at(tables, s, field, xy, 10, 0.2)
 
     times = []
     for _ in range(rounds + 1):

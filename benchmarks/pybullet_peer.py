@@ -28,8 +28,8 @@ from benchmarks.steps_per_second import _commit, _versions
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
-from interactive_nav.scene import load_scene
-from interactive_nav.world import build_world
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import build_world
 
 WHEEL_RADIUS_M, HALF_TRACK_M, BODY_RADIUS_M = 0.0352, 0.115, 0.176
 RESULTS = Path("benchmarks/results/pybullet_peer.jsonl")

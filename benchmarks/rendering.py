@@ -25,8 +25,8 @@ import numpy as np
 
 import interactive_nav
 from benchmarks.steps_per_second import _commit, _versions
-from interactive_nav.rendering import CameraPose, Lens, make_renderer
-from interactive_nav.rendering.shading import colours, normals
+from interactive_nav.pictures.shading import colours, normals
+from interactive_nav.sensing import CameraPose, Lens, make_renderer
 
 STREAMS = ("observation", "depth", "segmentation", "normals", "rgb", "rgb_textured")
 TURN_RAD = 0.1
@@ -54,8 +54,8 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
     if stream == "rgb_textured":
         if renderer_name != "warp":
             raise Skip("textures are drawn by warp only")
-        from interactive_nav.rendering.visual import VISUAL_GROUP, build_visual
-        from interactive_nav.rendering.warp import WarpColour
+        from interactive_nav.pictures.visual import VISUAL_GROUP, build_visual
+        from interactive_nav.sensing.warp import WarpColour
 
         visual = build_visual(env.world, 0)
         data = visual.pose(np.asarray(qpos[0]))

@@ -30,11 +30,11 @@ from rich.console import Console
 
 import interactive_nav
 from interactive_nav.physics import resolve_backend
-from interactive_nav.sharding import ShardedEnv
-from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav.task.sharding import ShardedEnv
+from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common.versions import commit
 from train import config_io
-from train.run import train_run
-from train.run_folder import commit
+from train.runs.run import train_run
 
 MODES = ("physics", "task", "observed", "simulation", "train")
 COUNTED = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")

@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from interactive_nav.robots import get_robot
-from interactive_nav.scene import Scene, load_scene
-from topological_nav.build import camera_of, renderer_of
-from topological_nav.packaged import packaged_weights
-from topological_nav.rendering import camera_pose
-from topological_nav.space import free_space
-from topological_nav.training import Trained, load_trained
+from interactive_nav.scenes.scene import Scene, load_scene
+from topological_nav.learn.training import Trained, load_trained
+from topological_nav.maps.build import camera_of, renderer_of
+from topological_nav.scenes.rendering import camera_pose
+from topological_nav.scenes.space import free_space
+from topological_nav.weights.packaged import packaged_weights
 
 CLEARANCE_M = 0.35
 """Least distance of places from obstacles."""

@@ -26,7 +26,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from converters.errors import StageFailed
+from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import CATEGORIES
@@ -139,7 +139,7 @@ def _object(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _check(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.gates import check_folder
+    from converters.check.gates import check_folder
 
     manifest, gates = check_folder(arguments.scene)
     for gate in gates:
@@ -169,7 +169,7 @@ def _generate(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.generate.recipes import load_recipes, make_scenes
+    from converters.recipes import load_recipes, make_scenes
 
     recipes = load_recipes(arguments.recipes or arguments.out / "recipes.yaml")
     with _progress(console) as report:
@@ -186,7 +186,7 @@ def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _preview(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.preview import preview
+    from converters.check.preview import preview
 
     preview(arguments.scene, arguments.output, arguments.source)
     console.print(f"{arguments.output}: picture of {arguments.scene}", soft_wrap=True)
@@ -194,8 +194,8 @@ def _preview(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _propose(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.pipeline import read_source
-    from converters.propose import propose
+    from converters.propose.report import propose
+    from converters.read.source import read_source
 
     library = (arguments.library or arguments.source) if arguments.auto_align or arguments.library else None
     with _progress(console) as report:

@@ -15,36 +15,35 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from converters import gibson, interactive_gibson, scan2cad
-from converters.alignment import Alignment, compare, upright
-from converters.cache import NOT_HASHED, StageCache
-from converters.cut import cut_furniture, face_areas
-from converters.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
-from converters.emit import SceneParts, write_scene
-from converters.errors import SceneRejected
-from converters.floor import level_floor
-from converters.gates import Gate, evaluate
-from converters.holes import fill_holes
-from converters.manifest import make_manifest
-from converters.maps import FloorPlan, main_direction, make_floor_plan, resample
-from converters.objects import Hull, PlacedObject, name_objects, place_object, rotation_of, to_world
-from converters.physical import Physical, physical_properties
-from converters.proposals import propose_instances
-from converters.propose import floor_of
-from converters.raw import RawScene
-from converters.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
-from converters.settle import Settled, settle
-from converters.storeys import split_storeys
-from converters.texture import ColourCloud, VisualMesh, bake_object, bake_structure, colour_cloud
-from converters.walls import wall_boxes
+from converters.bodies.alignment import Alignment, compare, upright
+from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
+from converters.bodies.objects import PlacedObject, name_objects, place_object, to_world
+from converters.bodies.physical import Physical, physical_properties
+from converters.check.gates import evaluate
+from converters.check.settle import Settled, settle
+from converters.fill.holes import fill_holes
+from converters.geometry.boxes import Hull, rotation_of
+from converters.geometry.faces import face_areas
+from converters.propose.proposals import propose_instances
+from converters.propose.report import floor_of
+from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
+from converters.read.source import read_source
+from converters.read.storeys import split_storeys
+from converters.records.cache import NOT_HASHED, StageCache
+from converters.records.errors import SceneRejected
+from converters.records.gate import Gate
+from converters.records.raw import RawScene
+from converters.records.visual import ColourCloud, VisualMesh
+from converters.structure.cut import cut_furniture
+from converters.structure.floor import level_floor
+from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
+from converters.structure.walls import wall_boxes
+from converters.write.emit import SceneParts, write_scene
+from converters.write.manifest import make_manifest
+from converters.write.texture import bake_object, bake_structure, colour_cloud
 from interactive_nav_common.files import part_folder, publish
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
-READERS = {
-    "interactive-gibson": (interactive_gibson.looks_like, interactive_gibson.read_interactive_gibson),
-    "gibson": (gibson.looks_like, gibson.read_gibson),
-    "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
-}
 STAGES = {
     "read": 1.0,
     "align": 0.5,
@@ -125,32 +124,6 @@ class _Clock:
         inner(1.0)
         self._before += STAGES[name]
         self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
-
-
-def detect_format(source: Path) -> str:
-    """Name of the layout that the folder has.
-
-    Raises:
-        SceneRejected: no known layout.
-    """
-    for name, (looks_like, _) in READERS.items():
-        if looks_like(source):
-            return name
-    if not source.exists():
-        raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
-    raise SceneRejected(
-        f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
-        f"(interactive-gibson) or {scan2cad.ANNOTATION} (scan2cad) in it"
-    )
-
-
-def read_source(source: Path, layout: str = "auto", strict: bool = False) -> RawScene:
-    """Reads a raw folder in the given layout, or in the one that its files show.
-
-    Raises:
-        SceneRejected: no known layout, or bad input.
-    """
-    return READERS[layout if layout != "auto" else detect_format(source)][1](source, strict)
 
 
 def with_retrieved(

@@ -19,21 +19,25 @@ import mujoco
 import numpy as np
 import trimesh
 
-from converters.cad import Y_UP_TO_Z_UP, clean_surface, merge_vertices
-from converters.decompose import DecomposeConfig, cache_folder, decompose_all
-from converters.emit import SceneParts, build_spec, write_scene
-from converters.errors import SceneRejected
-from converters.files import SourceFolder
-from converters.gates import collide_with, physical_values
-from converters.manifest import PACKAGES
-from converters.meshes import colours_of_faces, read_surface
-from converters.obj import TexturedMesh
-from converters.objects import Hull, PlacedObject, convex_hull, fit_box, rotation_of
-from converters.physical import MATERIALS, Physical
-from converters.raw import ScanMesh
-from converters.settle import settle
-from converters.texture import VisualMesh, bake_object, colour_cloud
-from converters.urdf import RigidObject, read_urdf
+from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
+from converters.bodies.objects import PlacedObject
+from converters.bodies.physical import MATERIALS, Physical
+from converters.check.gates import collide_with, physical_values
+from converters.check.settle import settle
+from converters.geometry.boxes import Hull, convex_hull, fit_box, rotation_of
+from converters.geometry.faces import merge_vertices
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.cad import clean_surface
+from converters.read.files import SourceFolder
+from converters.read.meshes import colours_of_faces, read_surface
+from converters.read.obj import TexturedMesh
+from converters.read.urdf import RigidObject, read_urdf
+from converters.records.errors import SceneRejected
+from converters.records.raw import ScanMesh
+from converters.records.visual import VisualMesh
+from converters.write.emit import SceneParts, build_spec, write_scene
+from converters.write.manifest import PACKAGES
+from converters.write.texture import bake_object, colour_cloud
 from interactive_nav_common.files import whole_folder
 from scenes_mjcf.schema import CATEGORIES
 
@@ -52,7 +56,7 @@ WORDS = {
 DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0, "other": 300.0}
 """Of the hulls, for meshes without a mass: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm
 0.7 kg in 0.8 dm3, a plastic toy is mostly hollow; other things lie between.
-Furniture has `converters.physical.MATERIALS`."""
+Furniture has `converters.bodies.physical.MATERIALS`."""
 FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4, "other": 0.5}
 """Sliding coefficients on a floor: rubber soles, clay, plastic, anything."""
 FOOT_SHARE = 0.03

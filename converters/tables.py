@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from converters.gates import Gate
-    from converters.propose import Proposed
+    from converters.propose.report import Proposed
+    from converters.records.gate import Gate
 
 
 def bounds(gate: Gate) -> str:

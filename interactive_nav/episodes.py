@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from interactive_nav_common.errors import UserError
 
 if TYPE_CHECKING:
-    from interactive_nav.env import InteractiveNav
+    from interactive_nav.task.env import InteractiveNav
     from interactive_nav.types import EpisodeStart
 
 FORMAT = "interactive-nav-episodes"
@@ -104,7 +104,7 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
 
 
 def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart, Any]:
-    from interactive_nav.navigation import geodesic_at, goal_field
+    from interactive_nav.navigation.lookup import geodesic_at, goal_field
 
     field = goal_field(env.tables, start.scene_index, start.goal_xy_w)
     return start, geodesic_at(env.tables, start.scene_index, field, start.start_xy_w)
@@ -112,7 +112,7 @@ def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart
 
 def _objects_digests(env: InteractiveNav) -> tuple[str, str]:
     """Of what decides the task, and as old files have it."""
-    from interactive_nav.scene import TASK_DIGEST
+    from interactive_nav.scenes.scene import TASK_DIGEST
 
     small = env.world.small_objects
     task = [
@@ -142,7 +142,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     import jax.numpy as jnp
     import numpy as np
 
-    from interactive_nav.scene import TASK_DIGEST
+    from interactive_nav.scenes.scene import TASK_DIGEST
     from interactive_nav.types import EpisodeStart
 
     if file.robot != env.robot.name:

@@ -2,7 +2,7 @@
 
 The environment's is `corner_graph`: among blocked squares a shortest path is straight but where it bends
 round a corner, so the corners' mutual distances, and which corners each place sees, hold every distance
-from anywhere to anywhere (`interactive_nav.navigation` looks them up inside jit).
+from anywhere to anywhere (`interactive_nav.navigation.lookup` looks them up inside jit).
 
 `distance_field` is for any map and goal inside jit: shortest paths on a grid whose nodes are the free
 cells' centres and whose edges are the 32 moves of `STENCIL`, each allowed only where every cell that it

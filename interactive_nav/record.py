@@ -21,10 +21,8 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.ndimage import gaussian_filter1d
 
-from interactive_nav.replay import Replay, ReplayError, load
-from interactive_nav.robots import get_robot
-from interactive_nav.scene import Scene, load_scene
-from interactive_nav.views import (
+from interactive_nav.pictures.replay import Replay, ReplayError, load
+from interactive_nav.pictures.views import (
     INSIDE,
     OUTSIDE,
     FloorPaint,
@@ -35,6 +33,8 @@ from interactive_nav.views import (
     robot_camera,
     yaw_of,
 )
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.files import whole_file
 
 FORMATS = (".mp4", ".gif")

@@ -24,11 +24,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path as Outline
 
+from interactive_nav.pictures.replay import Replay, ReplayError, load
+from interactive_nav.pictures.views import COLOURS, yaw_of
 from interactive_nav.record import check_scene
-from interactive_nav.replay import Replay, ReplayError, load
 from interactive_nav.robots import get_robot
-from interactive_nav.scene import Scene, load_scene
-from interactive_nav.views import COLOURS, yaw_of
+from interactive_nav.scenes.scene import Scene, load_scene
 
 COLOUR_BY = ("time", "contact")
 TOUCH_COLOURS = {"nothing": "#0072b2", "an object": "#d55e00", "a wall": "#555555"}

@@ -18,10 +18,10 @@ import mujoco
 import numpy as np
 
 from interactive_nav.geodesic import clearance
-from interactive_nav.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, pick
+from interactive_nav.navigation.tables import furniture_map
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
-from interactive_nav.scene import Scene, load_scene
-from interactive_nav.tables import furniture_map
+from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, pick
+from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.errors import UserError
 
 VIEWERS = ("auto", "window", "browser")

@@ -110,3 +110,18 @@ def _flock(descriptor: int, path: Path, kind: int) -> bool:
             f"{path}: its file system has no locks ({error.strerror}); choose a folder on one that does"
         ) from None
     return True
+
+
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Makes a folder and keeps other processes out of it for the block.
+
+    Raises:
+        FileError: another one works there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out / LOCK, f"{out}: {{holder}} works there; wait for it or choose another folder (-o)"):
+        yield

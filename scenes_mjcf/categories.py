@@ -7,6 +7,7 @@ field here, so that a new category is one new row and no two places differ.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 
 Rgb = tuple[float, float, float]
 
@@ -72,3 +73,20 @@ CLASSES = tuple(name for name, _ in _classes())
 """Class of a segmentation image -> category; 4, where desks have no class of their own, is theirs too."""
 CLASS_COLOURS = tuple(colour for _, colour in _classes())
 """Class -> colour."""
+
+
+def class_id(category: str, five: bool = False) -> int:
+    """Segmentation id of an object category.
+
+    Args:
+        category: such as chair.
+        five: desks apart from tables.
+
+    Raises:
+        ValueError: a category without an id.
+    """
+    if category not in CATEGORIES:
+        near = difflib.get_close_matches(category, CATEGORIES, 1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ValueError(f"category '{category}' has no segmentation id; {hint}known: {', '.join(CATEGORIES)}")
+    return CATEGORIES[category].segmentation_id(five)

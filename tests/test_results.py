@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from topological_nav.scores import differences, markdown, summary
+from interactive_nav_common.metrics_file import PACKED_METRICS, read_metrics
+from interactive_nav_common.rows import read_rows
+from topological_nav.evaluate.scores import differences, markdown, summary
 from train.figures import tables
-from train.rows import read_rows
-from train.run_folder import PACKED_METRICS, read_metrics
 from train.sweep import spec
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -21,7 +21,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.schema import SceneError
-from topological_nav import adapt_commands
+from topological_nav.commands import adapt
 from topological_nav.config import (
     PASSAGE_POLICY,
     RUNS,
@@ -38,7 +38,7 @@ from topological_nav.config import (
 from topological_nav.settings import overridden, refuse_unused, settings_help
 
 if TYPE_CHECKING:
-    from topological_nav.contest import Contest
+    from topological_nav.evaluate.contest import Contest
 
 DATASET, DRIVES = RUNS / "data", RUNS / "drives"
 TASKS = {"rooms": room_config, "passages": passage_config}
@@ -140,7 +140,7 @@ def parser() -> argparse.ArgumentParser:
             "--localiser", type=Path, metavar="RUN", help=f"embeds images (default {RUNS}, or the package's)"
         )
         sub.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
-    adapt_commands.add_to(command, DATASET, RUNS)
+    adapt.add_to(command, DATASET, RUNS)
     carry = command("export", "Writes finished runs as a small folder of weights in half precision.", ExportConfig())
     carry.add_argument("--localiser", type=Path, default=RUNS / "rooms", metavar="RUN", help="embeds images")
     carry.add_argument("--detector", type=Path, default=RUNS / "passages", metavar="RUN", help="judges passages")
@@ -189,8 +189,8 @@ def _data(arguments: argparse.Namespace) -> None:
         return _drives(arguments)
     config = overridden(DataConfig(), arguments.settings)
     out = arguments.out or DATASET
-    from topological_nav.data import dataset_bytes, make_dataset
-    from topological_nav.figures import dataset_figure, save
+    from topological_nav.data.dataset import dataset_bytes, make_dataset
+    from topological_nav.figures.maps import dataset_figure, save
 
     with _stops() as stops, _bar() as tell:
 
@@ -215,9 +215,9 @@ def _data(arguments: argparse.Namespace) -> None:
 def _drives(arguments: argparse.Namespace) -> None:
     config = overridden(DriveConfig(), arguments.settings)
     out, scenes = arguments.out or DRIVES, [Path(s) for s in arguments.scenes]
-    from topological_nav.drive_figures import drives_figure
-    from topological_nav.drives import draw_drives, drives_bytes, simulate_drives, summary
-    from topological_nav.figures import save
+    from topological_nav.drives.dataset import draw_drives, drives_bytes, simulate_drives, summary
+    from topological_nav.figures.drive_figures import drives_figure
+    from topological_nav.figures.maps import save
 
     with _stops() as stops:
 
@@ -255,9 +255,9 @@ def _train(arguments: argparse.Namespace) -> None:
     if config.init != "selfsup":
         refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
-    from topological_nav.figures import curves_figure, save
-    from topological_nav.training import train
-    from train.run_folder import read_metrics
+    from interactive_nav_common.metrics_file import read_metrics
+    from topological_nav.figures.maps import curves_figure, save
+    from topological_nav.learn.training import train
 
     with _stops() as stops:
         results = train(
@@ -288,10 +288,10 @@ def _policy(arguments: argparse.Namespace) -> None:
     if arguments.grid:
         refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
-    from topological_nav.drive_figures import policy_figure
-    from topological_nav.figures import save
-    from topological_nav.imitation import embed_drives, grid_table, train_grid, train_policy
-    from train.run_folder import read_metrics
+    from interactive_nav_common.metrics_file import read_metrics
+    from topological_nav.drives.imitation import embed_drives, grid_table, train_grid, train_policy
+    from topological_nav.figures.drive_figures import policy_figure
+    from topological_nav.figures.maps import save
 
     def tell(line: str) -> None:
         print(line, flush=True)
@@ -328,7 +328,7 @@ def _policy(arguments: argparse.Namespace) -> None:
 
 def _map(arguments: argparse.Namespace) -> None:
     config = overridden(MapConfig(), arguments.settings)
-    from topological_nav.packaged import choose
+    from topological_nav.weights.packaged import choose
 
     chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
     if chosen.said:
@@ -341,9 +341,9 @@ def _build(
     scene: Path, localiser: Path, detector: Path, config: MapConfig, out: Path, ends: Sequence[int] | None = None
 ) -> None:
     """Makes a map, draws it and tells of it."""
-    from topological_nav.build import build_map, forget
-    from topological_nav.figures import map_figure, save
-    from topological_nav.graph import save_map
+    from topological_nav.figures.maps import map_figure, save
+    from topological_nav.maps.build import build_map, forget
+    from topological_nav.maps.graph import save_map
 
     parts = out.with_name(f"{out.name}.parts")
     with _stops() as stops, _bar() as tell:
@@ -372,7 +372,7 @@ def _build(
 
 def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
     """The contest asked for; networks and maps that were not named are chosen, and maps that are nowhere made."""
-    from topological_nav.contest import Contest
+    from topological_nav.evaluate.contest import Contest
 
     contest = Contest(
         scenes=tuple(Path(scene) for scene in scenes),
@@ -387,8 +387,8 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     _refuse_unused(arguments, contest)
     if arguments.truth or not {"dense", "sparse"} & set(contenders):
         return contest
-    from interactive_nav.scene import load_scene
-    from topological_nav.packaged import choose, fitting_map
+    from interactive_nav.scenes.scene import load_scene
+    from topological_nav.weights.packaged import choose, fitting_map
 
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
     if chosen.told:
@@ -434,8 +434,8 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
 
 
 def _navigate(arguments: argparse.Namespace) -> None:
-    from topological_nav.figures import save
-    from topological_nav.journey import drive_episode, film
+    from topological_nav.figures.journey import drive_episode, film
+    from topological_nav.figures.maps import save
 
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
@@ -461,10 +461,10 @@ def _navigate(arguments: argparse.Namespace) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> None:
     from interactive_nav_common.files import write_text
-    from topological_nav.contest import hold, tracks_of, venues_of
-    from topological_nav.episode_figures import journeys_figure
-    from topological_nav.figures import save
-    from topological_nav.scores import console_table, differences, markdown, summary, where
+    from topological_nav.evaluate.contest import hold, tracks_of, venues_of
+    from topological_nav.evaluate.scores import console_table, differences, markdown, summary, where
+    from topological_nav.figures.episode_figures import journeys_figure
+    from topological_nav.figures.maps import save
 
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
@@ -500,16 +500,16 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 def _adapt(arguments: argparse.Namespace) -> None:
     with _stops() as stops:
-        if not adapt_commands.run(arguments, lambda: bool(stops)):
+        if not adapt.run(arguments, lambda: bool(stops)):
             raise Stopped(stops[0])
 
 
 def _export(arguments: argparse.Namespace) -> None:
     config = overridden(ExportConfig(), arguments.settings)
-    from topological_nav.export import export, level_images, size_lines
-    from topological_nav.export_figure import export_figure
-    from topological_nav.figures import save
-    from topological_nav.training import load_trained
+    from topological_nav.figures.export_figure import export_figure
+    from topological_nav.figures.maps import save
+    from topological_nav.learn.training import load_trained
+    from topological_nav.weights.export import export, level_images, size_lines
 
     with _stops() as stops, _bar() as tell:
 

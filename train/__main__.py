@@ -13,7 +13,7 @@ from rich.console import Console
 from interactive_nav_common.errors import UserError
 from train import config_io
 from train.config import TrainConfig
-from train.run_folder import RunFolder
+from train.runs.run_folder import RunFolder
 
 
 def parser() -> argparse.ArgumentParser:
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         config = read_config(arguments)
         # Heavy: after the config is known to be right.
-        from train.run import train_run
+        from train.runs.run import train_run
 
         _, _, stopped_by = train_run(config, Console())
     except UserError as error:

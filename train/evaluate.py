@@ -22,17 +22,20 @@ from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
 from interactive_nav.episodes import load as load_episodes
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import whole_file
-from train import checkpoint, config_io
-from train.algorithms import ALGORITHMS
-from train.checkpoint import CheckpointMeta
+from interactive_nav_common.rows import write_parquet
+from interactive_nav_common.versions import versions
+from train import config_io
 from train.config import EnvConfig, TrainConfig
-from train.planners import Planner
-from train.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
-from train.rollout import Episodes, Player, episode_keys
-from train.row_files import EvaluationAsked, paths_beside
-from train.rows import episode_table, score_table, write_parquet
-from train.run import check_fits, config_to_play, make_env
-from train.run_folder import FAILURES, RunFolder, claim, versions
+from train.learners.algorithms import ALGORITHMS
+from train.runs import checkpoint
+from train.runs.checkpoint import CheckpointMeta
+from train.runs.run import check_fits, config_to_play, make_env
+from train.runs.run_folder import FAILURES, RunFolder, claim
+from train.scoring.planners import Planner
+from train.scoring.policies import PLANNERS, YARDSTICKS, PolicyFn, make_yardstick
+from train.scoring.rollout import Episodes, Player, episode_keys
+from train.scoring.row_files import EvaluationAsked, paths_beside
+from train.scoring.rows import episode_table, score_table
 
 LEARNED = "learned"
 ROWS = "evaluation/episodes.parquet"

@@ -41,12 +41,12 @@ from interactive_nav.robots.gait import (
     targets,
 )
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.scene import Scene
-from interactive_nav.world import build_world
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.scenes.world import build_world
 from scenes_mjcf.schema import SceneManifest, SceneMaps
-from train import ppo
 from train.config import AUTO_PPO, PPOConfig, RunConfig, TrainConfig
-from train.learner import Snapshot, Update
+from train.learners import ppo
+from train.learners.learner import Snapshot, Update
 
 ROBOTS = ("ant", "humanoid", "minitaur")
 METRICS = ("forward_error_m_s", "turn_error_rad_s", "fallen", "length", "sum_reward")
@@ -54,7 +54,7 @@ METRICS = ("forward_error_m_s", "turn_error_rad_s", "fallen", "length", "sum_rew
 
 def get_gait(robot: str) -> Gait:
     """The gait of a legged robot."""
-    return importlib.import_module(f"interactive_nav.robots.{robot}").GAIT
+    return importlib.import_module(f"interactive_nav.robots.models.{robot}").GAIT
 
 
 def empty_plane() -> Scene:

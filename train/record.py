@@ -16,7 +16,7 @@ from rich.console import Console
 from interactive_nav.record import add_picture_words, check_picture_words, record
 from train import replay
 from train.config import EnvConfig
-from train.run import make_env
+from train.runs.run import make_env
 
 
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:

@@ -16,14 +16,14 @@ from typing import Any
 
 from rich.console import Console
 
-from interactive_nav import replay
+from interactive_nav.pictures import replay
 from interactive_nav_common.errors import ConfigError, UserError
 from train.config import EnvConfig
 from train.evaluate import LEARNED, load_policy
-from train.policies import YARDSTICKS
-from train.rollout import episode_keys
-from train.run import config_to_play, make_env
-from train.run_folder import RunFolder, claim
+from train.runs.run import config_to_play, make_env
+from train.runs.run_folder import RunFolder, claim
+from train.scoring.policies import YARDSTICKS
+from train.scoring.rollout import episode_keys
 
 
 def replay_path(run: Path, policy: str, episode: int) -> Path:

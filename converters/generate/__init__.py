@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.generate.annotate import annotate_items
-from converters.generate.config import BuildingConfig, GenerationError
-from converters.generate.furnish import furnish_plan, no_place
-from converters.generate.instance import Instance
-from converters.generate.maps import floor_maps
-from converters.generate.plan import Plan, make_plan
-from converters.generate.scan import Scan, scan_building
-from converters.generate.texture import Atlas, make_atlas
-from converters.generate.write import LICENCE, write_cad, write_json, write_png, write_scan
+from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.design.furnish import furnish_plan, no_place
+from converters.generate.design.instance import Instance
+from converters.generate.design.maps import floor_maps
+from converters.generate.design.plan import Plan, make_plan
+from converters.generate.surface.annotate import annotate_items
+from converters.generate.surface.scan import Scan, scan_building
+from converters.generate.surface.texture import Atlas, make_atlas
+from converters.generate.surface.write import LICENCE, write_cad, write_json, write_png, write_scan
 from interactive_nav_common.files import part_folder, publish
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "design_building", "generate_building"]

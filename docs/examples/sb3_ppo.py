@@ -7,7 +7,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 
-from interactive_nav.sb3_env import SB3VecEnv
+from interactive_nav.interop.sb3_env import SB3VecEnv
 
 
 class Scores(BaseCallback):

@@ -8,7 +8,7 @@ import jax
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import ForceOptions, Physics, PhysicsState, StepSignals
-from interactive_nav.world import World
+from interactive_nav.scenes.world import World
 
 
 def resolve_backend(name: str) -> str:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import custom_batching
 
-from interactive_nav.contacts import combine
+from interactive_nav.scenes.contacts import combine
 
 TOUCH_FORCE_N = 1e-4
 """A body counts as touched when the robot's net force on it exceeds this in any substep."""
@@ -154,7 +154,7 @@ def summarise_forces(
     Args:
         force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
         xp: numpy or jax.numpy.
-        contacts: see `interactive_nav.contacts.combine`.
+        contacts: see `interactive_nav.scenes.contacts.combine`.
         options: what F_t is.
     """
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)

@@ -14,7 +14,6 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.config import NavConfig
-from interactive_nav.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
 from interactive_nav.physics.base import (
     PAPER_FORCE,
     ForceOptions,
@@ -24,10 +23,11 @@ from interactive_nav.physics.base import (
     summarise_forces,
     uncommitted,
 )
+from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.warp_callbacks import keep_collector_out
-from interactive_nav.world import Layout, World
+from interactive_nav.scenes.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
+from interactive_nav.scenes.world import Layout, World
 
 # Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,
 # contact matches; and the solver's iteration limit. A test compares them with the engine's.

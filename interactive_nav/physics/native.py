@@ -17,10 +17,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from interactive_nav.contacts import from_sensors, sensor_addresses
 from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.world import World
+from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
+from interactive_nav.scenes.world import World
 
 _ENGINE_FAILURES = (
     mujoco.mjtWarning.mjWARN_BADQPOS,

@@ -5,19 +5,19 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 
-from interactive_nav.robots.ant import ant
-from interactive_nav.robots.fetch import fetch
-from interactive_nav.robots.freight import freight
-from interactive_nav.robots.humanoid import humanoid
-from interactive_nav.robots.husky import husky
-from interactive_nav.robots.jackrabbot1 import jackrabbot1
-from interactive_nav.robots.jackrabbot2 import jackrabbot2
-from interactive_nav.robots.minitaur import minitaur
+from interactive_nav.robots.models.ant import ant
+from interactive_nav.robots.models.fetch import fetch
+from interactive_nav.robots.models.freight import freight
+from interactive_nav.robots.models.humanoid import humanoid
+from interactive_nav.robots.models.husky import husky
+from interactive_nav.robots.models.jackrabbot1 import jackrabbot1
+from interactive_nav.robots.models.jackrabbot2 import jackrabbot2
+from interactive_nav.robots.models.minitaur import minitaur
+from interactive_nav.robots.models.quadrotor import quadrotor
+from interactive_nav.robots.models.ttbot import ttbot
+from interactive_nav.robots.models.turtlebot import turtlebot
 from interactive_nav.robots.own import from_file
-from interactive_nav.robots.quadrotor import quadrotor
 from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.robots.ttbot import ttbot
-from interactive_nav.robots.turtlebot import turtlebot
 from interactive_nav_common.errors import ConfigError
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {

@@ -54,7 +54,7 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 
 def _print_evidence(names: tuple[str, ...], backend: str, console: Console) -> bool:
     """Prints each robot's checks as it is measured; whether all passed."""
-    from interactive_nav.robots.evidence import EVIDENCE, measure
+    from interactive_nav.robot_study.evidence import EVIDENCE, measure
 
     passed = True
     for k, name in enumerate(names):
@@ -75,8 +75,8 @@ def _print_evidence(names: tuple[str, ...], backend: str, console: Console) -> b
 
 
 def _draw_figure(names: tuple[str, ...], backend: str, path: Path) -> None:
-    from interactive_nav.robots.evidence import EVIDENCE, measure
-    from interactive_nav.robots.picture import save_figure
+    from interactive_nav.robot_study.evidence import EVIDENCE, measure
+    from interactive_nav.robot_study.picture import save_figure
 
     save_figure({n: measure(n, backend) if get_robot(n).kind in EVIDENCE else None for n in names}, path)
 
@@ -107,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
             return 0
         _print_table(names, console)
         if args.render:
-            from interactive_nav.robots.picture import save_pictures
+            from interactive_nav.robot_study.picture import save_pictures
 
             for path in save_pictures(names, args.render):
                 console.print(f"wrote {path}")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from topological_nav.__main__ import parser
-from topological_nav.adapt_config import AdaptConfig
+from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import (
     DataConfig,
     DriveConfig,

@@ -15,10 +15,11 @@ import pytest
 import trimesh
 from PIL import Image
 
-from converters import decompose, pipeline
+from converters import pipeline
 from converters.__main__ import main
-from converters.errors import SceneRejected, StageFailed
+from converters.bodies import decompose
 from converters.pipeline import ConvertConfig, convert
+from converters.records.errors import SceneRejected, StageFailed
 from interactive_nav_common.errors import FileError
 from scenes_mjcf.schema import load_manifest
 from tests.converters import tiny_raw
@@ -262,7 +263,7 @@ def test_of_two_conversions_into_one_folder_one_stands_whole(gibson_raw, tmp_pat
 
 
 def test_a_map_of_the_wrong_place_names_both_extents(gibson_raw):
-    from converters.gibson import read_gibson
+    from converters.read.gibson import read_gibson
 
     free = np.zeros((800, 800), np.uint8)
     free[:200, :200] = 255  # x and y from -4 to -2 m; the room is at 0 to 3

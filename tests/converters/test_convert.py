@@ -18,11 +18,12 @@ import pytest
 from PIL import Image
 
 from converters.__main__ import main
-from converters.errors import SceneRejected
-from converters.gates import LIMITS, Limit
-from converters.objects import rotation_of
+from converters.check.gates import LIMITS
+from converters.check.settle import settle
+from converters.geometry.boxes import rotation_of
 from converters.pipeline import STAGES, ConvertConfig, convert
-from converters.settle import settle
+from converters.records.errors import SceneRejected
+from converters.records.gate import Limit
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_stale
 from scenes_mjcf.schema import load_manifest, load_maps
@@ -176,7 +177,7 @@ def test_auto_align_adds_the_object_that_nobody_annotated(gibson_raw, tmp_path, 
 
 def test_convert_exits_one_when_a_gate_fails_and_keeps_the_scene(pristine, tmp_path, hull_cache, monkeypatch, capsys):
     monkeypatch.setitem(LIMITS, "walls", Limit("count", most=0))
-    monkeypatch.setattr("converters.gates.free_space_warnings", lambda maps: ("a room is cut off",))
+    monkeypatch.setattr("converters.check.gates.free_space_warnings", lambda maps: ("a room is cut off",))
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
     assert main(["convert", str(pristine / "gibson"), str(tmp_path / "out")]) == 1
     printed = capsys.readouterr().out

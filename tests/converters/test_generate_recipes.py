@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 import shapely
 
+from converters import recipes
 from converters.__main__ import main
-from converters.generate import Building, GenerationError, design_building, recipes
-from converters.generate.cad import TEST_MODELS, TRAIN_MODELS
-from converters.generate.doors import wall_behind_m
-from converters.generate.furnish import SIDE_WALL_M
-from converters.generate.maps import clearance
-from converters.generate.recipes import load_recipes, make_scenes, parse_recipes
-from converters.generate.space import GRID_M, passes, room_mask, static_grid, without
+from converters.generate import Building, GenerationError, design_building
+from converters.generate.design.doors import wall_behind_m
+from converters.generate.design.furnish import SIDE_WALL_M
+from converters.generate.design.maps import clearance
+from converters.generate.design.space import GRID_M, passes, room_mask, static_grid, without
+from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
+from converters.recipes import load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.errors import FileError
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"

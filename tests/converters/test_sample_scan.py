@@ -8,12 +8,12 @@ import mujoco
 import pytest
 
 from benchmarks.cracks import fill, measure
-from converters.gates import check_folder
-from converters.join import border_edges
+from converters.check.gates import check_folder
+from converters.fill.join import border_edges
 from converters.pipeline import ConvertConfig, convert
-from converters.proposals import bounds, box_iou, propose_instances
-from converters.propose import annotated_vertices
-from converters.scan2cad import read_scan2cad
+from converters.propose.proposals import bounds, box_iou, propose_instances
+from converters.propose.report import annotated_vertices
+from converters.read.scan2cad import read_scan2cad
 from scenes_mjcf.schema import load_maps
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]

@@ -12,10 +12,10 @@ import trimesh
 from PIL import Image
 
 from converters.__main__ import main
-from converters.errors import SceneRejected
-from converters.files import SourceFolder
+from converters.read.files import SourceFolder
+from converters.read.urdf import convex_pieces, merge_pieces, read_urdf
+from converters.records.errors import SceneRejected
 from converters.single_object import ObjectConfig, convert_object, guess_category
-from converters.urdf import convex_pieces, merge_pieces, read_urdf
 
 BOX = (0.3, 0.2, 0.1)
 URDF = """<robot name="{name}"><link name="base">

@@ -14,7 +14,7 @@ import pytest
 import interactive_nav
 from interactive_nav import episodes
 from interactive_nav.episodes import EpisodeFileError
-from interactive_nav.scene import load_scene
+from interactive_nav.scenes.scene import load_scene
 from scenes_mjcf.schema import load_maps, save_maps
 
 

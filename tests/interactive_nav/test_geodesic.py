@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.navigation_tables import RADIUS_M, fast_marching, random_points, random_room, reference, scene_tables
-from interactive_nav import geodesic, navigation
-from interactive_nav.tables import navigation_tables
+from interactive_nav import geodesic
+from interactive_nav.navigation import lookup
+from interactive_nav.navigation.tables import navigation_tables
 from interactive_nav.types import SceneTables
 
 
@@ -125,8 +126,8 @@ SCENE = jnp.asarray(0)
 
 @jax.jit
 def distances(tables, goal, xy):
-    field = navigation.goal_field(tables, SCENE, goal)
-    return jax.vmap(lambda p: navigation.geodesic_at(tables, SCENE, field, p))(xy)
+    field = lookup.goal_field(tables, SCENE, goal)
+    return jax.vmap(lambda p: lookup.geodesic_at(tables, SCENE, field, p))(xy)
 
 
 @settings(max_examples=10, deadline=None)
@@ -213,8 +214,8 @@ def test_waypoints_lie_on_the_descent_of_a_fast_marching_field(seed):
     tables, xy, goal = solved(seed)
     pytest.importorskip("skfmm", reason="scikit-fmm could not be built here")
     want = fast_marching(random_room(seed), goal)
-    field = navigation.goal_field(tables, SCENE, jnp.asarray(goal))
-    waypoints = jax.jit(lambda p: navigation.waypoints_at(tables, SCENE, field, p, 10, 0.2))
+    field = lookup.goal_field(tables, SCENE, jnp.asarray(goal))
+    waypoints = jax.jit(lambda p: lookup.waypoints_at(tables, SCENE, field, p, 10, 0.2))
     far = xy[np.linalg.norm(xy - goal, axis=-1) > 2.3]
     compared = 0
     for start in far[:: max(len(far) // 4, 1)]:
@@ -236,8 +237,8 @@ def test_waypoints_repeat_the_goal_at_the_end():
     graph = geodesic.corner_graph(np.ones((40, 60), bool), 0.05, 0.1, (0.0, 0.0))
     tables = tables_of(graph)
     goal = jnp.asarray([1.5, 1.0])
-    field = navigation.goal_field(tables, SCENE, goal)
-    got = navigation.waypoints_at(tables, SCENE, field, jnp.asarray([1.0, 1.0]), 5, 0.2)
+    field = lookup.goal_field(tables, SCENE, goal)
+    got = lookup.waypoints_at(tables, SCENE, field, jnp.asarray([1.0, 1.0]), 5, 0.2)
     np.testing.assert_allclose(got, [[1.2, 1.0], [1.4, 1.0], [1.5, 1.0], [1.5, 1.0], [1.5, 1.0]], atol=1e-5)
 
 
@@ -246,8 +247,8 @@ def test_grid_waypoints_start_at_the_own_cell_and_skip_every_second_node():
     tables = tables_of(graph)
 
     def points(xy, goal):
-        field = navigation.goal_field(tables, SCENE, jnp.asarray(goal))
-        return np.asarray(navigation.grid_waypoints_at(tables, SCENE, field, jnp.asarray(xy), 5, 0.2))
+        field = lookup.goal_field(tables, SCENE, jnp.asarray(goal))
+        return np.asarray(lookup.grid_waypoints_at(tables, SCENE, field, jnp.asarray(xy), 5, 0.2))
 
     # Along x: own cell's centre first, then every 0.2 m; along a diagonal every 0.283 m; the goal at the end.
     np.testing.assert_allclose(points([0.52, 1.03], [2.55, 1.05])[:, 0], [0.55, 0.75, 0.95, 1.15, 1.35], atol=1e-5)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from interactive_nav import view
-from interactive_nav.objects import pick
 from interactive_nav.robots import get_robot
-from interactive_nav.scene import load_scene
+from interactive_nav.scenes.objects import pick
+from interactive_nav.scenes.scene import load_scene
 
 
 def yes() -> bool:

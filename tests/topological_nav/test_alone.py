@@ -5,9 +5,9 @@ import os
 import pytest
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.locks import release, take_lock
+from interactive_nav_common.locks import alone_in, release, take_lock
 from topological_nav.__main__ import main
-from topological_nav.runs import alone_in, claimed
+from topological_nav.learn.runs import claimed
 
 
 def test_a_folder_in_use_is_refused_and_named(tmp_path):

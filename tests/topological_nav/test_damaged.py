@@ -7,14 +7,14 @@ import pytest
 
 from interactive_nav_common.errors import UserError
 from topological_nav.__main__ import main
-from topological_nav.data import load_plan
-from topological_nav.drives import _read as read_batch
-from topological_nav.driving import load_policy
-from topological_nav.graph import load_map
-from topological_nav.packaged import Choice, fitting_map
-from topological_nav.runs import claim
-from topological_nav.shards import read_shard
-from topological_nav.training import load_trained
+from topological_nav.data.dataset import load_plan
+from topological_nav.data.shards import read_shard
+from topological_nav.drives.dataset import _read as read_batch
+from topological_nav.drives.driving import load_policy
+from topological_nav.learn.runs import claim
+from topological_nav.learn.training import load_trained
+from topological_nav.maps.graph import load_map
+from topological_nav.weights.packaged import Choice, fitting_map
 
 
 def told_once(error) -> str:

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from interactive_nav.scene import load_scene
+from interactive_nav.scenes.scene import load_scene
 from topological_nav import __main__ as commands
-from topological_nav import build, rooms
 from topological_nav.__main__ import main
-from topological_nav.graph import load_map
-from topological_nav.localise import nearest_node
-from topological_nav.rendering import SceneRenderer
+from topological_nav.learn.localise import nearest_node
+from topological_nav.maps import build
+from topological_nav.maps.graph import load_map
 from topological_nav.ros.__main__ import main as nodes
+from topological_nav.scenes import rooms
+from topological_nav.scenes.rendering import SceneRenderer
 
 
 def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):

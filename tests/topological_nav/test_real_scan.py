@@ -7,7 +7,7 @@ import pytest
 
 from converters.pipeline import ConvertConfig, convert
 from topological_nav.__main__ import main
-from topological_nav.data import load_passages, load_rooms, read_header
+from topological_nav.data.dataset import load_passages, load_rooms, read_header
 
 pytestmark = [pytest.mark.data, pytest.mark.heavy]
 

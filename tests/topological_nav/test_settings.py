@@ -2,10 +2,10 @@
 
 import pytest
 
+from interactive_nav_common.config import to_dict
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig, TrainConfig, passage_config, room_config
 from topological_nav.settings import overlaid, overridden, settings_help
-from train.config_io import to_dict
 
 
 def test_words_are_read_by_the_types_of_the_settings():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from train.rows import write_parquet
+from interactive_nav_common.rows import write_parquet
 
 ALGORITHMS = ("ppo", "sac", "ddpg")
 K_INTS = (0.0, 0.1, 1.0)

@@ -9,10 +9,11 @@ import sys
 import pytest
 
 from interactive_nav.config import ORIGINAL_CODE
+from interactive_nav_common.config import field_docs
 from interactive_nav_common.errors import ConfigError
 from train import config_io
 from train.config import AUTO_PPO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
-from train.config_io import apply_overrides, field_docs, flatten, from_yaml, help_text, load, to_yaml
+from train.config_io import apply_overrides, flatten, from_yaml, help_text, load, to_yaml
 
 BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
 

@@ -12,15 +12,18 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from interactive_nav.env import EPISODE_METRICS
+from interactive_nav.task.env import EPISODE_METRICS
 from interactive_nav_common.errors import FileError
+from interactive_nav_common.rows import write_parquet
 from tests.train.toy_run import build_toy, toy_config
-from train import checkpoint, evaluate, figures, rollout
+from train import evaluate, figures
 from train.config import RunConfig
-from train.row_files import paths_beside
-from train.rows import score_table, write_parquet
-from train.run import train_run
-from train.run_folder import RunFolder
+from train.runs import checkpoint
+from train.runs.run import train_run
+from train.runs.run_folder import RunFolder
+from train.scoring import rollout
+from train.scoring.row_files import paths_beside
+from train.scoring.rows import score_table
 
 
 @pytest.fixture(scope="module")

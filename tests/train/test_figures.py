@@ -9,13 +9,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from interactive_nav_common.rows import write_parquet
 from tests.train.synthetic import paper_like, run_rows, write_results, yardstick_rows
 from train import figures
 from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
-from train.row_files import paths_beside
-from train.rows import write_parquet
-from train.statistics import claims
+from train.scoring.row_files import paths_beside
+from train.scoring.statistics import claims
 
 
 def xy(line) -> np.ndarray:

@@ -7,8 +7,8 @@ import pytest
 
 from interactive_nav.robots.gait import load_network, scripted_gait
 from interactive_nav.robots.spec import RobotState
-from train import ppo
 from train.gait import GaitCallbacks, GaitEnv, export, get_gait, main, train_config
+from train.learners import ppo
 
 N = 4
 

@@ -10,16 +10,17 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from interactive_nav import replay
+from interactive_nav.pictures import replay
+from interactive_nav_common.metrics_file import read_metrics
 from tests.toys import write_room
 from tests.train.toy_pixels import SMALL
 from tests.train.toy_run import UPDATE_STEPS, toy_config
-from train import checkpoint, evaluate
+from train import evaluate
 from train import replay as replay_program
 from train.__main__ import main
 from train.config import EnvConfig, TrainConfig
-from train.run import train_run
-from train.run_folder import read_metrics
+from train.runs import checkpoint
+from train.runs.run import train_run
 
 
 def best_steps(folder):

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import interactive_nav.record
-from interactive_nav import replay, topdown
+from interactive_nav import topdown
+from interactive_nav.pictures import replay
 from tests.train.toy_run import toy_config
 from train import record
 from train import replay as program
 from train.config import EnvConfig, resolve
-from train.run_folder import RunFolder
+from train.runs.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs import Env, State
 
-from interactive_nav.env import EPISODE_METRICS
 from interactive_nav.robots import get_robot
-from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav.task.env import EPISODE_METRICS
+from interactive_nav.task.wrappers import AutoResetEnv
 from scenes_mjcf.schema import SceneMaps
 
 WHEEL_RADIUS_M, TRACK_M, DT_S = 0.0352, 0.23, 0.1

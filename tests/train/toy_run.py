@@ -11,7 +11,7 @@ from rich.console import Console
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.config import EnvConfig, PPOConfig, RunConfig, TrainConfig
 from train.config_io import apply_overrides
-from train.run import FolderCallbacks, train_run
+from train.runs.run import FolderCallbacks, train_run
 
 UPDATE_STEPS = 16 * 2 * 8
 

@@ -113,8 +113,8 @@ def _add_journey(sub: argparse.ArgumentParser) -> None:
 
 
 def _journey(arguments: argparse.Namespace) -> Any:
-    from topological_nav.packaged import choose
     from topological_nav.ros.pilot import Journey
+    from topological_nav.weights.packaged import choose
 
     if arguments.map is None:
         raise UserError("--driver topological needs a map: --map PATH")

@@ -12,7 +12,7 @@ from interactive_nav_common.errors import UserError
 from topological_nav.ros.config import HeadingConfig
 
 if TYPE_CHECKING:
-    from interactive_nav.rendering.base import Lens
+    from interactive_nav.sensing.base import Lens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,7 @@ class HeadingDriver:
 
 
 class Pilot(Protocol):
-    """The navigator, with its memory: what `topological_nav.navigator.Pilot` is for a batch of one."""
+    """The navigator, with its memory: what `topological_nav.navigate.navigator.Pilot` is for a batch of one."""
 
     def step(
         self, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float

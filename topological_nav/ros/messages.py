@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pillow
 
-from interactive_nav.rendering.base import Lens
+from interactive_nav.sensing.base import Lens
 from interactive_nav_common.errors import UserError
 
 RGB = "rgb8"
@@ -141,7 +141,7 @@ def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
 def scan_fields(
     readings: np.ndarray, fov_deg: float, range_min_m: float, range_max_m: float, period_s: float
 ) -> dict[str, Any]:
-    """sensor_msgs/LaserScan of the lidar of `interactive_nav.sensors`.
+    """sensor_msgs/LaserScan of the lidar of `interactive_nav.sensing.sensors`.
 
     Args:
         readings: [n] in [0, 1]: distances over `range_max_m`, 1 where nothing is nearer; from right to left.

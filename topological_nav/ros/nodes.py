@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from interactive_nav.rendering.base import Lens
+from interactive_nav.sensing.base import Lens
 from topological_nav.ros import messages, topics
 from topological_nav.ros.debian import RosError
 from topological_nav.ros.drivers import Command, Driver, checked

@@ -11,15 +11,15 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from interactive_nav_common.errors import ConfigError
-from topological_nav.build import camera_of
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
-from topological_nav.data import lens_of
-from topological_nav.graph import load_map
-from topological_nav.navigator import Navigator, Pilot
+from topological_nav.data.dataset import lens_of
+from topological_nav.learn.training import load_trained
+from topological_nav.maps.build import camera_of
+from topological_nav.maps.graph import load_map
+from topological_nav.maps.sight import NetworkSight, PassagePolicy
+from topological_nav.navigate.navigator import Navigator, Pilot
 from topological_nav.ros.drivers import PilotDriver
 from topological_nav.ros.messages import seen_through
-from topological_nav.sight import NetworkSight, PassagePolicy
-from topological_nav.training import load_trained
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
     if journey.policy == PASSAGE_POLICY:
         policy = PassagePolicy(sight, config.passable, config.clear_m)
     else:
-        from topological_nav import driving
+        from topological_nav.drives import driving
 
         seeing = (journey.localiser, networks[0]), (journey.detector, networks[1])
         policy = driving.load_policy_beside(journey.policy, *seeing)

@@ -1,7 +1,7 @@
 """A scene and velocity commands in, what a robot's sensors tell out; without ROS.
 
-TTbot on C MuJoCo (`native`), its lidar and odometry from `interactive_nav.sensors`, its pictures from
-`interactive_nav.rendering.camera`. The odometry's frame is the start's; the heading is the world's, as a compass has
+TTbot on C MuJoCo (`native`), its lidar and odometry from `interactive_nav.sensing.sensors`, its pictures from
+`interactive_nav.pictures.camera`. The odometry's frame is the start's; the heading is the world's, as a compass has
 it.
 """
 
@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from interactive_nav.rendering.base import Lens
-from interactive_nav.rendering.camera import Camera
-from interactive_nav.sensors import LIDAR_NEAR_M
+from interactive_nav.pictures.camera import Camera
+from interactive_nav.sensing.base import Lens
+from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
-from topological_nav.rendering import need_engine, shrink
 from topological_nav.ros.config import SimulatorConfig
-from topological_nav.space import free_space
+from topological_nav.scenes.rendering import need_engine, shrink
+from topological_nav.scenes.space import free_space
 
 ROBOT = "ttbot"
 LIDAR_POS_M = (0.17, 0.0, 0.36)

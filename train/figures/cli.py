@@ -15,15 +15,15 @@ import pyarrow as pa
 
 from interactive_nav_common.errors import FileError, UserError
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, read_metrics
+from interactive_nav_common.rows import read_rows
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
 from train.figures.frontier import frontier
 from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
-from train.rows import read_rows
-from train.run_folder import METRICS, PACKED_METRICS, read_metrics
-from train.statistics import run_means
+from train.scoring.statistics import run_means
 
 import matplotlib.pyplot as plt  # isort: skip
 from matplotlib.figure import Figure  # isort: skip

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
+from interactive_nav_common.statistics import estimate
 from train.figures import style
-from train.statistics import estimate
 
 CURVES = (
     ("episode/success", "success"),

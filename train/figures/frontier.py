@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from interactive_nav_common.statistics import interval
 from train.figures.style import policy_colour
-from train.rows import interval
 
 
 def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:

@@ -13,9 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from interactive_nav_common.statistics import estimate, p_text
 from train.figures import style
 from train.figures.frontier import equal_ins
-from train.statistics import RunMean, cells, correlation, estimate, p_text, run_means, seen_unseen
+from train.scoring.statistics import RunMean, cells, correlation, run_means, seen_unseen
 
 ALPHAS = np.linspace(0.0, 1.0, 11)
 DOTS = 3000

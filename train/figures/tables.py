@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from interactive_nav_common.statistics import estimate, interval
 from train.figures import style
-from train.rows import interval
-from train.statistics import cells, claims, estimate, run_means
+from train.scoring.statistics import cells, claims, run_means
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")

@@ -11,8 +11,8 @@ from rich.console import Console
 
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.signals import stop_signals
-from train.policy_file import STEP
-from train.run_folder import claim
+from train.runs.policy_file import STEP
+from train.runs.run_folder import claim
 from train.sweep import spec
 from train.sweep.devices import Machine, find_gpus
 from train.sweep.folder import SweepFolder

@@ -14,13 +14,14 @@ import pyarrow as pa
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
-from train import checkpoint
+from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, read_metrics, write_metrics
+from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from train.errors import CheckpointError
-from train.policy_file import STEP
-from train.row_files import files_of_run, paths_beside
-from train.rows import read_notes, read_rows, write_parquet
-from train.run_folder import METRICS, PACKED_METRICS, RunFolder, read_metrics, write_metrics
-from train.statistics import run_means
+from train.runs import checkpoint
+from train.runs.policy_file import STEP
+from train.runs.run_folder import RunFolder
+from train.scoring.row_files import files_of_run, paths_beside
+from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
 
@@ -37,7 +38,7 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
     Args:
         folder: of the sweep.
         out: `<out>/rows/episodes.parquet`, `<out>/rows/_paths` and `<out>/runs` are written.
-        step: to which the kept policies' weights are rounded, see `train.policy_file`.
+        step: to which the kept policies' weights are rounded, see `train.runs.policy_file`.
 
     Returns:
         Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5

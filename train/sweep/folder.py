@@ -21,10 +21,10 @@ from typing import Any
 
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import is_locked
+from interactive_nav_common.rows import read_notes
 from train.config_io import to_yaml
-from train.row_files import EvaluationAsked, files_of_run, paths_beside
-from train.rows import read_notes
-from train.run_folder import RunFolder
+from train.runs.run_folder import RunFolder
+from train.scoring.row_files import EvaluationAsked, files_of_run, paths_beside
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
 
 TAIL_BYTES = 1 << 16

@@ -15,8 +15,8 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.scene import load_scene
-from interactive_nav.world import World, build_world
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import World, build_world
 from tests.toys import write_room
 
 DT_S = 0.1

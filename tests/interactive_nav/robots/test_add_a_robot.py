@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from interactive_nav import robots
-from interactive_nav.robots import evidence
-from interactive_nav.robots.picture import stage
+from interactive_nav.robot_study import evidence
+from interactive_nav.robot_study.picture import stage
 from tests.toys import write_room
 
 DOC = Path(__file__).parents[3] / "docs" / "add-a-robot.md"

@@ -3,7 +3,8 @@
 import jax
 import pytest
 
-from interactive_nav.robots import evidence, robot_names
+from interactive_nav.robot_study import evidence
+from interactive_nav.robots import robot_names
 
 pytestmark = [pytest.mark.gpu, pytest.mark.heavy]
 

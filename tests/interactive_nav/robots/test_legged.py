@@ -30,7 +30,7 @@ NOTHING = RobotState(None, None, None)
 
 
 def gait_of(name: str) -> Gait:
-    return importlib.import_module(f"interactive_nav.robots.{name}").GAIT
+    return importlib.import_module(f"interactive_nav.robots.models.{name}").GAIT
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 
 import interactive_nav
 from tests.toys import write_room
-from train.policies import make_follower
+from train.scoring.policies import make_follower
 
 
 @pytest.fixture(scope="module")

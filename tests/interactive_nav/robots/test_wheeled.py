@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig
-from interactive_nav.robots import evidence, get_robot, robot_names
+from interactive_nav.robot_study import evidence
+from interactive_nav.robot_study.picture import picture, stage
+from interactive_nav.robots import get_robot, robot_names
 from interactive_nav.robots.__main__ import main
 from interactive_nav.robots.build import half_extents
-from interactive_nav.robots.picture import picture, stage
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.world import build_world
+from interactive_nav.scenes.world import build_world
 
 WHEELED = tuple(name for name in robot_names() if get_robot(name).kind == "wheeled")
 SKID = ("husky", "ttbot")

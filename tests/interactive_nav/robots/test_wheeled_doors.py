@@ -7,9 +7,10 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robots import evidence, get_robot
-from interactive_nav.scene import Hinge, Movable
-from interactive_nav.world import build_world
+from interactive_nav.robot_study import evidence
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import Hinge, Movable
+from interactive_nav.scenes.world import build_world
 
 LEAF_M, THICK_M, TALL_M, MASS_KG = 0.8, 0.04, 1.2, 8.0
 BAR_Y_M, BAR_OUT_M, BAR_HALF_M = 0.7, 0.08, 0.0125

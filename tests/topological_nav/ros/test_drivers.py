@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from interactive_nav.rendering.base import Lens
+from interactive_nav.sensing.base import Lens
 from interactive_nav_common.errors import UserError
 from topological_nav.ros.config import HeadingConfig
 from topological_nav.ros.drivers import Command, HeadingDriver, PilotDriver, checked

@@ -8,12 +8,12 @@ from PIL import Image
 
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import NavigatorConfig
-from topological_nav.data import load_rooms
-from topological_nav.graph import load_map
+from topological_nav.data.dataset import load_rooms
+from topological_nav.learn.training import load_trained
+from topological_nav.maps.graph import load_map
 from topological_nav.ros.__main__ import DRIVERS, main
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.ros.pilot import Journey, goal_words, topological_driver
-from topological_nav.training import load_trained
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from interactive_nav_common.files import whole_file
-from train.row_files import EvaluationAsked
+from train.scoring.row_files import EvaluationAsked
 
 
 def fates(run: Path) -> dict[str, list[str]]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import yaml
 
+from interactive_nav_common.rows import read_rows
 from tests.toys import write_room
 from train import figures
-from train.rows import read_rows
 from train.sweep.__main__ import main
 
 pytestmark = pytest.mark.slow

@@ -8,12 +8,12 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
+from interactive_nav_common.metrics_file import PACKED_METRICS, read_metrics
+from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from tests.train.sweep.test_sweep import write_sweep
 from tests.train.synthetic import run_rows
-from train import checkpoint
-from train.row_files import paths_beside
-from train.rows import read_notes, read_rows, write_parquet
-from train.run_folder import PACKED_METRICS, read_metrics
+from train.runs import checkpoint
+from train.scoring.row_files import paths_beside
 from train.sweep import export as export_module
 from train.sweep import spec
 from train.sweep.__main__ import main

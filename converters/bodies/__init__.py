@@ -1,0 +1,1 @@
+"""Aligned CAD models in, movable bodies out: poses, hulls, masses."""

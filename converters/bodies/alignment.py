@@ -1,0 +1,417 @@
+"""Keypoint pairs and annotated poses in, upright placements and their residuals out.
+
+The seven free parameters (three scales, three translations, yaw; roll and pitch fixed) are those of the
+original annotation (Interactive Gibson, section III-B).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.stats import f as f_distribution
+
+from converters.geometry.rotations import wrap_angle, yaw_matrix
+from converters.records.raw import Annotation
+from interactive_nav_common.errors import UserError
+
+MIN_POINTS = 6
+"""The annotators' rule (section III-B): eighteen equations for seven unknowns, so that one can be thrown out."""
+MIN_SPREAD = 0.01
+"""Least spread of the keypoints in a direction, as a share of the largest: below it the scale there is noise."""
+PAIRS_PER_OUTLIER = 8
+"""At most one gross outlier in so many pairs (rounded up) is thrown out."""
+OUTLIER_P = 1e-3
+"""Chance of throwing out a sound pair, all pairs taken together, where errors are Gaussian."""
+LYING_DEG = 15.0
+"""Annotated tilt from which a scene's report says that the object was stood upright."""
+MAX_SUBSETS = 3000
+"""Up to so many ways to leave pairs out are all tried; beyond, `RANDOM_STARTS` random ones are refined."""
+RANDOM_STARTS = 200
+
+SYMMETRY_PERIOD_RAD = {
+    "__SYM_NONE": 2 * math.pi,
+    "__SYM_ROTATE_UP_2": math.pi,
+    "__SYM_ROTATE_UP_4": math.pi / 2,
+    "__SYM_ROTATE_UP_INF": 0.0,
+}
+"""Scan2CAD's `sym` word -> the turn about the vertical after which the model looks the same (0: any turn)."""
+
+
+class AlignmentError(UserError):
+    """Keypoints that do not determine the seven parameters; the message says why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Alignment:
+    """CAD frame (z up) -> scan frame: `Rz(yaw) @ diag(scale) @ p + translation`."""
+
+    scale: np.ndarray
+    """(3,) along the CAD model's own axes."""
+    translation: np.ndarray
+    """(3,) m."""
+    yaw: float
+    """rad, counter-clockwise seen from above."""
+    rms_m: float
+    """Root mean square point-to-point distance of the fit; nan where nothing was fitted."""
+
+
+def _check_spread(points: np.ndarray) -> None:
+    """Refuses keypoints that leave one of the seven parameters open.
+
+    Roll and pitch being fixed, height separates from the rest: the z scale needs extent along z, the two
+    horizontal scales and the yaw need points that do not lie on one line seen from above.
+
+    Raises:
+        AlignmentError: with the direction that is missing.
+    """
+    centred = points - points.mean(axis=0)
+    spread = np.sqrt((centred**2).mean(axis=0))
+    _, singular, axes = np.linalg.svd(centred, full_matrices=False)
+    largest = singular[0] / math.sqrt(len(points))
+    if largest < 1e-9:
+        raise AlignmentError("the keypoints coincide: no parameter but the translation is observable")
+    if singular[1] / math.sqrt(len(points)) < MIN_SPREAD * largest:
+        raise AlignmentError(
+            f"the keypoints are collinear (along {np.round(axes[0], 2).tolist()}): scales and yaw unobservable; "
+            "choose points off that line"
+        )
+    flat = np.flatnonzero(spread < MIN_SPREAD * largest)
+    if len(flat):
+        axis = "xyz"[flat[0]]
+        raise AlignmentError(
+            f"the keypoints have no extent along the model's {axis} axis: they are coplanar and the {axis} scale "
+            "is unobservable; choose points off that plane"
+        )
+    _, across, directions = np.linalg.svd(centred[:, :2], full_matrices=False)
+    if across[1] / math.sqrt(len(points)) < MIN_SPREAD * largest:
+        raise AlignmentError(
+            f"the keypoints lie in one upright plane (along {np.round(directions[0], 2).tolist()} seen from above): "
+            "the horizontal scales and the yaw cannot be told apart; choose points off that plane"
+        )
+
+
+def least_squares(
+    p: np.ndarray, q: np.ndarray, round_model: bool = False, weights: np.ndarray | None = None
+) -> Alignment:
+    """Least squares over all pairs, in closed form where all scales come out positive.
+
+    For a fixed yaw the best scales are one-dimensional regressions, and the explained variance left as a
+    function of (cos, sin) is a quadratic form: its leading eigenvector is the yaw. A mirrored optimum (a
+    negative scale) is refused; the best yaw with positive scales is then searched for.
+
+    Args:
+        p: (k, 3) CAD frame.
+        q: (k, 3) scan frame, m.
+        round_model: one scale for both horizontal axes (what is round stays round).
+        weights: (k,) of the squared distances, or None for equal ones.
+
+    Raises:
+        AlignmentError: degenerate or contradictory pairs.
+    """
+    _check_spread(p)
+    share = np.full(len(p), 1.0 / len(p)) if weights is None else weights / weights.sum()
+    p_mean, q_mean = share @ p, share @ q
+    root = np.sqrt(share)[:, None]
+    pc, qc = (p - p_mean) * root, (q - q_mean) * root
+    power = (pc**2).sum(axis=0)
+    (a, d), (b, e) = (qc[:, :2].T @ pc[:, :2]).tolist()
+    if round_model:
+        yaw = math.atan2(b - d, a + e)
+        both = math.hypot(b - d, a + e) / (power[0] + power[1])
+        horizontal = (both, both)
+    else:
+        form = np.array(
+            [
+                [a * a / power[0] + e * e / power[1], a * b / power[0] - d * e / power[1]],
+                [a * b / power[0] - d * e / power[1], b * b / power[0] + d * d / power[1]],
+            ]
+        )
+        c, s = np.linalg.eigh(form)[1][:, -1]
+        if c * a + s * b < 0:
+            c, s = -c, -s
+        yaw = math.atan2(s, c)
+        if c * a + s * b <= 0 or c * e - s * d <= 0:
+            yaw = _best_positive_yaw(a, b, d, e, power)
+        c, s = math.cos(yaw), math.sin(yaw)
+        horizontal = ((c * a + s * b) / power[0], (c * e - s * d) / power[1])
+    scale = np.array([*horizontal, (qc[:, 2] @ pc[:, 2]) / power[2]])
+    if (scale <= 0).any():
+        raise AlignmentError("the best fit mirrors the model: the keypoint pairs contradict each other")
+    turn = yaw_matrix(yaw)
+    translation = q_mean - turn @ (scale * p_mean)
+    residual = p * scale @ turn.T + translation - q
+    return Alignment(scale, translation, yaw, float(np.sqrt(share @ (residual**2).sum(axis=1))))
+
+
+def apply_alignment(found: Alignment, points: np.ndarray) -> np.ndarray:
+    """(n, 3) points of the CAD frame moved to the scan frame."""
+    return points * found.scale @ yaw_matrix(found.yaw).T + found.translation
+
+
+def _squared(found: Alignment, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return ((apply_alignment(found, p) - q) ** 2).sum(axis=1)
+
+
+def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -> tuple[np.ndarray, Alignment] | None:
+    """The fit of least residual over the pairs that stay when `count` are left out (least trimmed squares).
+
+    All choices are tried where they are few; else random starts are refined until the pairs that stay are those
+    of least residual (Rousseeuw and Van Driessen 1999, C-steps).
+    """
+    k = len(p)
+    best: tuple[np.ndarray, Alignment] | None = None
+
+    def offer(keep: np.ndarray) -> Alignment | None:
+        nonlocal best
+        try:
+            found = least_squares(p[keep], q[keep], round_model)
+        except AlignmentError:
+            return None
+        if best is None or found.rms_m < best[1].rms_m:
+            best = (keep, found)
+        return found
+
+    if math.comb(k, count) <= MAX_SUBSETS:
+        for left_out in itertools.combinations(range(k), count):
+            offer(np.delete(np.arange(k), left_out))
+        return best
+    rng = np.random.default_rng(0)
+    for _ in range(RANDOM_STARTS):
+        keep = np.sort(rng.choice(k, 5, replace=False))
+        for _ in range(20):
+            found = offer(keep) if len(keep) == k - count else None
+            if found is None:
+                try:
+                    found = least_squares(p[keep], q[keep], round_model)
+                except AlignmentError:
+                    break
+            closest = np.sort(np.argsort(_squared(found, p, q), kind="stable")[: k - count])
+            if np.array_equal(closest, keep):
+                break
+            keep = closest
+    return best
+
+
+def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
+    """(k,) bool: pairs that are no gross outliers.
+
+    Leaving pairs out always lowers the residual. They count as outliers where it falls by more than chance
+    allows: an F test of the fit with against the fit without them, at `OUTLIER_P` shared among the choices.
+    """
+    k = len(p)
+    every = np.ones(k, bool)
+    try:
+        full = (_squared(least_squares(p, q, round_model), p, q)).sum()
+    except AlignmentError:
+        full = math.inf  # a gross outlier can mirror the fit of all pairs
+    for count in range(math.ceil(k / PAIRS_PER_OUTLIER), 0, -1):
+        freedom = 3 * (k - count) - 7
+        best = _best_without(p, q, count, round_model) if freedom > 0 else None
+        if best is None:
+            continue
+        keep, found = best
+        rest = found.rms_m**2 * len(keep)
+        if rest < 1e-18 * max(float((q - q.mean(axis=0)).var()), 1e-12) * k:
+            rest = 1e-18  # exact pairs: only the rounding is left
+        limit = float(f_distribution.isf(OUTLIER_P / math.comb(k, count), 3 * count, freedom))
+        off = np.delete(np.arange(k), keep)
+        single = float(f_distribution.isf(OUTLIER_P / k, 3, freedom)) * 3 * rest / freedom
+        each_far = (_squared(found, p[off], q[off]) > single).all()
+        if each_far and (full - rest) / (3 * count) > limit * rest / freedom:
+            every[off] = False
+            return every
+    return every
+
+
+def _canonical(found: Alignment, period: float) -> Alignment:
+    """The equivalent pose whose yaw is the smallest; a quarter turn swaps the horizontal scales."""
+    if not period or period >= 2 * math.pi - 1e-9:
+        return dataclasses.replace(found, yaw=wrap_angle(found.yaw))
+    yaw = wrap_angle(found.yaw, period)
+    swapped = round((found.yaw - yaw) / (math.pi / 2)) % 2 == 1
+    scale = found.scale[[1, 0, 2]] if swapped else found.scale
+    return dataclasses.replace(found, scale=scale, yaw=yaw)
+
+
+def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> Alignment:
+    """Scales, translation and yaw of least squared point-to-point distance, without gross outliers.
+
+    Robust to one gross outlier in eight pairs (see `_inliers`); `rms_m` is over the pairs that were kept.
+
+    A model with a rotational symmetry may be clicked on any of its equivalent points: each pair then takes the
+    equivalent CAD point that fits, and the pose is the equivalent one of smallest yaw. The axis of symmetry is
+    the CAD frame's z axis, as in ShapeNet. A round model (`__SYM_ROTATE_UP_INF`) keeps one horizontal scale.
+
+    Args:
+        cad_points: (k, 3) in a z-up CAD frame, unscaled, k >= 6.
+        scan_points: (k, 3) in the scan frame, m, row by row the same physical points.
+        symmetry: Scan2CAD's word, a key of `SYMMETRY_PERIOD_RAD`.
+
+    Raises:
+        AlignmentError: fewer than six pairs, numbers that are not finite, keypoints that leave a parameter open
+            (collinear, coplanar), pairs that contradict each other, or an unknown symmetry.
+    """
+    p, q = np.asarray(cad_points, float), np.asarray(scan_points, float)
+    if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
+        raise AlignmentError(f"keypoints have shapes {p.shape} and {q.shape}, expected two equal (k, 3) arrays")
+    if symmetry not in SYMMETRY_PERIOD_RAD:
+        raise AlignmentError(f"symmetry is '{symmetry}', expected one of {', '.join(SYMMETRY_PERIOD_RAD)}")
+    if len(p) < MIN_POINTS:
+        raise AlignmentError(f"{len(p)} keypoint pairs, expected at least {MIN_POINTS}; click more points")
+    if not (np.isfinite(p).all() and np.isfinite(q).all()):
+        raise AlignmentError("a keypoint is not a finite number, expected coordinates in metres")
+    period = SYMMETRY_PERIOD_RAD[symmetry]
+    round_model = period == 0.0
+    folds = 1 if round_model else round(2 * math.pi / period)
+    best = _robust_fit(p, q, round_model)
+    if folds > 1:
+        best = _fit_equivalents(p, q, best, folds)
+    return _canonical(best, period)
+
+
+def gross_outliers(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> np.ndarray:
+    """(k,) bool: the pairs that `solve_alignment` leaves out (same arguments)."""
+    found = solve_alignment(cad_points, scan_points, symmetry)
+    p, period = np.asarray(cad_points, float), SYMMETRY_PERIOD_RAD[symmetry]
+    if period and period < 6:
+        p = _equivalents(p, np.asarray(scan_points, float), found, round(2 * math.pi / period))
+    return ~_inliers(p, np.asarray(scan_points, float), period == 0.0)
+
+
+def _robust_fit(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment:
+    _check_spread(p)
+    keep = _inliers(p, q, round_model)
+    return least_squares(p[keep], q[keep], round_model)
+
+
+def _equivalents(p: np.ndarray, q: np.ndarray, found: Alignment, folds: int) -> np.ndarray:
+    """(k, 3) of each CAD point's `folds` images under the symmetry the one that the fit brings closest."""
+    images = np.stack([p @ yaw_matrix(2 * math.pi * i / folds).T for i in range(folds)])
+    distance = np.stack([_squared(found, image, q) for image in images])
+    return images[np.argmin(distance, axis=0), np.arange(len(p))]
+
+
+def _fit_equivalents(p: np.ndarray, q: np.ndarray, first: Alignment, folds: int) -> Alignment:
+    """Alternates between choosing equivalent CAD points and fitting, while the residual falls."""
+    best, images = first, p
+    for _ in range(10):
+        images = _equivalents(p, q, best, folds)
+        try:
+            found = _robust_fit(images, q, False)
+        except AlignmentError:
+            break
+        if found.rms_m >= best.rms_m - 1e-12:
+            break
+        best = found
+    return best
+
+
+def _best_positive_yaw(a: float, b: float, d: float, e: float, power: np.ndarray) -> float:
+    """Yaw of least residual among those with two positive horizontal scales."""
+
+    def unexplained(yaw: float) -> float:
+        c, s = math.cos(yaw), math.sin(yaw)
+        return -(max(c * a + s * b, 0.0) ** 2 / power[0] + max(c * e - s * d, 0.0) ** 2 / power[1])
+
+    step = math.radians(1.0)
+    start = min(np.arange(-math.pi, math.pi, step), key=unexplained)
+    found = minimize_scalar(unexplained, bounds=(start - step, start + step), method="bounded")
+    return wrap_angle(float(getattr(found, "x")))  # noqa: B009 (scipy's result has no static fields)
+
+
+def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
+    """Takes the small roll and pitch out of an annotated pose, turning about the object's own middle.
+
+    Args:
+        pose: (4, 4) CAD frame -> scan frame, with scale.
+        pivot_cad: (3,) point of the CAD frame that keeps its place (the middle of the bounding box).
+
+    Returns:
+        The upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
+    """
+    scale = np.linalg.norm(pose[:3, :3], axis=0)
+    turn = pose[:3, :3] / scale
+    yaw = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    place = pose[:3, :3] @ pivot_cad + pose[:3, 3]
+    translation = place - yaw_matrix(yaw) @ (scale * pivot_cad)
+    tilt = math.acos(float(np.clip(turn[2, 2], -1.0, 1.0)))
+    return Alignment(scale, translation, yaw, math.nan), tilt
+
+
+def compare(
+    annotation: Annotation, placed: Alignment, tilt_rad: float, pivot_cad: np.ndarray, name: str
+) -> dict[str, Any]:
+    """One row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
+
+    Args:
+        annotation: with its keypoints.
+        placed: the annotated pose, upright: the one that the scene uses.
+        tilt_rad: what `upright` removed.
+        pivot_cad: (3,) where the two poses' translations are compared.
+        name: body name.
+    """
+    row: dict[str, Any] = {
+        "name": name,
+        "cad_id": annotation.cad_id,
+        "n_keypoints": len(annotation.keypoints_cad),
+        "symmetry": annotation.symmetry,
+        "tilt_removed_deg": round(math.degrees(tilt_rad), 3),
+    }
+    if tilt_rad > math.radians(LYING_DEG):
+        degrees = math.degrees(tilt_rad)
+        row["note"] = f"annotated {degrees:.0f} degrees off the vertical; placed upright, yaw is the only rotation"
+    if len(annotation.keypoints_cad):
+        at = annotation.keypoints_cad @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+        distance2 = ((at - annotation.keypoints_scan) ** 2).sum(axis=1)
+        row["annotated_rms_m"] = round(float(np.sqrt(distance2.mean())), 5)
+    try:
+        solved = solve_alignment(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
+        outliers = gross_outliers(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
+    except AlignmentError as error:
+        return row | {"solved": False, "reason": str(error)}
+    difference = pose_difference(solved, placed, pivot_cad, annotation.symmetry)
+    return row | {
+        "solved": True,
+        "n_outliers": int(outliers.sum()),
+        "rms_m": round(solved.rms_m, 5),
+        "translation_difference_m": round(difference.translation_m, 5),
+        "yaw_difference_deg": round(math.degrees(difference.yaw_rad), 3),
+        "scale_ratio": [round(float(v), 4) for v in difference.scale_ratio],
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseDifference:
+    """How far one pose of a model is from another, modulo the model's symmetry."""
+
+    translation_m: float
+    yaw_rad: float
+    """In [0, pi]."""
+    scale_ratio: np.ndarray
+    """(3,) first / second along the second's axes."""
+
+
+def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, symmetry: str) -> PoseDifference:
+    """Compares two poses of the same model at the pivot; turns that the symmetry allows do not count.
+
+    Args:
+        one: the pose in question.
+        other: the reference.
+        pivot_cad: (3,) point of the CAD frame where translations are compared.
+        symmetry: Scan2CAD's word; unknown words count as none.
+    """
+    period = SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
+    at = [apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
+    yaw = abs(wrap_angle(one.yaw - other.yaw, period)) if period else 0.0
+    quarter_turns = (
+        round((wrap_angle(one.yaw - other.yaw) - wrap_angle(one.yaw - other.yaw, period)) / (math.pi / 2))
+        if period
+        else 0
+    )
+    scale = one.scale[[1, 0, 2]] if quarter_turns % 2 else one.scale
+    return PoseDifference(float(np.linalg.norm(at[0] - at[1])), yaw, scale / other.scale)

@@ -1,0 +1,131 @@
+"""CAD models, hulls and upright poses in, `PlacedObject` records out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from converters.bodies.alignment import Alignment
+from converters.geometry.boxes import Box, Hull, convex_hull, fit_box, rotation_of
+from converters.geometry.rotations import yaw_matrix
+from converters.records.raw import Annotation, CadModel
+
+FOOT_M = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyHinge:
+    """A vertical hinge in the body frame."""
+
+    origin_b: np.ndarray
+    """(3,) m."""
+    range_rad: tuple[float, float]
+    """Counter-clockwise seen from above; 0 is the pose as scanned."""
+    assumed: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class PlacedObject:
+    """One movable object. Body frame: origin at the middle of the base, z up."""
+
+    name: str
+    category: str
+    cad_id: str
+    vertices_b: np.ndarray
+    """(n, 3) CAD surface, scaled, m."""
+    faces: np.ndarray
+    face_colours: np.ndarray
+    hulls_b: tuple[Hull, ...]
+    boxes_b: tuple[Box, ...]
+    """The oriented box of each hull, same order."""
+    position_w: np.ndarray
+    """(3,) m."""
+    quaternion_w: np.ndarray
+    """(4,) w x y z."""
+    hinge: BodyHinge | None
+
+
+def to_world(placed: PlacedObject, points_b: np.ndarray) -> np.ndarray:
+    """Moves (n, 3) points from the body frame to the world."""
+    return points_b @ rotation_of(placed.quaternion_w).T + placed.position_w
+
+
+def flatten_feet(hull: Hull) -> Hull:
+    """Cuts a hull at the body frame's z = 0 and brings what ends within `FOOT_M` above it down to it.
+
+    Decomposition works on voxels: hulls stand out of the model by some millimetres and feet come out of
+    unequal length; the object would rest tilted on its hulls and upright on its boxes.
+    """
+    points = hull.vertices * [1.0, 1.0, 1.0]
+    points[:, 2] = np.maximum(points[:, 2], 0.0)
+    feet = points[points[:, 2] < FOOT_M] * [1.0, 1.0, 0.0]
+    return convex_hull(np.vstack([points, feet]))
+
+
+def _door_hinge(annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray) -> BodyHinge:
+    """The door's hinge in the body frame; without an articulation, one at the leaf's edge is assumed."""
+    hinge = annotation.hinge
+    if hinge is None:
+        along = int(np.argmax(extent[:2]))
+        origin = np.zeros(3)
+        origin[along] = -extent[along] / 2
+        return BodyHinge(origin, (-math.pi / 2, math.pi / 2), True)
+    low, high = sorted(hinge.sign * v for v in hinge.range_rad)
+    origin = scale * hinge.origin - base_cad
+    origin[2] = 0.0
+    return BodyHinge(origin, (low, high), hinge.assumed)
+
+
+def place_object(
+    name: str,
+    annotation: Annotation,
+    cad: CadModel,
+    hulls_cad: tuple[Hull, ...],
+    pose: Alignment,
+    floor_height_m: float,
+    walls_yaw: float,
+) -> PlacedObject:
+    """Scales a CAD model and its hulls, moves the origin to the middle of the base and states the world pose.
+
+    Args:
+        name: body name.
+        annotation: of the object.
+        cad: its model, CAD frame.
+        hulls_cad: convex hulls, CAD frame, unscaled (a hull stays convex under any scale).
+        pose: upright, CAD frame -> scan frame.
+        floor_height_m: of the scan frame; the world's z is the scan's less this.
+        walls_yaw: main direction of the building, rad.
+    """
+    vertices = cad.vertices * pose.scale
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+    hulls = tuple(convex_hull(h.vertices * pose.scale - base) for h in hulls_cad)
+    hulls = tuple(flatten_feet(h) for h in hulls)
+    position = yaw_matrix(pose.yaw) @ base + pose.translation
+    position[2] -= floor_height_m
+    return PlacedObject(
+        name=name,
+        category=annotation.category,
+        cad_id=annotation.cad_id,
+        vertices_b=vertices - base,
+        faces=cad.faces,
+        face_colours=cad.face_colours,
+        hulls_b=hulls,
+        boxes_b=tuple(fit_box(h, 0.0, walls_yaw - pose.yaw) for h in hulls),
+        position_w=position,
+        quaternion_w=np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)]),
+        hinge=_door_hinge(annotation, pose.scale, base, high - low) if annotation.category == "door" else None,
+    )
+
+
+def name_objects(annotations: tuple[Annotation, ...]) -> tuple[str, ...]:
+    """Body names `<category>_<k>`, k counting from 0 inside its category in the annotation's order."""
+    count: dict[str, int] = {}
+    names = []
+    for annotation in annotations:
+        k = count.get(annotation.category, 0)
+        count[annotation.category] = k + 1
+        names.append(f"{annotation.category}_{k}")
+    return tuple(names)

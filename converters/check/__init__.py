@@ -1,0 +1,1 @@
+"""Does a scene hold: settling, gates, a picture of the conversion."""

@@ -1,0 +1,223 @@
+"""A scene's model, manifest and maps in; acceptance values against one table of limits out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist
+
+from converters.records.gate import Gate, Limit
+from converters.structure.maps import label_pieces
+from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+
+ROBOT_RADIUS_M = 0.18
+"""Free space is judged for a TurtleBot-sized disc."""
+START_GOAL_M = 1.0
+DRIFT_S = 5.0
+TIMESTEP_S = 0.02
+"""The environments' own physics timestep (`sim_dt_s`), for hulls and for boxes."""
+
+
+LIMITS: dict[str, Limit] = {
+    "compiles": Limit("bool", least=1, meaning="scene.xml compiles in MuJoCo"),
+    "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml"),
+    "finite": Limit("bool", least=1, meaning="no non-finite number in 5 s, no simulation started over"),
+    "drift_hulls": Limit("m", most=0.01, meaning="largest move in 5 s untouched, hulls at the environments' timestep"),
+    "drift_boxes": Limit("m", most=0.01, meaning="the same with boxes"),
+    "turn_hulls": Limit("deg", most=1.0, meaning="largest turn in 5 s untouched, hulls"),
+    "turn_boxes": Limit("deg", most=1.0, meaning="the same with boxes"),
+    "penetration_hulls": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, hulls"),
+    "penetration_boxes": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, boxes"),
+    "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),
+    "connected_share": Limit(
+        "share", least=0.8, meaning="of the free floor, what a disc of 0.18 m radius covers in one piece"
+    ),
+    "start_goal": Limit("m", least=START_GOAL_M, meaning="farthest two cells in that piece, straight line"),
+    "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
+    "hulls": Limit("count", most=400, meaning="hulls in all"),
+    "walls": Limit("count", most=200, meaning="wall boxes"),
+}
+
+
+def judge(name: str, value: float, warnings: tuple[str, ...] = ()) -> Gate:
+    """Holds a value against the table; a non-finite value fails."""
+    limit = LIMITS[name]
+    passed = math.isfinite(value)
+    passed = passed and (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
+    return Gate(name, float(value) if math.isfinite(value) else -1.0, passed, limit, warnings)
+
+
+def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
+    """Compiles a scene with the movables colliding by their hulls or by their boxes.
+
+    The switch is thrown in the spec: a compiled model's bounding-volume trees hold colliding geoms only, so
+    that setting `geom_contype` afterwards leaves contacts out.
+
+    Args:
+        spec: of a scene folder; changed in place.
+        shape: 'hull', 'box' or 'both'.
+    """
+    for geom in spec.geoms:
+        for kind in ("hull", "box"):
+            if f"_{kind}_" in geom.name:
+                geom.contype = geom.conaffinity = int(shape in (kind, "both"))
+    return spec.compile()
+
+
+def run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
+    """Steps for so long at the model's own timestep."""
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+
+
+def started_over(data: mujoco.MjData) -> bool:
+    """Whether MuJoCo met a bad position, velocity or acceleration.
+
+    It then starts the simulation over and only counts a warning: the state alone would look sound.
+    """
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    return any(data.warning[int(w)].number for w in bad)
+
+
+def movable_bodies(model: mujoco.MjModel) -> list[int]:
+    """Ids of the bodies that have a joint of their own."""
+    return [b for b in range(1, model.nbody) if model.body_jntnum[b] > 0]
+
+
+def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Largest penetration among the present contacts, m; 0 without any."""
+    return max([-float(c.dist) for c in data.contact[: data.ncon]], default=0.0) if data.ncon else 0.0
+
+
+def physical_values(model: mujoco.MjModel) -> dict[str, float]:
+    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    bodies = movable_bodies(model)
+    start_com, start_quat = data.xipos[bodies].copy(), data.xquat[bodies].copy()
+    start_pos, depth = data.xpos[bodies].copy(), deepest_contact(model, data)
+    run(model, data, DRIFT_S)
+    mujoco.mj_forward(model, data)
+    moved = np.maximum(
+        np.linalg.norm(data.xipos[bodies] - start_com, axis=1),
+        np.linalg.norm(data.xpos[bodies] - start_pos, axis=1),
+    )
+    cosine = np.abs((data.xquat[bodies] * start_quat).sum(axis=1))
+    return {
+        "drift": float(moved.max(initial=0.0)),
+        "turn": float(np.degrees(2 * np.arccos(np.clip(cosine, 0, 1))).max(initial=0.0)),
+        "penetration": max(depth, deepest_contact(model, data)),
+        "finite": float(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all() and not started_over(data)),
+    }
+
+
+def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
+    """Cells whose middle is at least the radius from all that is not traversable, map edge included."""
+    padded = np.pad(traversable, 1)
+    distance = ndimage.distance_transform_edt(padded)
+    assert isinstance(distance, np.ndarray)
+    # The transform measures to the middle of the nearest blocked cell; its edge is half a cell nearer.
+    return ((distance - 0.5) * resolution_m >= radius_m)[1:-1, 1:-1]
+
+
+def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:
+    """Cells where the disc's middle may be, all of them hanging together; and every cell's distance to them, m."""
+    free = eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M)
+    pieces, count = label_pieces(free, np.ones((3, 3)))
+    if not count:
+        return free, np.full(free.shape, np.inf)
+    piece = pieces == int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1
+    distance = ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m)
+    assert isinstance(distance, np.ndarray)
+    return piece, distance
+
+
+def free_space_values(maps: SceneMaps) -> dict[str, float]:
+    """Traversable area (m2), share of it that the disc covers in one piece, and that piece's farthest pair (m)."""
+    piece, distance = _largest_piece(maps)
+    cells = np.argwhere(piece).astype(float)
+    farthest = 0.0
+    if len(cells) > 1:
+        try:
+            cells = cells[ConvexHull(cells).vertices]
+        except QhullError:
+            cells = cells[[0, -1]]  # one straight line of cells, sorted along it
+        farthest = float(pdist(cells).max()) * maps.resolution_m
+    # The erosion rounds up to whole cells: a disc that touches a wall has its middle up to a cell nearer to it.
+    covered = maps.traversable & (distance <= ROBOT_RADIUS_M + maps.resolution_m)
+    return {
+        "traversable_area": float(maps.traversable.sum()) * maps.resolution_m**2,
+        "connected_share": float(covered.sum() / max(maps.traversable.sum(), 1)),
+        "start_goal": farthest,
+    }
+
+
+def free_space_warnings(maps: SceneMaps) -> tuple[str, ...]:
+    """Names the free floor that the robot cannot reach, when it is more than corners and rims.
+
+    Those are within two radii of where its middle may be; of the rest, less than the disc's own area is no matter.
+    """
+    _, distance = _largest_piece(maps)
+    cell_m2 = maps.resolution_m**2
+    lost_m2 = float((maps.traversable & (distance > 2 * ROBOT_RADIUS_M)).sum()) * cell_m2
+    if lost_m2 < math.pi * ROBOT_RADIUS_M**2:
+        return ()
+    return (
+        f"{lost_m2:.1f} of {float(maps.traversable.sum()) * cell_m2:.1f} m2 of free floor cannot be reached by a robot "
+        f"of {ROBOT_RADIUS_M} m radius from the largest piece: too narrow, or cut off; look at the map in the preview",
+    )
+
+
+def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]) -> tuple[Gate, ...]:
+    """Every gate in the table's order.
+
+    Args:
+        spec: of the scene; changed in place.
+        maps: of the scene.
+        object_names: from its manifest.
+    """
+    try:
+        model = collide_with(spec, "hull")
+        boxes = collide_with(spec, "box")
+    except ValueError:
+        return (judge("compiles", 0.0),)
+    model.opt.timestep = boxes.opt.timestep = TIMESTEP_S
+    bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in movable_bodies(model)}
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or "" for g in range(model.ngeom)]
+    hulls = [sum(n.startswith(f"{o}_hull_") for n in names) for o in object_names]
+    by_hull, by_box = physical_values(model), physical_values(boxes)
+    values = {
+        "compiles": 1.0,
+        "unmatched_objects": float(len(bodies ^ set(object_names))),
+        "finite": min(by_hull["finite"], by_box["finite"]),
+        "hulls_per_object": float(max(hulls, default=0)),
+        "hulls": float(sum(hulls)),
+        "walls": float(sum(n.startswith("wall_") for n in names)),
+    }
+    for quantity in ("drift", "turn", "penetration"):
+        values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
+    values |= free_space_values(maps)
+    warnings = {"connected_share": free_space_warnings(maps)}
+    return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
+
+
+def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
+    """Runs the gates on a written scene folder.
+
+    Raises:
+        SceneError: the folder's files are missing or break the schema.
+    """
+    manifest, maps = load_manifest(folder), load_maps(folder)
+    path = folder / "scene.xml"
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file; convert the scene again")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError:
+        return manifest, (judge("compiles", 0.0),)
+    return manifest, evaluate(spec, maps, tuple(o.name for o in manifest.objects))

@@ -1,0 +1,106 @@
+"""A single object's folder in, a figure of it from above, from the front and from the side out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull
+
+from converters.read.files import read_image, read_textured_obj
+from converters.records.raw import ScanMesh
+from converters.write.texture import colour_cloud
+from scenes_mjcf.schema import SceneError
+
+VIEWS = {
+    "from above": np.eye(3),
+    "from the front": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "from the side": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+}
+"""Rows: what runs to the right, what runs up, and what looks at the reader."""
+PIXELS = 260
+"""Longer side of a picture of the surface; a panel is about as large on the page."""
+
+
+def view(
+    points: np.ndarray, colours: np.ndarray, low: np.ndarray, shape: tuple[int, int], pixel_m: float
+) -> np.ndarray:
+    """(rows, columns, 3) uint8 view from above: the highest point of a pixel shows; white without any."""
+    index = np.floor((points[:, :2] - low) / pixel_m).astype(int)
+    inside = (index >= 0).all(axis=1) & (index[:, 0] < shape[1]) & (index[:, 1] < shape[0])
+    flat = index[inside, 1] * shape[1] + index[inside, 0]
+    order = np.argsort(points[inside, 2], kind="stable")
+    image = np.full((shape[0] * shape[1], 3), 255, np.uint8)
+    image[flat[order]] = colours[inside][order]  # later (higher) points overwrite earlier ones
+    return image.reshape(*shape, 3)
+
+
+def draw_object(folder: Path) -> Figure:
+    """Draws the textured surface, and the hulls and boxes that collide, as the object stands at rest.
+
+    Raises:
+        SceneError: the folder is no readable object.
+    """
+    try:
+        about = json.loads((folder / "object.json").read_text(encoding="utf-8"))
+        name, category, mass_kg = str(about["name"]), str(about["category"]), float(about["mass_kg"])
+        model = mujoco.MjModel.from_xml_path(str(folder / "object.xml"))
+        body = model.body(name).id
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise SceneError(f"{folder}: is no readable object ({error}); convert it again") from error
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    turn, origin = data.xmat[body].reshape(3, 3), data.xpos[body]
+    vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{name}_visual.obj")
+    image = read_image(folder / "assets" / f"{name}.png", "RGB")
+    scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
+    size_m = float(np.ptp(vertices, axis=0).max())
+    cloud = colour_cloud(scan, vertices @ turn.T + origin, faces, np.arange(len(faces)), 0.9 * size_m / PIXELS)
+    figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
+    for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
+        points = cloud.points @ axes_w.T
+        low, high = points[:, :2].min(axis=0) - 0.1 * size_m, points[:, :2].max(axis=0) + 0.1 * size_m
+        pixel_m = float((high - low).max()) / PIXELS
+        columns, rows = np.ceil((high - low) / pixel_m).astype(int)
+        light = 0.55 + 0.45 * np.abs(cloud.normals @ axes_w[2])  # from where the reader stands
+        seen = view(points, (cloud.colours * light[:, None]).astype(np.uint8), low, (int(rows), int(columns)), pixel_m)
+        extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)
+        surface.imshow(seen, origin="lower", extent=extent, interpolation="nearest")
+        _draw_solids(solid, model, data, body, axes_w)
+        for axes in (surface, solid):
+            axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
+            axes.axis("off")
+            if title != "from above":
+                axes.axhline(0.0, color="0.6", linewidth=0.8)  # the floor
+        surface.set_title(title, fontsize=10)
+    bar_m = 10.0 ** np.floor(np.log10(size_m))
+    left, bottom = grid[0, 0].get_xlim()[0], grid[0, 0].get_ylim()[0]
+    grid[0, 0].plot([left, left + bar_m], [bottom] * 2, color="black", linewidth=4, solid_capstyle="butt")
+    grid[0, 0].text(left, bottom, f" {100 * bar_m:g} cm", va="bottom", fontsize=8)
+    hulls = sum(model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX for g in range(model.ngeom))
+    figure.suptitle(f"{name}: {category}, {mass_kg:.3g} kg; below: {hulls} hulls (filled) and their boxes (lines)")
+    figure.tight_layout()
+    return figure
+
+
+def _draw_solids(axes: Axes, model: mujoco.MjModel, data: mujoco.MjData, body: int, axes_w: np.ndarray) -> None:
+    """Outlines of hulls, filled, and boxes, as lines."""
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
+        if not box and not model.geom_contype[geom]:
+            continue  # the surface
+        if box:
+            corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
+        else:
+            mesh = model.geom_dataid[geom]
+            first = model.mesh_vertadr[mesh]
+            corners = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+        points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w.T
+        outline = points[ConvexHull(points[:, :2]).vertices, :2]
+        fill, line = ("none", "#b03020") if box else ("#3070c040", "none")
+        axes.fill(*outline.T, facecolor=fill, edgecolor=line, linewidth=0.8)

@@ -1,0 +1,326 @@
+"""A scene folder in, and the raw folder it came from; one PNG of the conversion's stages from above out.
+
+Drawn by matplotlib's Agg, which needs neither display nor GPU.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from PIL import Image
+from scipy.spatial import ConvexHull
+
+from converters.bodies.objects import PlacedObject
+from converters.check.object_preview import draw_object, view
+from converters.geometry.boxes import convex_hull
+from converters.read.files import read_image, read_textured_obj
+from converters.records.raw import RawScene, ScanMesh
+from converters.records.visual import ColourCloud
+from converters.structure.cut import cut_furniture
+from converters.write.emit import CATEGORY_COLOURS
+from converters.write.texture import colour_cloud
+from interactive_nav_common.files import whole_file
+from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+
+MARGIN_M = 0.3
+"""Empty border around the map."""
+SURFACE_PIXELS = 480
+"""Longer side of a surface's picture; a panel is about as large on the page."""
+DPI = 100
+SURFACE_COLOURS = 64
+TRAVERSABLE = (0.85, 0.94, 0.85)
+WALL = (0.75, 0.75, 0.75)
+
+
+def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
+    """(geom name, body name, geom id) of every named geom."""
+    found = []
+    for geom in range(model.ngeom):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or ""
+        body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])) or ""
+        found.append((name, body, geom))
+    return found
+
+
+def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """(k, 2) world outline of a mesh or box geom seen from above, m."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
+    else:
+        mesh = int(model.geom_dataid[geom])
+        first = int(model.mesh_vertadr[mesh])
+        corners = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])[:, :2]
+    return points[ConvexHull(points).vertices]
+
+
+def _coloured_points(folder: Path, stem: str, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) on a visual mesh, as stored, and their colours (n, 3) uint8."""
+    vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{stem}_visual.obj")
+    image = read_image(folder / "assets" / f"{stem}.png", "RGB")
+    assert corner_uv is not None
+    scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
+    cloud = colour_cloud(scan, vertices, faces, np.arange(len(faces)), spacing_m)
+    return cloud.points, cloud.colours.astype(np.uint8)
+
+
+def _palette(views: list[np.ndarray]) -> Image.Image:
+    """A palette image: the views' own commonest colours beside those that the panels draw with."""
+    surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
+    own = surface.quantize(SURFACE_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    ground, flat = np.array(TRAVERSABLE), np.array(list(CATEGORY_COLOURS.values()))[:, :3]
+    drawn = [np.outer(np.linspace(0, 1, 12), np.ones(3)), ground[None], np.array(WALL)[None]]
+    drawn += [flat * light for light in (0.55, 0.75, 1.0)] + [ground + (flat - ground) * a for a in (0.3, 0.51, 0.66)]
+    chart = np.rint(255 * np.vstack(drawn)).astype(int).ravel().tolist()
+    image = Image.new("P", (1, 1))
+    image.putpalette((own[: 3 * SURFACE_COLOURS] + chart)[: 3 * 256])
+    return image
+
+
+@dataclasses.dataclass(frozen=True)
+class _Scene:
+    """A scene at rest, ready to draw."""
+
+    folder: Path
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    manifest: SceneManifest
+    maps: SceneMaps
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom, top of the map, m."""
+        x, y = self.maps.origin_w
+        rows, columns = self.maps.traversable.shape
+        return x, x + columns * self.maps.resolution_m, y, y + rows * self.maps.resolution_m
+
+
+def _frame(axes: Axes, scene: _Scene, title: str) -> None:
+    left, right, bottom, top = scene.extent
+    axes.set_xlim(left - MARGIN_M, right + MARGIN_M)
+    axes.set_ylim(bottom - 0.5, top + MARGIN_M)
+    axes.set_aspect("equal")
+    axes.set_title(title, fontsize=10)
+    axes.axis("off")
+    axes.plot([left, left + 1.0], [bottom - 0.3] * 2, color="black", linewidth=3, solid_capstyle="butt")
+    axes.text(left + 0.5, bottom - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
+
+
+def _draw_surface(axes: Axes, scene: _Scene, sample: Callable[[float], list[ColourCloud]], title: str) -> None:
+    """Coloured surfaces from above; `sample` is told how far apart the points may be."""
+    left, right, bottom, top = scene.extent
+    low = np.array([left, bottom]) - MARGIN_M
+    size_m = np.array([right - left, top - bottom]) + 2 * MARGIN_M
+    pixel_m = float(size_m.max()) / SURFACE_PIXELS
+    clouds = sample(0.9 * pixel_m)
+    shape = (int(np.ceil(size_m[1] / pixel_m)), int(np.ceil(size_m[0] / pixel_m)))
+    points, colours = np.vstack([c.points for c in clouds]), np.vstack([c.colours for c in clouds])
+    seen = view(points, colours.astype(np.uint8), low, shape, pixel_m)
+    extent = (low[0], low[0] + shape[1] * pixel_m, low[1], low[1] + shape[0] * pixel_m)
+    axes.imshow(seen, origin="lower", extent=extent, interpolation="nearest")
+    _frame(axes, scene, title)
+
+
+def _draw_ground(axes: Axes, scene: _Scene) -> None:
+    """Traversable area and wall boxes."""
+    shade = np.where(scene.maps.traversable[..., None], TRAVERSABLE, 1.0)
+    axes.imshow(shade, origin="lower", extent=scene.extent, interpolation="nearest")
+    for name, _, geom in _geoms(scene.model):
+        if name.startswith("wall_"):
+            outline = _outline(scene.model, scene.data, geom)
+            axes.fill(*outline.T, facecolor=WALL, edgecolor="0.45", linewidth=0.4)
+
+
+def _draw_objects(axes: Axes, scene: _Scene) -> None:
+    """Each movable object's CAD surface in its category's colour, lit from above, with its name."""
+    _draw_ground(axes, scene)
+    for item in scene.manifest.objects:
+        vertices, faces, _ = read_textured_obj(scene.folder / "assets" / f"{item.name}_visual.obj")
+        body = scene.model.body(item.name).id
+        corners = (vertices @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body])[faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        light = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+        order = np.argsort(corners[:, :, 2].max(axis=1), kind="stable")
+        colours = np.outer(0.55 + 0.45 * light, CATEGORY_COLOURS[item.category][:3])[order]
+        axes.add_collection(
+            PolyCollection(corners[order, :, :2], facecolors=colours, edgecolors=colours, linewidth=0.2)
+        )
+    for item in scene.manifest.objects:
+        x, y = scene.data.body(item.name).xipos[:2]
+        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.75, "linewidth": 0}
+        axes.text(x, y, item.name, ha="center", va="center", fontsize=6, bbox=box)
+    area = f"{scene.manifest.floor_area_m2:.1f} m² traversable"
+    _frame(axes, scene, f"{len(scene.manifest.objects)} objects, {area}")
+
+
+def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
+    """Outlines of one kind of collision shape, 'hull' or 'box', in the category's colour."""
+    _draw_ground(axes, scene)
+    category = {o.name: o.category for o in scene.manifest.objects}
+    count = 0
+    for name, body, geom in _geoms(scene.model):
+        if body in category and name.startswith(f"{body}_{kind}_"):
+            colour = CATEGORY_COLOURS[category[body]][:3]
+            outline = _outline(scene.model, scene.data, geom)
+            axes.fill(*outline.T, facecolor=(*colour, 0.30), edgecolor=colour, linewidth=0.6)
+            count += 1
+    walls = sum(name.startswith("wall_") for name, _, _ in _geoms(scene.model))
+    title = f"{count} hulls" if kind == "hull" else f"{count} boxes of objects, {walls} of walls"
+    _frame(axes, scene, title)
+
+
+def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
+    """The scene's objects as the cut takes them."""
+    found = []
+    for item in scene.manifest.objects:
+        assets = scene.folder / "assets"
+        vertices, faces, _ = read_textured_obj(assets / f"{item.name}_visual.obj")
+        hulls = [read_textured_obj(assets / f"{item.name}_hull_{i}.obj")[0] for i in range(item.n_hulls)]
+        body = scene.model.body(item.name).id
+        found.append(
+            PlacedObject(
+                name=item.name,
+                category=item.category,
+                cad_id=item.cad_id,
+                vertices_b=vertices,
+                faces=faces,
+                face_colours=np.zeros((len(faces), 3), np.uint8),
+                hulls_b=tuple(convex_hull(h) for h in hulls),
+                boxes_b=(),
+                position_w=scene.data.xpos[body].copy(),
+                quaternion_w=scene.data.xquat[body].copy(),
+                hinge=None,
+            )
+        )
+    return tuple(found)
+
+
+def _visual_cloud(scene: _Scene, stem: str, spacing_m: float) -> ColourCloud:
+    """World points on a textured mesh of the scene."""
+    points, colours = _coloured_points(scene.folder, stem, spacing_m)
+    body = scene.model.body(stem).id
+    points = points @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body]
+    return ColourCloud(points, np.zeros_like(points), colours)
+
+
+def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
+    """Reads the raw folder that a scene was made from.
+
+    Args:
+        source: the raw folder.
+        manifest: of the scene.
+        floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
+
+    Raises:
+        SceneRejected: no known layout, or unusable files.
+        SceneError: another building than the scene's.
+    """
+    from converters.read.source import READERS, detect_format
+    from converters.read.storeys import split_storeys
+
+    raw = READERS[detect_format(source)][1](source, False)
+    expected = manifest.source.get("sha256", {})
+    strange = sorted(k for k in raw.sources if k in expected and raw.sources[k] != expected[k])
+    if strange or not set(raw.sources) & set(expected):
+        what = f"{strange[0]} differs" if strange else "no file is the same"
+        raise SceneError(f"{source}: is not what {manifest.name} was made from ({what}); give its own --source")
+    floors = split_storeys(raw)
+    return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
+
+
+def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
+    """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes.
+
+    Returns:
+        The figure, and a palette that suits it.
+    """
+    left, right, bottom, top = scene.extent
+    ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
+    columns, height = (3, 4.6) if raw is not None else (2, 4.2)
+    width = max(columns * height * ratio, 7.0)  # the legend's
+    figure, grid = plt.subplots(2, columns, figsize=(width, 2 * height + 0.7), dpi=DPI)
+    panels = list(grid.ravel())
+
+    if raw is not None:
+        vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
+        keep = cut_furniture(vertices_w, raw.scan.faces, raw.scan.labels, _placed(scene)).keep
+        for axes, chosen, title in (
+            (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
+            (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
+        ):
+            faces = raw.scan.faces
+
+            def sample(spacing_m: float, chosen: np.ndarray = chosen, faces: np.ndarray = faces) -> list[ColourCloud]:
+                return [colour_cloud(raw.scan, vertices_w, faces, chosen, spacing_m)]
+
+            _draw_surface(axes, scene, sample, title)
+    filled, objects, hulls, boxes = panels
+    _draw_surface(filled, scene, lambda m: [_visual_cloud(scene, "structure", m)], "filled: the static structure")
+    _draw_objects(objects, scene)
+    _draw_collision(hulls, scene, "hull")
+    _draw_collision(boxes, scene, "box")
+
+    shown = sorted({o.category for o in scene.manifest.objects})
+    handles = [Patch(facecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
+    handles += [Patch(facecolor=TRAVERSABLE, label="traversable"), Patch(facecolor=WALL, label="wall")]
+    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
+    figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
+    figure.tight_layout(rect=(0, 0.03, 1, 0.985))
+    return figure, _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
+
+
+def preview(folder: Path, target: Path, source: Path | None = None) -> None:
+    """Draws a scene or object folder into a PNG of few colours, whole or not at all.
+
+    Args:
+        folder: of the scene, or of an object made by `python -m converters object`.
+        target: the PNG.
+        source: the raw folder that a scene was made from: scan and cut are drawn too.
+
+    Raises:
+        SceneError: the folder is not a readable scene or object, or the source is another building's.
+        FileError: the picture cannot be written.
+        SceneRejected: the source is unusable.
+    """
+    if not target.parent.is_dir():
+        raise SceneError(f"{target.parent}: no such folder; give another -o")
+    if (folder / "object.json").is_file():
+        if source is not None:
+            raise SceneError(f"{folder}: is a single object, which has no scan to draw; leave --source out")
+        figure = draw_object(folder)
+        with whole_file(target) as picture:
+            figure.savefig(picture, format="png", metadata={"Software": None})
+        plt.close(figure)
+        return
+    manifest, maps = load_manifest(folder), load_maps(folder)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    except ValueError as error:
+        raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
+    for item in manifest.objects:
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name) < 0:
+            raise SceneError(
+                f"{folder / 'scene.xml'}: no body named '{item.name}', which scene.json lists; convert the scene again"
+            )
+    raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    figure, palette = draw(_Scene(folder, model, data, manifest, maps), raw)
+    with whole_file(target) as picture:
+        figure.savefig(picture, format="png", metadata={"Software": None})
+        with Image.open(picture) as image:
+            few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
+            few.save(picture, "PNG", optimize=True)
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""What furniture hid of floor and walls, closed without cracks."""

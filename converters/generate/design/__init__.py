@@ -1,0 +1,1 @@
+"""A seed in; a floor plan and its furniture out."""

@@ -1,0 +1,141 @@
+"""Numbers in, a checked `BuildingConfig` out: what shapes a generated building besides its seed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from converters.generate.models.cad import LIBRARY, TRAIN_MODELS
+from interactive_nav_common.errors import UserError
+
+NAMES = ("models", "passage_chairs")
+"""Settings that are names of CAD models, not ranges."""
+
+
+class GenerationError(UserError):
+    """A building that cannot be generated; the message says what, where, what was expected and what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BuildingConfig:
+    """What to build. Pairs are inclusive ranges from which each seed draws."""
+
+    floor_area_m2: tuple[float, float] = (31.0, 42.0)
+    """Inside area of the building, walls between rooms included."""
+    n_rooms: tuple[int, int] = (3, 4)
+    """Rooms, a corridor included."""
+    corridor_from_rooms: int = 6
+    """A building of this many rooms or more gets a corridor that joins them."""
+    min_room_side_m: float = 2.2
+    """Shortest side of a room (a corridor is `corridor_width_m` wide)."""
+    corridor_width_m: float = 1.4
+    """Clear width of a corridor."""
+    wall_height_m: tuple[float, float] = (2.4, 2.6)
+    """Height of the walls above the floor."""
+    wall_thickness_m: tuple[float, float] = (0.10, 0.15)
+    """Thickness of each wall."""
+    doorway_width_m: tuple[float, float] = (0.92, 1.04)
+    """Clear width of a doorway; one without a leaf may be `archway_extra_m` wider."""
+    archway_extra_m: float = 0.3
+    """How much wider a doorway without a leaf may be."""
+    loop_probability: float = 0.25
+    """Chance of each further doorway beyond those that make all rooms reachable."""
+    corner_doorways: float = 0.0
+    """Share of doorways put right beside a room's corner, where an open leaf can rest along the side wall."""
+    n_static: tuple[int, int] = (1, 2)
+    """Unmovable cupboards and counters: part of the static structure."""
+    n_windows: tuple[int, int] = (2, 4)
+    """Windows in the outer walls; their glass returns no depth and so leaves holes in the scan."""
+    n_chairs: tuple[int, int] = (3, 5)
+    """Chairs, the ones that narrow a passage included."""
+    n_tables: tuple[int, int] = (1, 1)
+    """Tables."""
+    n_desks: tuple[int, int] = (1, 1)
+    """Desks."""
+    n_sofas: tuple[int, int] = (1, 1)
+    """Sofas."""
+    n_doors: tuple[int, int] = (1, 2)
+    """Hinged leaves, standing open."""
+    door_open_deg: tuple[float, float] = (85.0, 115.0)
+    """How far a leaf stands open, where the wall behind it allows; at 60 it would bar half of its doorway."""
+    corner_margin_m: float = 0.12
+    """Wall between such a doorway and the corner."""
+    leaf_wall_gap_m: float = 0.08
+    """Least room between an open leaf's edge and the wall beside it. The converter takes walls within 0.04 m of
+    a leaf's sweep, annotation errors included, for the leaf."""
+    leaf_proud_m: float = 0.0
+    """How far before the wall's face the hinges stand: an open leaf that is annotated 1 cm off clears the wall."""
+    leaves_at_walls: bool = False
+    """Leaves only where a side wall is close behind the hinge, never into a corridor or before another doorway:
+    robots that pass seldom catch them. Needs `corner_doorways` to be found often."""
+    n_bottlenecks: int = 1
+    """Chairs put so that they narrow the way through a doorway to `bottleneck_gap_m`."""
+    bottleneck_gap_m: tuple[float, float] = (0.42, 0.62)
+    """Width of the widest passage left beside such a chair."""
+    n_blockers: int = 0
+    """Further chairs that narrow the way through a doorway to `blocker_gap_m`: less than a robot, who must push
+    or go round."""
+    blocker_gap_m: tuple[float, float] = (0.05, 0.32)
+    """Width of the widest passage left beside such a chair."""
+    passage_chairs: tuple[str, ...] = ()
+    """Names of the chair models that may narrow a doorway; empty: all chairs of `models`. Light ones can be pushed
+    by a small robot."""
+    robot_radius_m: float = 0.18
+    """A disc of this radius reaches every room with the furniture (but for blockers) where it stands."""
+    scale_jitter: float = 0.08
+    """Each instance is scaled per axis by up to this fraction."""
+    models: tuple[str, ...] = TRAIN_MODELS
+    """Names of the CAD models that may be used (see `converters.generate.models.cad`)."""
+    floor_height_m: tuple[float, float] = (0.05, 0.25)
+    """The floor's height in the scan's own frame."""
+    voxel_m: float = 0.025
+    """Grid of the scanner's volume; thin parts come out about as broken as in a real reconstruction."""
+    vertex_noise_m: float = 0.006
+    """Standard deviation of the reconstruction noise along the surface normal."""
+    label_noise: float = 0.04
+    """Share of labels that are wrong, all of them near a border between classes."""
+    annotation_noise_m: float = 0.01
+    """Standard deviation per axis of where an annotator clicked on the scan."""
+    faces_per_m2: float = 1350.0
+    """Triangles of the scan per square metre of floor."""
+    texels_per_m: float = 64.0
+    """Texture resolution."""
+
+    def validate(self) -> BuildingConfig:
+        """Returns itself, or raises.
+
+        Raises:
+            GenerationError: a range is upside down, a number is negative, a CAD model is unknown or missing.
+        """
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple) and field.name not in NAMES and not 0 <= value[0] <= value[1]:
+                raise GenerationError(f"{field.name} is {value}: expected 0 <= lowest <= highest")
+            if isinstance(value, int | float) and value < 0:
+                raise GenerationError(f"{field.name} is {value}: expected a number that is not negative")
+        for name in ("voxel_m", "texels_per_m", "faces_per_m2", "robot_radius_m", "min_room_side_m"):
+            if getattr(self, name) <= 0:
+                raise GenerationError(f"{name} is {getattr(self, name)}: expected a positive number")
+        if self.n_rooms[0] < 1:
+            raise GenerationError(f"n_rooms is {self.n_rooms}: expected at least one room")
+        for name in ("corner_doorways", "loop_probability"):
+            if getattr(self, name) > 1:
+                raise GenerationError(f"{name} is {getattr(self, name)}: expected a share of 0 to 1")
+        if self.n_bottlenecks + self.n_blockers > self.n_chairs[0]:
+            raise GenerationError(
+                f"n_bottlenecks is {self.n_bottlenecks} and n_blockers {self.n_blockers} but n_chairs may be "
+                f"{self.n_chairs[0]}: each bottleneck needs a chair; raise n_chairs"
+            )
+        unknown = sorted({*self.models, *self.passage_chairs} - set(LIBRARY))
+        if unknown:
+            raise GenerationError(f"unknown CAD models {unknown}: known are {sorted(LIBRARY)}")
+        strange = [m for m in self.passage_chairs if m not in self.models or LIBRARY[m].category != "chair"]
+        if strange:
+            raise GenerationError(f"passage_chairs names {strange}: expected chairs that `models` has")
+        for category in ("chair", "table", "desk", "sofa", "door"):
+            wanted = getattr(self, f"n_{category}s")[1]
+            if wanted and not any(LIBRARY[m].category == category for m in self.models):
+                raise GenerationError(
+                    f"n_{category}s is up to {wanted} but `models` names no {category}: "
+                    f"add one of {sorted(m for m in LIBRARY if LIBRARY[m].category == category)}"
+                )
+        return self

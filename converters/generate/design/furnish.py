@@ -1,0 +1,283 @@
+"""A floor plan in, furniture out: which CAD model stands where, how large and which way it faces.
+
+Frame: scan x, y; heights above the floor. Footprints never overlap; doorways, the sweep of the door leaves
+and enough floor to drive into every room stay free; some chairs narrow a doorway on purpose, so that pushing
+one aside pays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import shapely
+
+from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.design.doors import DOOR_BOTTOM_M, door_leaf, wall_behind_m
+from converters.generate.design.instance import Instance, place
+from converters.generate.design.maps import clearance
+from converters.generate.design.plan import Plan, Rect, doorway_zone
+from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
+from converters.generate.models.cad import LIBRARY, CadModel, cad_model
+
+SIDE_WALL_M = 0.35
+"""A side wall this close behind the hinge leaves no way through behind an open leaf."""
+
+
+class _Room:
+    """What is taken so far: mutable, private to one furnishing attempt."""
+
+    def __init__(self, plan: Plan):
+        self.plan = plan
+        self.rooms = [shapely.box(r.x0, r.y0, r.x1, r.y1) for r in plan.rooms]
+        self.taken = [shapely.box(f.rect.x0, f.rect.y0, f.rect.x1, f.rect.y1) for f in plan.fixtures]
+        self.kept_free = [_poly(doorway_zone(d, 0.75)) for d in plan.doorways]
+        self.placed: list[Instance] = []
+        self.room_of: list[int] = []
+        self.drawn: Counter[str] = Counter()
+
+    def draw_model(
+        self, category: str, cfg: BuildingConfig, rng: np.random.Generator, among: tuple[str, ...] = ()
+    ) -> tuple[CadModel, np.ndarray]:
+        """One of the category's models that were drawn least so far, and its scale (CAD units -> metres)."""
+        names = [m for m in among or cfg.models if LIBRARY[m].category == category]
+        least = min(self.drawn[m] for m in names)
+        names = [m for m in names if self.drawn[m] == least]
+        model = cad_model(names[rng.integers(len(names))])
+        self.drawn[model.name] += 1
+        return model, model.unit_m * (1 + rng.uniform(-cfg.scale_jitter, cfg.scale_jitter, 3))
+
+    def fits(self, item: Instance, room: int, gap_m: float = 0.06, zones: bool = True) -> bool:
+        shape = item.footprint
+        if not self.rooms[room].buffer(-0.03).contains(shape):
+            return False
+        grown = shape.buffer(gap_m)
+        if any(grown.intersects(t) for t in self.taken):
+            return False
+        return not (zones and any(shape.intersects(z) for z in self.kept_free))
+
+    def add(self, item: Instance, room: int) -> None:
+        self.placed.append(item)
+        self.room_of.append(room)
+        self.taken.append(item.footprint)
+
+
+def _poly(rect: Rect) -> shapely.Polygon:
+    return shapely.box(rect.x0, rect.y0, rect.x1, rect.y1)
+
+
+def _against_wall(
+    state: _Room, room: int, model: CadModel, scale: np.ndarray, rng: np.random.Generator
+) -> Instance | None:
+    """Tries places with the back to a wall."""
+    r = state.plan.rooms[room]
+    width, depth = 2 * model.half_extents[0] * scale[0], 2 * model.half_extents[2] * scale[2]
+    for _ in range(60):
+        side = int(rng.integers(4))
+        facing = side * math.pi / 2  # into the room: +x, +y, -x, -y
+        off = depth / 2 + rng.uniform(0.04, 0.10)
+        along = rng.uniform(width / 2 + 0.05, max(r.size[1 - side % 2] - width / 2 - 0.05, width / 2 + 0.06))
+        x = (r.x0 + off, r.x0 + along, r.x1 - off, r.x0 + along)[side]
+        y = (r.y0 + along, r.y0 + off, r.y0 + along, r.y1 - off)[side]
+        item = place(model, scale, np.array([x, y]), facing + rng.normal(0, 0.02))
+        if state.fits(item, room):
+            return item
+    return None
+
+
+def _in_the_open(
+    state: _Room, room: int, model: CadModel, scale: np.ndarray, rng: np.random.Generator
+) -> Instance | None:
+    """Tries places anywhere in a room, mostly square to its walls."""
+    r = state.plan.rooms[room]
+    for _ in range(80):
+        xy = np.array([rng.uniform(r.x0, r.x1), rng.uniform(r.y0, r.y1)])
+        facing = rng.integers(4) * math.pi / 2 + rng.normal(0, 0.06)
+        item = place(model, scale, xy, facing)
+        if state.fits(item, room, gap_m=0.25):
+            return item
+    return None
+
+
+def _seat_at(
+    state: _Room, host: Instance, room: int, model: CadModel, scale: np.ndarray, rng: np.random.Generator
+) -> Instance | None:
+    """Tries places for a chair before a table or desk, facing it; at a desk only on its front."""
+    depth = 2 * model.half_extents[2] * scale[2]
+    half = host.model.half_extents * host.scale
+    centre = host.to_floor(host.model.center[None])[0, :2]
+    front = host.yaw_rad - math.pi / 2 + (math.pi if host.model.front < 0 else 0.0)
+    turns = [0.0] if host.model.category == "desk" else list(rng.permutation(4) * math.pi / 2)
+    for _ in range(6):
+        for turn in turns:
+            away = front + turn
+            reach = (half[2] if round(turn / (math.pi / 2)) % 2 == 0 else half[0]) + depth / 2 + rng.uniform(0.07, 0.16)
+            spread = 0.25 * (half[0] if round(turn / (math.pi / 2)) % 2 == 0 else half[2])
+            slide = rng.uniform(-spread, spread)
+            xy = centre + reach * np.array([math.cos(away), math.sin(away)])
+            xy += slide * np.array([-math.sin(away), math.cos(away)])
+            item = place(model, scale, xy, away + math.pi + rng.normal(0, 0.12))
+            if state.fits(item, room, gap_m=0.04):
+                return item
+    return None
+
+
+def _narrow(
+    state: _Room, cfg: BuildingConfig, gap_m: tuple[float, float], rng: np.random.Generator, used: set[int], local: bool
+) -> Instance | None:
+    """Tries to put a chair before a doorway so that the way through narrows to the wanted gap.
+
+    Args:
+        state: what stands so far.
+        cfg: models.
+        gap_m: least and largest width left.
+        rng: random stream.
+        used: doorways that have a chair already; extended in place.
+        local: judge the way through this doorway only, not round through other rooms.
+    """
+    plan = state.plan
+    low, high = gap_m
+    before = free_grid(plan, state.placed)
+    for k in rng.permutation(len(plan.doorways)):
+        d = plan.doorways[k]
+        masks = [room_mask(before, plan.rooms[i]) for i in d.rooms]
+        here = masks[0] | masks[1] | room_mask(before, d.rect) if local else np.ones_like(before)
+        if int(k) in used or not passes(clearance(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
+            continue
+        model, scale = state.draw_model("chair", cfg, rng, cfg.passage_chairs)
+        for _ in range(25):
+            side = int(rng.integers(2))
+            xy = np.array(d.rect.centre)
+            half = d.rect.size[d.axis] / 2
+            xy[d.axis] += (1 if side else -1) * (half + rng.uniform(0.3, 0.75))
+            xy[1 - d.axis] += rng.uniform(-0.6, 0.6)
+            item = place(model, scale, xy, rng.uniform(-math.pi, math.pi))
+            sweeps = state.kept_free[len(plan.doorways) :]
+            if not state.fits(item, d.rooms[side], zones=False) or any(item.footprint.intersects(s) for s in sweeps):
+                continue
+            room_m = clearance(without(before, [item]) & here, GRID_M)
+            if passes(room_m, masks, low) and not passes(room_m, masks, high):
+                used.add(int(k))
+                state.add(item, d.rooms[side])
+                return item
+    return None
+
+
+def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generator) -> Instance | None:
+    """Tries to hang a leaf into doorway k where its sweep meets nothing."""
+    plan, d = state.plan, state.plan.doorways[k]
+    model, _ = state.draw_model("door", cfg, rng)
+    for side, jamb in rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
+        room = d.rooms[int(side)]
+        if cfg.leaves_at_walls and (
+            room == plan.corridor or wall_behind_m(d, bool(side), bool(jamb), plan) > SIDE_WALL_M
+        ):
+            continue
+        opened = math.radians(rng.uniform(*cfg.door_open_deg))
+        lift_m = rng.uniform(*DOOR_BOTTOM_M)
+        gaps_m = cfg.leaf_wall_gap_m, cfg.leaf_proud_m
+        leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, lift_m, *gaps_m)
+        if any(sweep.intersects(t) for t in (*state.taken, *state.kept_free[len(plan.doorways) :])):
+            continue
+        others = [z for j, z in enumerate(state.kept_free[: len(plan.doorways)]) if j != k]
+        if cfg.leaves_at_walls and any(leaf.footprint.intersects(z) for z in others):
+            continue
+        state.kept_free.append(sweep)
+        state.add(leaf, room)
+        return leaf
+    return None
+
+
+def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Instance], list[Instance]] | None:
+    """One try: all furniture, and the blockers among it."""
+    state = _Room(plan)
+    ranges = {c: getattr(cfg, f"n_{c}s") for c in ("chair", "table", "desk", "sofa", "door")}
+    count = {c: int(rng.integers(low, high + 1)) for c, (low, high) in ranges.items()}
+    leaves = 0
+    for k in rng.permutation(len(plan.doorways)):
+        if leaves == count["door"]:
+            break
+        if plan.doorways[k].width_m <= 1.1:
+            leaves += _hang_leaf(state, int(k), cfg, rng) is not None
+    if leaves < count["door"]:
+        return None
+    roomy = [i for i in range(len(plan.rooms)) if i != plan.corridor]
+    hosts: list[tuple[Instance, int]] = []
+    for category in ("sofa", "desk", "table"):
+        for _ in range(count[category]):
+            model, scale = state.draw_model(category, cfg, rng)
+            # Large pieces go first to large rooms that are still empty.
+            score = {
+                i: plan.rooms[i].area_m2 * rng.uniform(0.6, 1.4) / (1 + 1.5 * state.room_of.count(i)) for i in roomy
+            }
+            for room in sorted(roomy, key=lambda i: -score[i]):
+                find = _in_the_open if category == "table" and rng.random() < 0.7 else _against_wall
+                item = find(state, room, model, scale, rng)
+                if item is not None:
+                    state.add(item, room)
+                    if category != "sofa":
+                        hosts.append((item, room))
+                    break
+            else:
+                return None
+    used: set[int] = set()
+    for _ in range(cfg.n_bottlenecks):
+        if _narrow(state, cfg, cfg.bottleneck_gap_m, rng, used, local=False) is None:
+            return None
+    blockers = [_narrow(state, cfg, cfg.blocker_gap_m, rng, used, local=True) for _ in range(cfg.n_blockers)]
+    if any(b is None for b in blockers):
+        return None
+    desks_first = sorted(hosts, key=lambda h: h[0].model.category)
+    for n in range(count["chair"] - cfg.n_bottlenecks - cfg.n_blockers):
+        model, scale = state.draw_model("chair", cfg, rng)
+        item, room = None, 0
+        if hosts:
+            for host, room in [desks_first[(n + i) % len(hosts)] for i in range(len(hosts))]:
+                item = _seat_at(state, host, room, model, scale, rng)
+                if item is not None:
+                    break
+        for _ in range(6):
+            if item is not None:
+                break
+            room = int(rng.choice(roomy))
+            item = _in_the_open(state, room, model, scale, rng)
+        if item is None:
+            return None
+        state.add(item, room)
+    return state.placed, [b for b in blockers if b is not None]
+
+
+def furnish_plan(
+    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 10
+) -> list[Instance] | None:
+    """Places the furniture.
+
+    Args:
+        plan: the floor plan.
+        cfg: how many of what.
+        rng: random stream.
+        max_tries: attempts.
+
+    Returns:
+        Doors, sofas, desks, tables, chairs; None where this plan cannot take them.
+    """
+    for _ in range(max_tries):
+        found = _attempt(plan, cfg, rng)
+        if found is None:
+            continue
+        items, blockers = found
+        blocking = {id(b) for b in blockers}
+        standing = [i for i in items if id(i) not in blocking]
+        if rooms_joined(free_grid(plan, standing), plan, cfg.robot_radius_m + 0.02):
+            return items
+    return None
+
+
+def no_place(cfg: BuildingConfig, seed: int) -> GenerationError:
+    """The error for a building that cannot take its furniture."""
+    return GenerationError(
+        f"seed {seed}: no way found to furnish {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2 with up to "
+        f"{cfg.n_chairs[1]} chairs, {cfg.n_tables[1]} tables, {cfg.n_desks[1]} desks, {cfg.n_sofas[1]} "
+        f"sofas and {cfg.n_doors[1]} doors: ask for fewer, or for more area"
+    )

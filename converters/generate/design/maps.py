@@ -1,0 +1,60 @@
+"""A floor plan in, the two map images of the raw layout out, and clearances.
+
+Both images show the STATIC structure only: walls and built-in cupboards that stand in the robot's height
+band; movable furniture and door leaves are in neither. 0.01 m a pixel, square, the image's centre is the
+origin of the scan frame, rows run along +y and columns along +x. `floor_0`: 0 where something static stands,
+255 elsewhere (outside the building too: nothing stands there). `floor_trav_0`: 255 where there is floor and
+nothing static, 0 elsewhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from converters.generate.design.plan import CM, Plan, Rect
+
+BAND_M = (0.02, 1.2)
+"""Heights above the floor between which a robot meets obstacles."""
+MARGIN_M = 0.5
+"""Empty border of the images around the building."""
+
+
+def image_size(plan: Plan) -> int:
+    """Side of the square map images in pixels: even, so that the origin lies on a pixel corner."""
+    o = plan.outer
+    half_m = max(abs(o.x0), abs(o.y0), abs(o.x1), abs(o.y1)) + MARGIN_M
+    return 2 * int(np.ceil(half_m / CM - 1e-6))
+
+
+def fill(image: np.ndarray, rect: Rect, value) -> None:
+    """Sets the pixels whose centres lie in a rectangle (scan frame); writes into `image`."""
+    half = image.shape[0] // 2
+    c0, r0, c1, r1 = (round(v / CM) + half for v in (rect.x0, rect.y0, rect.x1, rect.y1))
+    image[r0:r1, c0:c1] = value
+
+
+def floor_maps(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Draws both maps.
+
+    Args:
+        plan: the floor plan; its horizontal coordinates are whole centimetres.
+
+    Returns:
+        `floor_0` and `floor_trav_0`, each (size, size) uint8 of 0 and 255, row = y / 0.01 + size / 2.
+    """
+    size = image_size(plan)
+    obstacles = np.full((size, size), 255, np.uint8)
+    traversable = np.zeros((size, size), np.uint8)
+    for rect in (*plan.rooms, *(d.rect for d in plan.doorways)):
+        fill(traversable, rect, 255)
+    for box in (*plan.walls, *plan.fixtures):
+        if box.low[2] < BAND_M[1] and box.high[2] > BAND_M[0]:
+            fill(obstacles, box.rect, 0)
+            fill(traversable, box.rect, 0)
+    return obstacles, traversable
+
+
+def clearance(free: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Distance in metres from each free cell's centre to the nearest cell that is not free (0 there)."""
+    return np.asarray(ndimage.distance_transform_edt(free)) * resolution_m - resolution_m / 2 * free

@@ -1,0 +1,86 @@
+"""A plan and furniture in, free space out: grids of free floor, and what a disc can reach on them.
+
+Grids are (n, n) bool, rows along +y and columns along +x, cells of `GRID_M`, the scan frame's origin in the
+middle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from scipy import ndimage
+
+from converters.generate.design.instance import Instance
+from converters.generate.design.maps import clearance, floor_maps
+from converters.generate.design.plan import Plan, Rect
+
+GRID_M = 0.05
+
+
+def static_grid(plan: Plan) -> np.ndarray:
+    """(n, n) bool, True where the static map is free."""
+    trav = floor_maps(plan)[1] > 0
+    step = round(GRID_M / 0.01)
+    n = trav.shape[0] // (2 * step) * 2
+    half = trav.shape[0] // 2
+    keep = slice(half - n // 2 * step, half + n // 2 * step)
+    return np.asarray(trav[keep, keep].reshape(n, step, n, step).all(axis=(1, 3)))
+
+
+def cell_centres(grid: np.ndarray) -> np.ndarray:
+    """(n,) coordinate in metres of the cells along either axis."""
+    n = grid.shape[0]
+    return (np.arange(n) - n / 2 + 0.5) * GRID_M
+
+
+def without(grid: np.ndarray, items: list[Instance]) -> np.ndarray:
+    """A copy of the grid with the footprints of the furniture blocked."""
+    centres = cell_centres(grid)
+    grid = grid.copy()
+    for item in items:
+        shape = item.footprint.buffer(GRID_M * 0.35)
+        x0, y0, x1, y1 = shape.bounds
+        columns = slice(*np.searchsorted(centres, (x0, x1)))
+        rows = slice(*np.searchsorted(centres, (y0, y1)))
+        xs, ys = np.meshgrid(centres[columns], centres[rows])
+        grid[rows, columns] &= ~shapely.contains_xy(shape, xs, ys)
+    return grid
+
+
+def free_grid(plan: Plan, items: list[Instance]) -> np.ndarray:
+    """Static map and furniture on a coarse grid: (n, n) bool, True where free."""
+    return without(static_grid(plan), items)
+
+
+def room_mask(grid: np.ndarray, room: Rect) -> np.ndarray:
+    """(n, n) bool: the cells of a room."""
+    c = cell_centres(grid)
+    return ((c > room.y0) & (c < room.y1))[:, None] & ((c > room.x0) & (c < room.x1))[None]
+
+
+def _regions(mask: np.ndarray) -> np.ndarray:
+    """Connected regions, numbered from 1; 0 where the mask is False."""
+    out = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, output=out)
+    return out
+
+
+def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float = 0.4) -> bool:
+    """True where a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
+    regions = _regions(clearance(grid, GRID_M) >= radius_m)
+    if not regions.any():
+        return False
+    main = regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])
+    return all((main & room_mask(grid, r)).sum() * GRID_M**2 >= least_m2 for r in plan.rooms)
+
+
+def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
+    """True where a disc `width_m` wide gets from one mask to the other.
+
+    Args:
+        room_m: (n, n) clearance.
+        masks: two of (n, n) bool.
+        width_m: the disc's diameter.
+    """
+    regions = _regions(room_m >= width_m / 2)
+    return bool(set(np.unique(regions[masks[0]])) & set(np.unique(regions[masks[1]])) - {0})

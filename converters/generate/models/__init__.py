@@ -1,0 +1,1 @@
+"""CAD furniture of convex parts."""

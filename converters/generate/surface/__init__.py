@@ -1,0 +1,1 @@
+"""A plan and furniture in; the scan of it, its colours and annotations out."""

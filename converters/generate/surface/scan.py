@@ -1,0 +1,217 @@
+"""Plan and furniture in, a scan-like labelled mesh out: what a depth camera would leave.
+
+Solids are fused on a voxel grid and contoured; what no camera position saw is dropped (behind sofas, under
+desks, outside faces, the tops of walls), as is glass; the rest is thinned to the wanted number of faces, gets
+noise along the normals, and labels that are sometimes wrong near a border. There is no ceiling: nothing in
+this project looks at it. Frame: scan x, y, height above the floor; metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import fast_simplification
+import numpy as np
+from scipy import ndimage, sparse
+
+from converters.generate.design.config import BuildingConfig
+from converters.generate.design.instance import Instance
+from converters.generate.design.maps import clearance
+from converters.generate.design.plan import Plan
+from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
+from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
+
+NYU40 = {"wall": 1, "floor": 2, "cabinet": 3, "chair": 5, "sofa": 6, "table": 7, "door": 8, "desk": 14}
+"""Class name -> NYU40 id."""
+
+RANGE_M = 5.0
+"""A depth camera's reach."""
+GRAZING = 0.12
+"""Cosine between ray and normal below which depth is lost."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scan:
+    """A reconstruction."""
+
+    vertices: np.ndarray
+    """(n, 3) float64."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    labels: np.ndarray
+    """(n,) uint8 NYU40 ids, with label noise."""
+    solid: np.ndarray
+    """(n,) int64: index of the nearest solid, without noise."""
+    solids: tuple[Solid, ...]
+
+
+def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
+    """Everything that a camera can hit, with labels and materials."""
+    o = plan.outer
+    solids = [solid_from_box((o.x0, o.y0, -0.3), (o.x1, o.y1, 0.0), NYU40["floor"], "floor")]
+    solids += [solid_from_box(w.low, w.high, NYU40["wall"], "paint") for w in plan.walls]
+    solids += [solid_from_box(f.low, f.high, NYU40["cabinet"], "cabinet") for f in plan.fixtures]
+    for k, item in enumerate(items):
+        label = NYU40[item.model.category]
+        for part in item.model.parts:
+            mesh = item.to_floor(part.vertices), part.faces
+            solids.append(solid_from_mesh(*mesh, label, part.material, k))
+    return solids
+
+
+def camera_positions(plan: Plan, items: list[Instance], rng: np.random.Generator) -> np.ndarray:
+    """(n, 3) places where the camera stood: two to four a room, at eye height, and one in each doorway."""
+    free = clearance(free_grid(plan, items), GRID_M)
+    centres = cell_centres(free)
+    out = []
+    for room in plan.rooms:
+        score = np.where(room_mask(free, room), free, 0.0)
+        cells = np.argwhere(score > min(0.35, 0.7 * score.max()))
+        for _ in range(2 + int(room.area_m2 > 8) + int(room.area_m2 > 14)):
+            # The next place is the one of thirty random ones that is farthest from the earlier ones.
+            pick = cells[rng.integers(len(cells), size=30)]
+            xy = np.stack([centres[pick[:, 1]], centres[pick[:, 0]]], axis=1)
+            if out:
+                gap = np.linalg.norm(xy[:, None] - np.array(out)[None, :, :2], axis=2).min(axis=1)
+                xy = xy[np.argmax(gap)][None]
+            out.append(np.array([*xy[0], rng.uniform(1.35, 1.6)]))
+    out += [np.array([*d.rect.centre, rng.uniform(1.35, 1.6)]) for d in plan.doorways]
+    return np.array(out)
+
+
+def seen_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volume: Volume) -> np.ndarray:
+    """(n,) bool: some camera sees the point, within reach, not grazing, nothing between."""
+    seen = np.zeros(len(points), bool)
+    start = points + normals * 1.6 * volume.voxel_m
+    step = 1.5 * volume.voxel_m
+    for camera in cameras:
+        ray = camera - start
+        length = np.linalg.norm(ray, axis=1)
+        facing = np.einsum("ij,ij->i", ray, normals) > GRAZING * length
+        index = np.flatnonzero(~seen & facing & (length < RANGE_M))
+        direction = ray[index] / length[index, None]
+        at, left = start[index], length[index]
+        while len(index):
+            keep = volume.sample(at) > 0
+            seen[index[keep & (left <= 0)]] = True
+            keep &= left > 0
+            index, direction, left = index[keep], direction[keep], left[keep] - step
+            at = at[keep] + direction * step
+    return seen
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(n, 3) unit normals, weighted by face area; (0, 0, 1) where there are no faces."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    face_normals = np.cross(b - a, c - a)
+    out = np.zeros_like(vertices)
+    for k in range(3):
+        for corner in range(3):
+            out[:, k] += np.bincount(faces[:, corner], face_normals[:, k], len(vertices))
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+
+
+def smooth_noise(points: np.ndarray, wave_m: float, rng: np.random.Generator) -> np.ndarray:
+    """(n, 3) -> (n,) spatially correlated noise of about unit deviation and correlation length `wave_m`."""
+    low = points.min(axis=0) - wave_m
+    shape = np.ceil((points.max(axis=0) - low) / wave_m).astype(int) + 2
+    grid = rng.standard_normal(tuple(shape))
+    return 1.5 * ndimage.map_coordinates(grid, ((points - low) / wave_m).T, order=1)
+
+
+def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Drops connected pieces of fewer than `min_faces` faces, degenerate faces, and unused vertices."""
+    degenerate = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    faces = faces[~degenerate]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), shape=(len(vertices),) * 2)
+    _, piece = sparse.csgraph.connected_components(graph, directed=False)
+    of_face = piece[faces[:, 0]]
+    faces = faces[np.bincount(of_face)[of_face] >= min_faces]
+    used, index = np.unique(faces, return_inverse=True)
+    return vertices[used], index.reshape(-1, 3)
+
+
+def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
+    """For each point the solid whose surface is nearest, and the label of the nearest one of another class.
+
+    Args:
+        points: (n, 3).
+        solids: candidates.
+        reach_m: how far a solid may be to count.
+
+    Returns:
+        index (n,) int64 of the nearest solid; other (n,) int64 label of the nearest other class
+            within 0.05 m, or 0.
+    """
+    best = np.full(len(points), np.inf)
+    index = np.zeros(len(points), np.int64)
+    by_label = {s.label: np.full(len(points), np.inf) for s in solids}
+    for k, s in enumerate(solids):
+        near = np.flatnonzero(((points > s.low - reach_m) & (points < s.high + reach_m)).all(axis=1))
+        # Signed, so that a point inside two solids belongs to the one it is deepest in.
+        distance = s.distance(points[near])
+        labelled = by_label[s.label]
+        labelled[near] = np.minimum(labelled[near], np.abs(distance))
+        better = distance < best[near]
+        best[near[better]] = distance[better]
+        index[near[better]] = k
+    own = np.array([s.label for s in solids])[index]
+    labels = np.array(sorted(by_label))
+    table = np.stack([np.where(own == lab, np.inf, by_label[int(lab)]) for lab in labels], axis=1)
+    closest = table.argmin(axis=1)
+    other = np.where(table.min(axis=1) < 0.05, labels[closest], 0)
+    return index, other
+
+
+def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: np.random.Generator) -> Scan:
+    """Reconstructs the building.
+
+    Args:
+        plan: the floor plan.
+        items: the furniture.
+        cfg: voxel size, noise levels, face budget.
+        rng: random stream.
+
+    Returns:
+        The mesh with a label for each vertex.
+    """
+    solids = building_solids(plan, items)
+    o = plan.outer
+    pad = 4 * cfg.voxel_m
+    # An offset that is not a whole voxel keeps walls from falling exactly onto voxel centres.
+    low = np.array([o.x0, o.y0, 0.0]) - pad - rng.uniform(0.2, 0.8, 3) * cfg.voxel_m
+    volume = fuse(solids, low, np.array([o.x1, o.y1, plan.wall_height_m]) + pad, cfg.voxel_m)
+    vertices, faces = surface_nets(volume)
+    normals = vertex_normals(vertices, faces)
+    seen = seen_from(vertices, normals, camera_positions(plan, items, rng), volume)
+    for w in plan.windows:
+        inside = (vertices > np.array(w.low) - 0.06) & (vertices < np.array(w.high) + 0.06)
+        seen &= ~inside.all(axis=1)
+    # Glossy spots return no depth either.
+    spots = vertices[rng.integers(len(vertices), size=max(3, int(0.15 * o.area_m2)))]
+    for spot in spots:
+        radius = rng.uniform(0.04, 0.11)
+        seen &= ((vertices - spot) ** 2).sum(axis=1) > radius**2
+    vertices, faces = compact(vertices, faces[seen[faces].all(axis=1)], 60)
+    index, _ = nearest_solids(vertices, solids)
+    movable = np.array([s.owner for s in solids])[index] >= 0
+    # Flat walls and floors thin out more readily than furniture if they are smoother before thinning.
+    noise = 0.5 * rng.standard_normal(len(vertices)) + smooth_noise(vertices, 0.12, rng)
+    noise *= np.where(movable, 0.8, 0.3) * cfg.vertex_noise_m
+    vertices = vertices + vertex_normals(vertices, faces) * noise[:, None]
+    budget = int(cfg.faces_per_m2 * sum(r.area_m2 for r in plan.rooms))
+    if len(faces) > budget:
+        points, triangles = fast_simplification.simplify(vertices, faces, target_count=budget, agg=5)[:2]
+        vertices, faces = compact(np.asarray(points, float), np.asarray(triangles, np.int64), 12)
+    index, _ = nearest_solids(vertices, solids)
+    movable = np.array([s.owner for s in solids])[index] >= 0
+    noise = rng.standard_normal(len(vertices)) * np.where(movable, 0.6, 0.95) * cfg.vertex_noise_m
+    vertices = vertices + vertex_normals(vertices, faces) * noise[:, None]
+    index, other = nearest_solids(vertices, solids)
+    labels = np.array([s.label for s in solids])[index]
+    border = np.flatnonzero((other > 0) & (other != labels))
+    wrong = rng.permutation(border)[: int(cfg.label_noise * len(vertices) * 0.5)]
+    labels[wrong] = other[wrong]
+    return Scan(vertices, faces, labels.astype(np.uint8), index, tuple(solids))

@@ -1,0 +1,253 @@
+"""A scan mesh in, a texture atlas out: charts by dominant direction, packed into rows, painted procedurally.
+
+Each chart is a connected patch of faces that look mostly along the same axis, projected along that axis; so a
+texel knows its place in the building, and a floor board runs on across chart borders.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from PIL import Image, ImageDraw
+from scipy import ndimage, sparse
+
+from converters.generate.models.parts import MATERIALS
+from converters.generate.surface.scan import Scan, smooth_noise
+
+PAD = 2
+"""Texels between charts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Atlas:
+    """UVs and the image they look up."""
+
+    uv: np.ndarray
+    """(k, 2) float64 in 0..1, origin at the lower left (OBJ's convention)."""
+    face_uv: np.ndarray
+    """(m, 3) int64 into `uv`."""
+    image: np.ndarray
+    """(size, size, 3) uint8, top row first."""
+
+
+def face_axes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m,) 0..5: +x, -x, +y, -y, +z, -z, the axis that each face's normal is closest to."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    axis = np.abs(normals).argmax(axis=1)
+    return 2 * axis + (normals[np.arange(len(faces)), axis] < 0)
+
+
+def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
+    """Connected patches of faces with the same axis.
+
+    Returns:
+        number of charts, and (m,) the chart of each face.
+    """
+    m = len(faces)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    owner = np.tile(np.arange(m), 3)
+    order = np.lexsort(edges.T[::-1])
+    edges, owner = edges[order], owner[order]
+    same = (edges[1:] == edges[:-1]).all(axis=1) & (axes[owner[1:]] == axes[owner[:-1]])
+    pairs = owner[:-1][same], owner[1:][same]
+    graph = sparse.coo_matrix((np.ones(same.sum(), bool), pairs), shape=(m, m))
+    n, chart = sparse.csgraph.connected_components(graph, directed=False)
+    return int(n), chart
+
+
+def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
+    """Packs rectangles into rows, tallest first.
+
+    Args:
+        sizes: (n, 2) int width and height, texels.
+        width: of the sheet.
+
+    Returns:
+        (n, 2) lower corner of each, and the height used.
+    """
+    corner = np.zeros_like(sizes)
+    x = y = row = 0
+    for k in np.lexsort((np.arange(len(sizes)), -sizes[:, 0], -sizes[:, 1])):
+        w, h = sizes[k]
+        if x + w > width:
+            x, y, row = 0, y + row, 0
+        corner[k] = x, y
+        x, row = x + w, max(row, h)
+    return corner, y + row
+
+
+def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """Lays the faces out on a square sheet.
+
+    Returns:
+        uv (k, 2) in texels, face_uv (m, 3), and the sheet's side (a power of two, so resolution may come out
+        lower).
+    """
+    axes = face_axes(vertices, faces)
+    n, chart = charts_of(faces, axes)
+    # One UV per (vertex, chart).
+    keys = faces.astype(np.int64) * n + chart[:, None]
+    ids, face_uv = np.unique(keys, return_inverse=True)
+    face_uv = face_uv.reshape(-1, 3)
+    vertex, of_chart = ids // n, ids % n
+    plane = np.array([(1, 2), (0, 2), (0, 1)])
+    chart_axis = np.zeros(n, int)
+    chart_axis[chart] = axes // 2
+    flat = np.take_along_axis(vertices[vertex], plane[chart_axis[of_chart]], axis=1)
+    low = np.full((n, 2), np.inf)
+    high = np.full((n, 2), -np.inf)
+    np.minimum.at(low, of_chart, flat)
+    np.maximum.at(high, of_chart, flat)
+    for _ in range(20):
+        sizes = np.ceil((high - low) * texels_per_m).astype(int) + 1 + 2 * PAD
+        side = 2 ** int(np.ceil(np.log2(np.sqrt(sizes.prod(axis=1).sum()) * 0.94)))
+        corner, used = pack_rows(sizes, side)
+        if used <= side and sizes[:, 0].max() <= side:
+            break
+        texels_per_m *= 0.95
+    else:
+        raise AssertionError("charts do not fit")
+    uv = corner[of_chart] + PAD + 0.5 + (flat - low[of_chart]) * texels_per_m
+    return uv, face_uv, side
+
+
+def face_image(uv: np.ndarray, face_uv: np.ndarray, side: int) -> np.ndarray:
+    """(side, side) int32: the face that each texel shows (row 0 at v = 0), nearest face where none does."""
+    image = Image.new("I", (side, side), 0)
+    draw = ImageDraw.Draw(image)
+    corners = (uv[face_uv] - 0.5).reshape(-1, 6)
+    for k, polygon in enumerate(corners.tolist()):
+        draw.polygon(polygon, fill=k + 1)
+    ids = np.array(image)
+    nearest = ndimage.distance_transform_edt(ids == 0, return_distances=False, return_indices=True)
+    return ids[tuple(nearest)] - 1  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+
+def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray) -> np.ndarray:
+    """(n, 3) place in the building of each texel, from its barycentric coordinates (clamped to the face)."""
+    a, b, c = (uv[face_uv[ids, i]] for i in range(3))
+    d = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    d = np.where(np.abs(d) < 1e-9, 1e-9, d)
+    p = texels - a
+    wb = (p[:, 0] * (c[:, 1] - a[:, 1]) - p[:, 1] * (c[:, 0] - a[:, 0])) / d
+    wc = ((b[:, 0] - a[:, 0]) * p[:, 1] - (b[:, 1] - a[:, 1]) * p[:, 0]) / d
+    w = np.clip(np.stack([1 - wb - wc, wb, wc], axis=1), 0, 1)
+    w /= np.maximum(w.sum(axis=1, keepdims=True), 1e-9)
+    return np.einsum("nk,nkd->nd", w, scan.vertices[scan.faces[ids]])
+
+
+def _hash(*keys: np.ndarray) -> np.ndarray:
+    """Integers to repeatable numbers in 0..1."""
+    value = np.zeros(keys[0].shape)
+    for i, k in enumerate(keys):
+        value = value + k * (12.9898 + 65.133 * i)
+    return np.mod(np.sin(value) * 43758.5453, 1.0)
+
+
+def _boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
+    """Wooden boards, 0.14 m wide, about 1.1 m long."""
+    across, length = p[:, 1 - along] / 0.14, p[:, along] / 1.1
+    row = np.floor(across)
+    board = np.floor(length + _hash(row))
+    tone = 0.86 + 0.26 * _hash(row, board)
+    grain = 1 + 0.04 * np.sin(40 * p[:, 1 - along] + 3 * np.sin(2.5 * p[:, along]))
+    joint = np.where(np.mod(across, 1) < 0.07, 0.8, 1.0)
+    return base * (tone * grain * joint)[:, None]
+
+
+def _tiles(p: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Square tiles of 0.3 m with grout."""
+    i, j = np.floor(p[:, 0] / 0.3), np.floor(p[:, 1] / 0.3)
+    grout = (np.mod(p[:, 0], 0.3) < 0.012) | (np.mod(p[:, 1], 0.3) < 0.012)
+    return base * (np.where(grout, 0.75, 0.96 + 0.06 * _hash(i, j)))[:, None]
+
+
+def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np.ndarray, ids: np.ndarray,
+          normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
+    """Colours of points on the scan.
+
+    Args:
+        scan: the mesh; the nearest solid's material decides.
+        rooms: x0, y0, x1, y1 of each; each has its own wall paint and floor.
+        points: (n, 3).
+        ids: (n,) face of each point.
+        normals: (m, 3) of faces.
+        rng: random stream.
+
+    Returns:
+        (n, 3) float in 0..1.
+    """
+    corner = scan.solid[scan.faces[ids]]
+    # Two of three corners decide, so that a border follows edges rather than zigzags.
+    solid = np.where(corner[:, 1] == corner[:, 2], corner[:, 1], corner[:, 0])
+    names = sorted({s.material for s in scan.solids})
+    material = np.array([names.index(s.material) for s in scan.solids])[solid]
+    colour = np.zeros((len(points), 3))
+    centres = np.array([[(r[0] + r[2]) / 2, (r[1] + r[3]) / 2] for r in rooms])
+    half = np.array([[(r[2] - r[0]) / 2, (r[3] - r[1]) / 2] for r in rooms])
+    outside = np.stack([(np.abs(points[:, :2] - c) - h).max(axis=1) for c, h in zip(centres, half, strict=True)], 1)
+    room = outside.argmin(axis=1)
+    paints = np.array(
+        [[0.90, 0.88, 0.83], [0.80, 0.86, 0.84], [0.88, 0.82, 0.76], [0.82, 0.84, 0.90], [0.93, 0.92, 0.90]]
+    )
+    woods = np.array([[0.66, 0.48, 0.31], [0.50, 0.36, 0.25], [0.76, 0.62, 0.45]])
+    wood = woods[rng.integers(len(woods))]
+    along = int(rng.integers(2))
+    tiled = rng.random(len(rooms)) < 0.25
+    paint_of = rng.integers(len(paints), size=len(rooms))
+    cabinet = np.array(MATERIALS["white"] if rng.random() < 0.6 else MATERIALS["oak"])
+    for m, name in enumerate(names):
+        here = np.flatnonzero(material == m)
+        p = points[here]
+        if name == "floor":
+            value = _boards(p, wood, along)
+            tile = tiled[room[here]]
+            value[tile] = _tiles(p[tile], np.array([0.72, 0.72, 0.70]))
+        elif name == "paint":
+            value = paints[paint_of[room[here]]].copy()
+            value[p[:, 2] < 0.09] = [0.95, 0.95, 0.94]
+        elif name == "cabinet":
+            seam = (np.mod(p[:, 0] + 0.003, 0.45) < 0.012) | (np.mod(p[:, 1] + 0.003, 0.45) < 0.012)
+            value = cabinet * np.where(seam, 0.7, 1.0)[:, None]
+            value[(p[:, 2] > 0.87) & (p[:, 2] < 0.95)] = [0.35, 0.34, 0.33]
+        else:
+            weave = 1 + 0.05 * np.sin(90 * p[:, 0]) * np.sin(90 * p[:, 1] + 40 * p[:, 2])
+            value = np.array(MATERIALS[name]) * weave[:, None]
+        colour[here] = value
+    # Light: a lamp per room that falls off, a little shade by direction, darker in corners near the floor.
+    lamp = np.column_stack([centres, np.full(len(rooms), 2.2)])[room]
+    away = lamp - points
+    far = np.linalg.norm(away, axis=1)
+    lambert = np.clip(np.einsum("ij,ij->i", normals[ids], away) / far, 0, 1)
+    light = 0.72 + 0.34 * lambert / (0.6 + 0.25 * far)
+    light *= 1 - 0.12 * np.exp(-np.maximum(points[:, 2], 0) / 0.15) * (np.abs(normals[ids, 2]) < 0.5)
+    light *= 1 + 0.03 * smooth_noise(points, 0.8, rng)
+    return np.clip(colour * light[:, None], 0, 1)
+
+
+def make_atlas(scan: Scan, rooms: list[tuple[float, float, float, float]], texels_per_m: float,
+               rng: np.random.Generator) -> Atlas:  # fmt: skip
+    """Unwraps and paints a scan.
+
+    Args:
+        scan: the mesh.
+        rooms: x0, y0, x1, y1 of each.
+        texels_per_m: wanted resolution.
+        rng: random stream.
+
+    Returns:
+        The atlas.
+    """
+    uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
+    faces_at = face_image(uv, face_uv, side).ravel()
+    a, b, c = (scan.vertices[scan.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    rows, columns = np.divmod(np.arange(side * side), side)
+    points = texel_positions(uv, face_uv, scan, faces_at, np.stack([columns + 0.5, rows + 0.5], axis=1))
+    shade = paint(scan, rooms, points, faces_at, normals, rng)
+    # Six bits a channel and no noise per texel: the PNG stays small.
+    colour = np.round(np.round(shade * 63) * (255 / 63)).astype(np.uint8)
+    return Atlas(uv / side, face_uv, colour.reshape(side, side, 3)[::-1])

@@ -1,0 +1,1 @@
+"""Pure functions of points, faces and rotations that several stages share."""

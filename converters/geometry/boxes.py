@@ -1,0 +1,116 @@
+"""Points in; convex hulls and boxes round them out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+
+from converters.geometry.rotations import yaw_matrix
+
+MIN_THICKNESS_M = 0.01
+"""Hulls and boxes thinner than this make contacts that a simulation step can tunnel through."""
+
+
+PREFER_SLACK = 1.15
+
+
+MIN_DRAW_IN = 0.85
+"""Least horizontal factor on an upright box; a circle's is sqrt(pi / 4) = 0.886."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Hull:
+    """A convex polyhedron."""
+
+    vertices: np.ndarray
+    """(n, 3) float64, m."""
+    faces: np.ndarray
+    """(m, 3) int64, counter-clockwise from outside."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Box:
+    """An oriented box."""
+
+    centre: np.ndarray
+    """(3,) m."""
+    rotation: np.ndarray
+    """(3, 3) columns are the box's axes."""
+    half: np.ndarray
+    """(3,) half sizes, m."""
+
+
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """(3, 3) matrix of a unit quaternion w x y z."""
+    return np.asarray(trimesh.transformations.quaternion_matrix(quaternion))[:3, :3]
+
+
+def convex_hull(points: np.ndarray) -> Hull:
+    """Convex hull of a point cloud; one without volume is first thickened to `MIN_THICKNESS_M` across."""
+    points = np.asarray(points, float)
+    centre = points.mean(axis=0)
+    _, _, axes = np.linalg.svd(points - centre, full_matrices=True)
+    along = (points - centre) @ axes.T
+    thin = np.ptp(along, axis=0) < MIN_THICKNESS_M
+    for k in np.flatnonzero(thin):
+        # Two copies pushed apart along the thin direction: the hull of both has exactly the minimum
+        # thickness.
+        along = np.vstack([along, along])
+        middle = (along[:, k].min() + along[:, k].max()) / 2
+        half = len(along) // 2
+        along[:half, k], along[half:, k] = middle - MIN_THICKNESS_M / 2, middle + MIN_THICKNESS_M / 2
+    hull = trimesh.convex.convex_hull(along @ axes + centre)
+    return Hull(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64))
+
+
+def upright_box(points: np.ndarray, prefer_yaw: float = 0.0) -> Box:
+    """Smallest box with a vertical axis around (n, 3) points.
+
+    Round things have no smallest direction: where the box along `prefer_yaw` is at most `PREFER_SLACK`
+    larger in area it is taken, so that a round table's box stands square to the walls and not with a corner
+    in one.
+    """
+    outline = points[ConvexHull(points[:, :2]).vertices, :2]
+    edges = np.roll(outline, -1, axis=0) - outline
+    # The smallest rectangle around a convex polygon lies along one of its edges.
+    angles = np.append(np.arctan2(edges[:, 1], edges[:, 0]), prefer_yaw) % (math.pi / 2)
+    area = np.array([np.ptp(outline @ yaw_matrix(t)[:2, :2], axis=0).prod() for t in angles])
+    best = len(angles) - 1 if area[-1] <= PREFER_SLACK * area.min() else int(np.argmin(area))
+    rotation = yaw_matrix(float(angles[best]))
+    turned = points @ rotation
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    return Box(rotation @ ((low + high) / 2), rotation, (high - low) / 2)
+
+
+def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0) -> Box:
+    """Oriented box that stands for a hull where collisions are boxes, at least `MIN_THICKNESS_M` thick.
+
+    The general smallest box of a slanted leg reaches below the leg's own foot and would lift the object off
+    the floor; where it would go below `lowest_m`, and where it gains little, the box keeps a vertical axis.
+    Such a box is drawn in horizontally until its cross-section equals the hull's shadow (at most to
+    `MIN_DRAW_IN`): the corners of the box around a round table top would otherwise stand a fifth of its
+    width outside it.
+
+    Args:
+        hull: body frame, m.
+        lowest_m: height of the object's lowest point, body frame.
+        prefer_yaw: direction of the walls in the body frame, rad.
+    """
+    box = upright_box(hull.vertices, prefer_yaw)
+    shadow = float(ConvexHull(hull.vertices[:, :2]).volume)  # scipy: `volume` of a planar hull is its area
+    fill = shadow / max(float(4 * box.half[0] * box.half[1]), 1e-12)
+    draw_in = max(math.sqrt(min(fill, 1.0)), MIN_DRAW_IN)
+    upright = dataclasses.replace(box, half=box.half * [draw_in, draw_in, 1.0])
+    to_origin, size = trimesh.bounds.oriented_bounds(hull.vertices, angle_digits=2)
+    rotation = to_origin[:3, :3].T
+    if np.linalg.det(rotation) < 0:
+        rotation = rotation * [1.0, 1.0, -1.0]
+    tilted = Box(-to_origin[:3, :3].T @ to_origin[:3, 3], rotation, np.asarray(size) / 2)
+    foot = tilted.centre[2] - np.abs(rotation[2]) @ tilted.half
+    better = np.prod(tilted.half) < 0.9 * np.prod(upright.half) and foot >= lowest_m + 0.002
+    chosen = tilted if better else upright
+    return dataclasses.replace(chosen, half=np.maximum(chosen.half, MIN_THICKNESS_M / 2))

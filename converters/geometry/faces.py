@@ -1,0 +1,54 @@
+"""Triangle meshes in; areas, labels, samples and cleaned surfaces out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def face_labels(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m,) label of each face: the one that two corners share, else the first corner's."""
+    a, b, c = labels[faces].T
+    return np.where((b == c) & (a != b), b, a)
+
+
+def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m,) m2."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points on every face no further apart than the spacing, by even barycentric steps (no chance involved).
+
+    Returns:
+        points (k, 3) m, face (k,) the face each lies on.
+    """
+    if len(faces) == 0:
+        return np.zeros((0, 3)), np.zeros(0, np.int64)
+    corners = vertices[faces]
+    longest = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
+    steps = np.maximum(np.ceil(longest / spacing_m).astype(int), 1)
+    points, index = [], []
+    for n in np.unique(steps):
+        chosen = np.flatnonzero(steps == n)
+        i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+        u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n
+        weights = np.stack([1 - u - v, u, v], axis=1)
+        points.append(np.einsum("kw,fwd->fkd", weights, corners[chosen]).reshape(-1, 3))
+        index.append(np.repeat(chosen, len(weights)))
+    return np.concatenate(points), np.concatenate(index)
+
+
+def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Joins vertices at equal positions (to 1e-6 of the extent) and drops faces that collapse.
+
+    Returns:
+        vertices (n', 3), faces (m', 3), keep (m',) indices of the faces that stayed.
+    """
+    step = max(float(np.ptp(vertices, axis=0).max()), 1e-9) * 1e-6
+    _, first, inverse = np.unique(
+        np.round(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    faces = inverse.reshape(-1)[faces]
+    keep = np.flatnonzero((faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0]))
+    return vertices[first], faces[keep], keep

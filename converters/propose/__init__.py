@@ -1,0 +1,1 @@
+"""Furniture found in a labelled scan, and CAD models retrieved for it (section III-B)."""

@@ -1,0 +1,157 @@
+"""A raw folder in; `proposals.json` (Scan2CAD's shape) and `proposals.png` out, and retrieval's report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.patches import Patch, Polygon
+from shapely import MultiPoint
+
+from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_corners, box_iou, propose_instances
+from converters.propose.retrieval import (
+    Comparison,
+    Retrieval,
+    annotated_vertices,
+    auto_align,
+    compare_retrieval,
+    read_library,
+)
+from converters.records.errors import SceneRejected
+from converters.records.raw import CEILING, RawScene
+from converters.structure.floor import fit_floor
+from converters.write.emit import CATEGORY_COLOURS
+from interactive_nav_common.files import whole_file
+
+SAME_OBJECT_SHARE = 0.3
+"""Share of a proposal's points in an annotated model's box from which they are compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposed:
+    """What `propose` found."""
+
+    proposals: tuple[Proposal, ...]
+    retrieved: dict[int, Retrieval]
+    comparisons: tuple[Comparison, ...]
+    """Where the source has annotations and models were retrieved, one for each annotation that was proposed."""
+
+
+def floor_of(raw: RawScene) -> float:
+    """Height of the floor in the scan frame, m."""
+    given = raw.floor_height_m
+    return given if given is not None else fit_floor(raw.scan.vertices, raw.scan.faces, raw.scan.labels).height_m
+
+
+def _nearest_proposal(raw: RawScene, proposals: tuple[Proposal, ...], k: int) -> int | None:
+    box = bounds(annotated_vertices(raw.annotations[k], raw.cads))
+    shares = [((p.points > box[0]) & (p.points < box[1])).all(axis=1).mean() for p in proposals]
+    overlap = [box_iou(box, bounds(p.points)) for p in proposals]
+    order = sorted(range(len(proposals)), key=lambda i: -overlap[i])
+    return order[0] if order and shares[order[0]] > SAME_OBJECT_SHARE else None
+
+
+def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
+    """The scan from above, proposals as boxes with class and confidence, retrieved models as outlines."""
+    figure, axes = plt.subplots(figsize=(9, 9), dpi=110)
+    keep = raw.scan.labels != CEILING
+    vertices = raw.scan.vertices[keep]
+    low = vertices[:, 2] < np.percentile(vertices[:, 2], 85)
+    shade = "0.75"
+    if raw.scan.vertex_colours is not None:
+        shade = raw.scan.vertex_colours[keep][low] / 255.0
+    axes.scatter(*vertices[low][:, :2].T, s=0.6, c=shade, alpha=0.5, linewidths=0)
+    for k, proposal in enumerate(found.proposals):
+        colour = CATEGORY_COLOURS[proposal.category]
+        axes.add_patch(Polygon(box_corners(proposal), fill=False, edgecolor=colour, linewidth=2))
+        text = f"{proposal.category} {proposal.confidence:.2f}"
+        model = found.retrieved.get(k)
+        if model is not None:
+            outline = MultiPoint(
+                model.cad.vertices[:, :2]
+                * model.pose.scale[:2]
+                @ np.array(
+                    [
+                        [np.cos(model.pose.yaw), np.sin(model.pose.yaw)],
+                        [-np.sin(model.pose.yaw), np.cos(model.pose.yaw)],
+                    ]
+                )
+                + model.pose.translation[:2]
+            ).convex_hull
+            axes.add_patch(
+                Polygon(np.asarray(outline.exterior.coords), fill=True, alpha=0.25, facecolor=colour, edgecolor=colour)
+            )
+            text += f"\nmodel {model.cad.cad_id[:6]} {model.confidence:.2f}"
+        axes.annotate(
+            text,
+            (float(proposal.centre[0]), float(proposal.centre[1])),
+            ha="center",
+            va="center",
+            fontsize=8,
+            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1},
+        )
+    for annotation in raw.annotations:
+        hull = MultiPoint(annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
+        axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)
+    shown = sorted({p.category for p in found.proposals})
+    handles = [Patch(facecolor="none", edgecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
+    handles.append(Patch(facecolor="none", edgecolor="black", linestyle=":", label="annotated model"))
+    axes.legend(handles=handles, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, m (scan frame)")
+    axes.set_ylabel("y, m (scan frame)")
+    axes.set_title(f"{raw.name}: {len(found.proposals)} proposals, class and confidence")
+    figure.tight_layout()
+    figure.savefig(target, metadata={"Software": None})
+    plt.close(figure)
+
+
+def propose(
+    raw: RawScene,
+    target: Path,
+    library_root: Path | None = None,
+    report: Callable[[str, float], None] | None = None,
+) -> Proposed:
+    """Finds instances, with a library also their models, and writes both files into `target`.
+
+    Args:
+        raw: the read source.
+        target: folder, made if absent; on failure older files in it stay as they were.
+        library_root: folder that holds `cad/`; None: boxes only.
+        report: progress, (stage, share).
+
+    Raises:
+        SceneRejected: no labelled furniture, or no library.
+        FileError: the folder cannot be written.
+    """
+    say = report or (lambda stage, share: None)
+    say("propose", 0.0)
+    proposals = propose_instances(raw.scan)
+    if not proposals:
+        raise SceneRejected(f"{raw.name}: no furniture label in the scan, expected NYU40 ids 5, 6, 7, 8, 14 or 39")
+    retrieved: dict[int, Retrieval] = {}
+    comparisons = []
+    if library_root is not None:
+        floor = floor_of(raw)
+        library = read_library(library_root)
+        retrieved = auto_align(proposals, library, floor, lambda share: say("retrieve", 0.1 + 0.8 * share))
+        for k, annotation in enumerate(raw.annotations):
+            at = _nearest_proposal(raw, proposals, k)
+            if at is not None and at in retrieved:
+                comparisons.append(compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor))
+    found = Proposed(proposals, retrieved, tuple(comparisons))
+    say("draw", 0.95)
+    text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"
+    with whole_file(target / "proposals.json") as written, whole_file(target / "proposals.png") as picture:
+        written.write_text(text, encoding="utf-8")
+        _draw(raw, found, picture)
+    say("draw", 1.0)
+    return found

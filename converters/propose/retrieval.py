@@ -1,0 +1,350 @@
+"""Proposals and a CAD library in; for each proposal the model and pose that fit best, and how sure that is, out.
+
+The paper had people choose and align models. Here every model of the class is fitted from several yaws by a
+two-sided iterative closest point scheme with the same seven parameters (three scales, position, yaw), and
+judged by how far the scan lies from the model and the model from the scan.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import KDTree
+
+from converters.bodies.alignment import (
+    Alignment,
+    AlignmentError,
+    PoseDifference,
+    apply_alignment,
+    least_squares,
+    pose_difference,
+    upright,
+)
+from converters.geometry.rotations import wrap_angle, yaw_matrix
+from converters.propose.proposals import Proposal, bounds, box_iou
+from converters.read.cad import read_cad
+from converters.read.files import SourceFolder
+from converters.records.errors import SceneRejected
+from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel
+
+N_YAWS = 24
+"""Starting yaws, even steps over the circle from the box's own."""
+COARSE_STEPS, FINE_STEPS = 6, 20
+KEEP = 4
+"""Starts that are refined to the end, per model."""
+COARSE_POINTS, FINE_POINTS = 250, 900
+FAR_M = 0.15
+"""A point farther off than this counts as this far: unseen backs, clutter on the seat."""
+CAD_WEIGHT = 0.5
+"""Weight of model-to-scan distances beside scan-to-model ones: a scan never shows all of a model."""
+SCALE_SPREAD_M = 0.03
+"""Cost of scaling the axes unequally, per unit of the standard deviation of the logarithms of the scales."""
+LIKELY_M = 0.006
+"""Models whose cost is this much higher are e times less likely."""
+CLOSE_M = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Retrieval:
+    """The best model and pose for one proposal."""
+
+    cad: CadModel
+    pose: Alignment
+    """Upright, CAD frame -> scan frame; `rms_m` is nan."""
+    cost_m: float
+    residual_m: float
+    """Mean distance of the scan's points to the model, each at most `FAR_M`."""
+    confidence: float
+    """In [0, 1]: share of the scan within 5 cm of the model, x share of the model within 10 cm of the scan,
+    x likelihood of this model among those tried."""
+    ranking: tuple[tuple[str, float], ...]
+    """(cad_id, cost in m) of every model tried, best first."""
+
+
+def read_library(root: Path) -> dict[str, CadModel]:
+    """Every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a known class, by id.
+
+    Raises:
+        SceneRejected: no model there, or a damaged one.
+    """
+    source = SourceFolder(root)
+    found = sorted((root / "cad").glob("*/*/models/model_normalized.obj"))
+    library = {}
+    for path in found:
+        synset, cad_id = path.parts[-4], path.parts[-3]
+        if synset in SYNSETS:
+            library[cad_id] = read_cad(source, synset, cad_id)
+    if not library:
+        raise SceneRejected(
+            f"{root / 'cad'}: no model of a known class (<synset>/<id>/models/model_normalized.obj); "
+            "put a library there"
+        )
+    return library
+
+
+def _thin(points: np.ndarray, count: int) -> np.ndarray:
+    """At most about `count` of the points, spread evenly: the first in each cell of the finest grid that fits."""
+    if len(points) <= count:
+        return points
+    low, high = 1e-3, float(np.ptp(points, axis=0).max())
+    chosen = np.arange(count)
+    for _ in range(14):
+        side = math.sqrt(low * high)
+        cell = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
+        first = np.unique(cell, axis=0, return_index=True)[1]
+        if len(first) > count:
+            low = side
+        else:
+            high, chosen = side, np.sort(first)
+    return points[chosen]
+
+
+def _surface(cad: CadModel, count: int) -> np.ndarray:
+    """About `count` even samples of the model's surface, CAD frame."""
+    mesh = trimesh.Trimesh(cad.vertices, cad.faces, process=False)
+    return _thin(np.asarray(trimesh.sample.sample_surface(mesh, 8 * count, seed=0)[0]), count)
+
+
+def _start(
+    cad_low: np.ndarray, cad_high: np.ndarray, points: np.ndarray, floor_m: float | None, yaw: float
+) -> Alignment:
+    """The pose that lays the model's box on the box of the scan's points along that yaw."""
+    turned = points @ yaw_matrix(yaw)
+    # The outermost hundredth is noise and mislabelled neighbours.
+    low, high = np.percentile(turned, 1, axis=0), np.percentile(turned, 99, axis=0)
+    if floor_m is not None:
+        low[2] = floor_m
+    scale = np.maximum(high - low, 0.05) / np.maximum(cad_high - cad_low, 1e-3)
+    middle = (low + high) / 2 - scale * (cad_low + cad_high) / 2
+    return Alignment(scale, yaw_matrix(yaw) @ middle, yaw, math.nan)
+
+
+def _on_floor(pose: Alignment, p: np.ndarray, q: np.ndarray, w: np.ndarray, base: float, floor_m: float) -> Alignment:
+    """The pose with its base on the floor: the z scale is then a regression through that height."""
+    height = p[:, 2] - base
+    scale_z = max(float(w @ (height * (q[:, 2] - floor_m))) / max(float(w @ height**2), 1e-12), 0.05)
+    scale = pose.scale * [1.0, 1.0, 0.0] + [0.0, 0.0, scale_z]
+    return dataclasses.replace(
+        pose, scale=scale, translation=np.array([*pose.translation[:2], floor_m - scale_z * base])
+    )
+
+
+def _refine(
+    pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTree, steps: int, floor_m: float | None
+) -> Alignment:
+    """Alternates closest pairs, both ways, with the fit of the seven parameters."""
+    reach = 0.3
+    base = float(surface[:, 2].min())
+    for _ in range(steps):
+        moved = apply_alignment(pose, surface)
+        to_cad, index = KDTree(moved).query(points)
+        to_scan, other = tree.query(moved)
+        p = np.vstack([surface[index], surface])
+        q = np.vstack([points, points[other]])
+        distance = np.concatenate([to_cad, to_scan])
+        # Geman-McClure weights: pairs far beyond the reach count little.
+        weight = 1.0 / (1.0 + (distance / (reach / 2)) ** 2) ** 2
+        weight[len(points) :] *= CAD_WEIGHT * len(points) / len(surface)
+        weight[distance > 2 * reach] = 0.0
+        used = weight > 0
+        try:
+            found = least_squares(p[used], q[used], weights=weight[used])
+        except AlignmentError:
+            return pose
+        # A fit to a partial scan creeps together: bound a step and the inequality of the scales.
+        found = dataclasses.replace(found, scale=np.clip(found.scale, 0.9 * pose.scale, 1.1 * pose.scale))
+        middle = (weight[used] @ p[used]) / weight[used].sum()
+        target = (weight[used] @ q[used]) / weight[used].sum()
+        found = dataclasses.replace(found, translation=target - yaw_matrix(found.yaw) @ (found.scale * middle))
+        if floor_m is not None:
+            found = _on_floor(found, p[used], q[used], weight[used], base, floor_m)
+        pose = found
+        reach = max(0.8 * reach, 0.08)
+    return pose
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    pose: Alignment
+    cost_m: float
+    residual_m: float
+    explained: float
+    supported: float
+
+
+def _judge(pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTree) -> _Fit:
+    moved = apply_alignment(pose, surface)
+    to_cad = KDTree(moved).query(points)[0]
+    to_scan = tree.query(moved)[0]
+    residual = float(np.minimum(to_cad, FAR_M).mean())
+    unequal = float(np.std(np.log(pose.scale)))
+    cost = residual + CAD_WEIGHT * float(np.minimum(to_scan, FAR_M).mean()) + SCALE_SPREAD_M * unequal
+    explained, supported = float((to_cad < CLOSE_M).mean()), float((to_scan < 2 * CLOSE_M).mean())
+    return _Fit(dataclasses.replace(pose, rms_m=math.nan), cost, residual, explained, supported)
+
+
+def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
+    """The best pose of one model: many coarse starts, the best few refined.
+
+    Args:
+        proposal: with its scan points.
+        cad: the model.
+        floor_m: height of the floor in the scan frame for what stands on it, or None.
+    """
+    low, high = cad.vertices.min(axis=0), cad.vertices.max(axis=0)
+    coarse = _thin(proposal.points, COARSE_POINTS)
+    coarse_tree, coarse_surface = KDTree(coarse), _surface(cad, COARSE_POINTS)
+    starts = []
+    for k in range(N_YAWS):
+        pose = _start(low, high, proposal.points, floor_m, proposal.yaw + 2 * math.pi * k / N_YAWS)
+        pose = _refine(pose, coarse_surface, coarse, coarse_tree, COARSE_STEPS, floor_m)
+        starts.append(_judge(pose, coarse_surface, coarse, coarse_tree))
+    starts.sort(key=lambda f: f.cost_m)
+    chosen: list[_Fit] = []
+    for start in starts:
+        if all(abs(wrap_angle(start.pose.yaw - c.pose.yaw)) > math.radians(10) for c in chosen):
+            chosen.append(start)
+    fine = _thin(proposal.points, FINE_POINTS)
+    tree, surface = KDTree(fine), _surface(cad, FINE_POINTS)
+    fits = [
+        _judge(_refine(s.pose, surface, fine, tree, FINE_STEPS, floor_m), surface, fine, tree) for s in chosen[:KEEP]
+    ]
+    best = min(fits, key=lambda f: f.cost_m)
+    return dataclasses.replace(best, pose=dataclasses.replace(best.pose, yaw=wrap_angle(best.pose.yaw)))
+
+
+def fits_label(cad: CadModel, label: int) -> bool:
+    """True when scans label such a model so (a desk is often labelled a table)."""
+    return label in CATEGORY_LABELS[cad.category]
+
+
+def retrieve(
+    proposal: Proposal, library: Mapping[str, CadModel], floor_m: float | None, any_category: bool = False
+) -> Retrieval | None:
+    """The model of the library that fits a proposal best; None when none is of its class.
+
+    Args:
+        proposal: from `propose_instances`.
+        library: cad_id -> model.
+        floor_m: height of the floor, scan frame; what stands on the floor is fitted down to it. Doors are not.
+        any_category: tries every model, whatever its class.
+    """
+    floor = None if proposal.category == "door" else floor_m
+    fits = {
+        cad_id: fit_model(proposal, cad, floor)
+        for cad_id, cad in sorted(library.items())
+        if any_category or fits_label(cad, proposal.label)
+    }
+    if not fits:
+        return None
+    ranking = sorted(fits.items(), key=lambda item: item[1].cost_m)
+    best_id, best = ranking[0]
+    likelihood = 1.0 / sum(math.exp(-(f.cost_m - best.cost_m) / LIKELY_M) for f in fits.values())
+    return Retrieval(
+        library[best_id],
+        best.pose,
+        best.cost_m,
+        round(best.residual_m, 5),
+        round(best.explained * best.supported * likelihood, 4),
+        tuple((k, f.cost_m) for k, f in ranking),
+    )
+
+
+def as_annotation(found: Retrieval) -> Annotation:
+    """The retrieved pose as an annotation without keypoints."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = yaw_matrix(found.pose.yaw) * found.pose.scale
+    matrix[:3, 3] = found.pose.translation
+    return Annotation(found.cad.category, found.cad.cad_id, matrix, "__SYM_NONE", np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+MIN_CONFIDENCE = 0.2
+"""Retrievals less sure than this are not used by `--auto-align`."""
+
+
+def annotated_vertices(annotation: Annotation, cads: Mapping[str, CadModel]) -> np.ndarray:
+    """(n, 3) the annotated model's vertices in the scan frame, m."""
+    return cads[annotation.cad_id].vertices @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+
+
+def without_annotation(
+    proposals: tuple[Proposal, ...], annotations: tuple[Annotation, ...], cads: Mapping[str, CadModel]
+) -> list[int]:
+    """Indices of the proposals of which less than half lies in the (10 cm larger) box of an annotated model."""
+    boxes = [bounds(annotated_vertices(a, cads)) for a in annotations]
+    result = []
+    for k, proposal in enumerate(proposals):
+        inside = [
+            ((proposal.points > low - 2 * CLOSE_M) & (proposal.points < high + 2 * CLOSE_M)).all(axis=1).mean()
+            for low, high in boxes
+        ]
+        if max(inside, default=0.0) < 0.5:
+            result.append(k)
+    return result
+
+
+def auto_align(
+    proposals: tuple[Proposal, ...],
+    library: Mapping[str, CadModel],
+    floor_m: float | None,
+    progress: Callable[[float], None] | None = None,
+) -> dict[int, Retrieval]:
+    """Index of a proposal -> what was retrieved for it; proposals without a model of their class are left out."""
+    found = {}
+    for k, proposal in enumerate(proposals):
+        one = retrieve(proposal, library, floor_m)
+        if one is not None:
+            found[k] = one
+        if progress is not None:
+            progress((k + 1) / len(proposals))
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """One retrieval against a person's annotation of the same object."""
+
+    category: str
+    true_cad: str
+    chosen_cad: str
+    rank: int
+    """Of the annotated model among those tried, from 1; 0: it was not tried."""
+    n_tried: int
+    difference: PoseDifference
+    """Of the annotated model's own best fit to its annotated pose: what `pose_difference` says."""
+    iou: float
+    """Of the axis-aligned boxes of the chosen and of the annotated model."""
+    confidence: float
+
+
+def compare_retrieval(
+    annotation: Annotation, cads: Mapping[str, CadModel], proposal: Proposal, found: Retrieval, floor_m: float | None
+) -> Comparison:
+    """Holds a retrieval against the annotation.
+
+    Yaw and scale can only be compared for the same model, so the annotated model's own best fit stands for them
+    where another one was chosen.
+    """
+    cad = cads[annotation.cad_id]
+    pivot = (cad.vertices.min(axis=0) + cad.vertices.max(axis=0)) / 2
+    reference, _ = upright(annotation.pose, pivot)
+    own = found.pose
+    if found.cad.cad_id != annotation.cad_id:
+        own = fit_model(proposal, cad, None if proposal.category == "door" else floor_m).pose
+    ids = [cad_id for cad_id, _ in found.ranking]
+    chosen = apply_alignment(found.pose, found.cad.vertices)
+    return Comparison(
+        annotation.category,
+        annotation.cad_id,
+        found.cad.cad_id,
+        ids.index(annotation.cad_id) + 1 if annotation.cad_id in ids else 0,
+        len(ids),
+        pose_difference(own, reference, pivot, annotation.symmetry),
+        box_iou(bounds(chosen), bounds(annotated_vertices(annotation, cads))),
+        found.confidence,
+    )

@@ -1,0 +1,1 @@
+"""Files of many layouts in, `RawScene` out."""

@@ -1,0 +1,154 @@
+"""Scan2CAD's annotation list (also Gibson's `alignments.json`) in, `Annotation` records out.
+
+Frames of the file (Avetisyan et al. 2019): an annotation world, y up; the scan's `trs` leads scan -> world,
+each model's `trs` CAD -> world, and both keypoint sets stand in that world (the CAD's after its `trs`).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.files import SourceFolder
+from converters.records.errors import SceneRejected
+from converters.records.raw import SYNSETS, Annotation, CadModel, Hinge
+
+CAD_ID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+"""Ids become paths: nothing that could leave the library's folder."""
+OUTSIDE_M = 0.5
+"""An object this far from everything scanned stands outside the scan."""
+
+
+def trs_matrix(trs: dict[str, Any]) -> np.ndarray:
+    """(4, 4) matrix that scales, then turns (quaternion w x y z), then moves."""
+    w, x, y, z = (float(v) for v in trs["rotation"])
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix() * np.asarray(trs["scale"], float)
+    matrix[:3, 3] = np.asarray(trs["translation"], float)
+    if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e6:
+        raise ValueError(f"the transform {trs} is not made of usable numbers")
+    return matrix
+
+
+def _apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _keypoints(model: dict[str, Any], key: str) -> np.ndarray:
+    flat = np.asarray(model.get(key, {}).get("position", []), float)
+    if not np.isfinite(flat).all():
+        raise ValueError(f"{key} has positions that are not finite numbers")
+    return flat.reshape(-1, 3)
+
+
+def _hinge(model: dict[str, Any], where: str) -> Hinge | None:
+    raw = model.get("articulation")
+    if raw is None:
+        return None
+    if raw.get("type") != "hinge":
+        raise SceneRejected(f"{where}: articulation type is {raw.get('type')!r}, expected 'hinge'")
+    axis = Y_UP_TO_Z_UP @ np.asarray(raw["axis"], float)
+    if not abs(axis[2]) >= 0.9 * np.linalg.norm(axis) > 0:
+        raise SceneRejected(f"{where}: the hinge axis is {raw['axis']}, expected the vertical (0, 1, 0)")
+    low, high = sorted(float(v) for v in raw["range_rad"])
+    origin = Y_UP_TO_Z_UP @ np.asarray(raw["origin"], float)
+    if not np.isfinite([low, high, *origin]).all():
+        raise SceneRejected(f"{where}: the articulation has numbers that are not finite")
+    return Hinge(origin, float(np.sign(axis[2])), (low, high))
+
+
+def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:
+    """Turns the decoded list of one scan into records.
+
+    Returns:
+        The scan id, and for each object its synset id and annotation.
+
+    Raises:
+        SceneRejected: not a list of one scan, a missing key, an unknown category, a singular pose.
+    """
+    if not isinstance(data, list) or len(data) != 1:
+        got = f"a list of {len(data)}" if isinstance(data, list) else type(data).__name__
+        raise SceneRejected(f"{path}: got {got}, expected a list with the annotation of one scan; cut it to one scan")
+    records = []
+    where = str(path)
+    try:
+        scan_to_world = trs_matrix(data[0]["trs"])
+        world_to_scan = np.linalg.inv(scan_to_world)
+        cad_to_y_up = np.eye(4)
+        cad_to_y_up[:3, :3] = Y_UP_TO_Z_UP.T
+        for i, model in enumerate(data[0]["aligned_models"]):
+            where = f"{path}: aligned_models[{i}]"
+            synset, cad_id = str(model["catid_cad"]), str(model["id_cad"])
+            if synset not in SYNSETS:
+                known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
+                raise SceneRejected(f"{where}: category id is {synset}, expected one of {known}")
+            if not CAD_ID.fullmatch(cad_id):
+                raise SceneRejected(f"{where}: id_cad is {cad_id!r}, expected letters, digits, '_', '-' and '.'")
+            pose_y_up = trs_matrix(model["trs"])
+            if abs(np.linalg.det(pose_y_up)) < 1e-9:
+                raise SceneRejected(f"{where}: the scale is {model['trs']['scale']}, expected three non-zero numbers")
+            pose = world_to_scan @ pose_y_up @ cad_to_y_up
+            cad_points = _apply(np.linalg.inv(pose_y_up @ cad_to_y_up), _keypoints(model, "keypoints_cad"))
+            scan_points = _apply(world_to_scan, _keypoints(model, "keypoints_scan"))
+            count = min(len(cad_points), len(scan_points))
+            records.append(
+                (
+                    synset,
+                    Annotation(
+                        category=SYNSETS[synset],
+                        cad_id=cad_id,
+                        pose=pose,
+                        symmetry=str(model.get("sym", "__SYM_NONE")),
+                        keypoints_cad=cad_points[:count],
+                        keypoints_scan=scan_points[:count],
+                        hinge=_hinge(model, where),
+                    ),
+                )
+            )
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        if isinstance(error, SceneRejected):
+            raise
+        what = f"missing key {error}" if isinstance(error, KeyError) else str(error)
+        raise SceneRejected(f"{where}: {what}; expected Scan2CAD's annotation layout") from error
+    return str(data[0].get("id_scan", path.parent.name)), tuple(records)
+
+
+def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, scan_vertices: np.ndarray) -> float:
+    """Distance from an object's upright bounding box to the nearest vertex of the scan, m; 0 where one is inside."""
+    placed = _apply(annotation.pose, cad_vertices)
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    outside = np.maximum(np.maximum(low - scan_vertices, scan_vertices - high), 0.0)
+    return float(np.sqrt((outside**2).sum(axis=1).min()))
+
+
+def inside_scan(
+    source: SourceFolder,
+    where: str,
+    annotations: tuple[Annotation, ...],
+    cads: dict[str, CadModel],
+    scan_vertices: np.ndarray,
+) -> tuple[Annotation, ...]:
+    """The annotations whose objects stand in the scan; the others are left out with a warning each.
+
+    Raises:
+        SceneRejected: most objects stand outside (the annotation belongs to another scan), or the folder is read
+            strictly.
+    """
+    gaps = [gap_to_scan(a, cads[a.cad_id].vertices, scan_vertices) for a in annotations]
+    outside = [i for i, gap in enumerate(gaps) if gap > OUTSIDE_M]
+    if 2 * len(outside) > len(annotations):
+        raise SceneRejected(
+            f"{source.root / where}: {len(outside)} of {len(annotations)} objects lie outside the scan (the first by "
+            f"{gaps[outside[0]]:.1f} m); the annotation belongs to another scan, or its `trs` is wrong"
+        )
+    for i in outside:
+        source.repaired(
+            f"{where}: object {i} ({annotations[i].category}, {annotations[i].cad_id}) lies {gaps[i]:.1f} m outside "
+            "the scan; it is left out"
+        )
+    return tuple(a for i, a in enumerate(annotations) if i not in outside)

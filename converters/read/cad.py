@@ -1,0 +1,86 @@
+"""A ShapeNet-like OBJ with its materials in, one `CadModel` (z up, a colour per face) out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from converters.geometry.faces import merge_vertices
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.files import SourceFolder
+from converters.read.obj import GREY, read_painted_obj, texels
+from converters.records.errors import SceneRejected
+from converters.records.raw import SYNSETS, CadModel
+
+
+def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
+    """Reads `cad/<synset>/<id>/models/model_normalized.obj` and turns it to z up.
+
+    Raises:
+        SceneRejected: unknown synset, absent model, or unreadable file.
+    """
+    if synset not in SYNSETS:
+        known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
+        raise SceneRejected(f"{source.root}: CAD model {cad_id} has category id {synset}, expected one of {known}")
+    relative = f"cad/{synset}/{cad_id}/models/model_normalized.obj"
+    mesh, image, images = read_painted_obj(
+        source,
+        relative,
+        f"an annotation names CAD model {cad_id} of category {synset} ({SYNSETS[synset]}); "
+        "put the model there or remove the annotation",
+    )
+    colours = np.full((len(mesh.faces), 3), GREY, np.uint8)
+    for k, own in enumerate(images):
+        of = image == k
+        middle = np.zeros((int(of.sum()), 2)) if mesh.corner_uv is None else mesh.corner_uv[of].mean(axis=1)
+        colours[of] = texels(own, middle)
+    # By material, the last first: decompositions depend on the order of the faces, and stored ones have this.
+    order = np.argsort(-image, kind="stable")
+    used, faces = np.unique(mesh.faces[order], return_inverse=True)
+    vertices, faces, keep = merge_vertices(mesh.vertices[used], faces.reshape(-1, 3))
+    vertices, faces, colours = clean_surface(source, relative, vertices, faces, colours[order][keep])
+    return CadModel(SYNSETS[synset], cad_id, vertices @ Y_UP_TO_Z_UP.T, faces, colours)
+
+
+def clean_surface(
+    source: SourceFolder, where: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drops faces without area and says what else is wrong; open and non-manifold surfaces are left as they are.
+
+    Decomposition rebuilds such surfaces as closed ones (coacd's manifold preprocessing), so that they need no repair
+    here; their hulls are a voxel thicker.
+
+    Args:
+        source: takes the warnings.
+        where: file named in them.
+        vertices: (n, 3), equal positions joined.
+        faces: (m, 3).
+        colours: (m, 3) of the faces.
+
+    Raises:
+        SceneRejected: nothing is left, or the model has no extent in two directions.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    extent = np.ptp(vertices, axis=0)
+    longest = np.max([np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    good = area > 1e-9 * np.maximum(longest, 1e-12) ** 2
+    if not good.any() or (extent > 1e-6 * max(float(extent.max()), 1e-12)).sum() < 2:
+        raise SceneRejected(f"{source.root / where}: its {len(faces)} faces enclose no area; fetch the model again")
+    if not good.all():
+        source.note(f"{where}: {int((~good).sum())} of {len(faces)} faces have no area; they are dropped")
+        faces, colours = faces[good], colours[good]
+    open_edges, busy_edges = edge_defects(faces)
+    if busy_edges:
+        source.note(
+            f"{where}: is not manifold ({busy_edges} edges with three faces or more); collision uses closed hulls"
+        )
+    elif open_edges:
+        source.note(f"{where}: is not watertight ({open_edges} open edges); collision uses closed hulls")
+    return vertices, faces, colours
+
+
+def edge_defects(faces: np.ndarray) -> tuple[int, int]:
+    """How many edges have one face only, and how many have three or more."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    return int((count == 1).sum()), int((count > 2).sum())

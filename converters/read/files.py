@@ -1,0 +1,289 @@
+"""Paths in; meshes, images, JSON and hashes out; a failure is one `SceneRejected` line."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from converters.records.errors import SceneRejected
+
+
+class SourceFolder:
+    """A raw scene's folder; remembers the sha256 of every file that was read through it, and what was repaired."""
+
+    def __init__(self, root: Path, strict: bool = False) -> None:
+        """Opens the folder; with `strict`, every repair is an error."""
+        if not root.exists():
+            raise SceneRejected(f"{root}: no such folder; give the folder that holds the raw scene")
+        if not root.is_dir():
+            raise SceneRejected(f"{root}: is a file, expected the folder that holds the raw scene")
+        self.root = root
+        self.strict = strict
+        self.sha256: dict[str, str] = {}
+        self.warnings: list[str] = []
+
+    def has(self, relative: str) -> bool:
+        """True when the file exists."""
+        return (self.root / relative).is_file()
+
+    def use(self, relative: str, remedy: str) -> Path:
+        """Path of a file that must exist; its hash goes into the record.
+
+        Raises:
+            SceneRejected: missing (`remedy` ends the message), unreadable, or a link out of the folder.
+        """
+        path = self.root / relative
+        if os.path.isfile(path) or path.is_symlink():
+            self.inside(path)
+        if not os.path.isfile(path):
+            raise SceneRejected(f"{path}: no such file; {remedy}")
+        try:
+            self.sha256[relative] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise SceneRejected(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        return path
+
+    def relative(self, path: Path) -> str | None:
+        """The path relative to the folder, or None where it leads out of it."""
+        try:
+            return self.inside(path)
+        except SceneRejected:
+            return None
+
+    def inside(self, path: Path) -> str:
+        """The path relative to the folder, links followed.
+
+        Raises:
+            SceneRejected: it leads out of the folder, or it is no path at all (a NUL byte, a loop of links).
+        """
+        try:
+            end = path.resolve()
+        except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
+            raise SceneRejected(f"{path}: leads nowhere ({error}); put the file itself there") from error
+        if not end.is_relative_to(self.root.resolve()):
+            raise SceneRejected(f"{path}: leads out of the source folder, to {end}; put a copy of the file there")
+        return end.relative_to(self.root.resolve()).as_posix()
+
+    def note(self, message: str) -> None:
+        """Records something the user should know; it goes into scene.json, so it names no absolute path."""
+        if message not in self.warnings:
+            self.warnings.append(message)
+
+    def repaired(self, message: str) -> None:
+        """Records a defect that was mended.
+
+        Raises:
+            SceneRejected: the folder is read strictly.
+        """
+        if self.strict:
+            raise SceneRejected(f"{self.root}: {message}; --strict refuses what would be repaired")
+        self.note(message)
+
+
+def read_json(path: Path) -> Any:
+    """Decodes one JSON file.
+
+    Raises:
+        SceneRejected: not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, a number too long, brackets too deep
+        raise SceneRejected(f"{path}: not readable as JSON ({error}); fetch the file again") from error
+
+
+def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
+    """One array of an NPZ file.
+
+    Raises:
+        SceneRejected: not an NPZ, damaged, or without the array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return np.asarray(arrays[name])
+    except Exception as error:  # damaged archives fail in zipfile, zlib or NumPy, each in its own way
+        reason = " ".join(str(error).split())
+        raise SceneRejected(f"{path}: not readable ({type(error).__name__}: {reason}); {remedy}") from error
+
+
+def read_image(path: Path, mode: str) -> np.ndarray:
+    """Reads an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w).
+
+    Raises:
+        SceneRejected: not an image, or truncated.
+    """
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert(mode))
+    except Exception as error:  # Pillow's decoders raise anything on a broken file
+        reason = str(error).replace(str(path), path.name)
+        raise SceneRejected(f"{path}: not readable as an image ({reason}); fetch the file again") from error
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """Reads a single mesh in file order (no vertices merged or moved).
+
+    Raises:
+        SceneRejected: unreadable, truncated, empty, or with vertices that are not finite.
+    """
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+    except Exception as error:  # trimesh's loaders raise anything on a broken file
+        raise SceneRejected(
+            f"{path}: not readable as a mesh ({type(error).__name__}: {error}); fetch the file again"
+        ) from error
+    assert isinstance(mesh, trimesh.Trimesh)
+    check_mesh(path, np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return mesh
+
+
+def vertex_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(n, 3) uint8 colour of each vertex; grey where the file has none."""
+    colours = getattr(mesh.visual, "vertex_colors", None)
+    if colours is None or len(colours) != len(mesh.vertices):
+        return np.full((len(mesh.vertices), 3), 170, np.uint8)
+    return np.asarray(colours, np.uint8)[:, :3]
+
+
+def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Refuses what no stage can use.
+
+    Raises:
+        SceneRejected: no faces, indices out of range, or vertices that are not finite.
+    """
+    if len(vertices) == 0 or len(faces) == 0:
+        raise SceneRejected(
+            f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; fetch the file again"
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SceneRejected(
+            f"{path}: a face names vertex {int(faces.max())} of {len(vertices)}; the file is truncated, fetch it again"
+        )
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if bad:
+        raise SceneRejected(f"{path}: {bad} vertices are not finite numbers; repair or fetch the file again")
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjMesh:
+    """Content of an OBJ file, polygons cut into triangles."""
+
+    vertices: np.ndarray
+    """(n, 3) float64."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    corner_uv: np.ndarray | None
+    """(m, 3, 2) float64, or None where a face has no texture coordinates."""
+    material: np.ndarray
+    """(m,) int64 into `materials`; -1 before the first `usemtl`."""
+    materials: tuple[str, ...]
+    libraries: tuple[str, ...]
+    """Names of MTL files."""
+
+
+def read_obj(path: Path) -> ObjMesh:
+    """Reads a polygon OBJ in its own vertex order (labels refer to it; mesh libraries reorder at seams).
+
+    Raises:
+        SceneRejected: a malformed line, an index out of range, no faces, or vertices that are not finite.
+    """
+    positions: list[str] = []
+    uvs: list[str] = []
+    corners: list[str] = []
+    sizes: list[int] = []
+    material: list[int] = []
+    names: dict[str, int] = {}
+    libraries: list[str] = []
+    current = -1
+    try:
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+            if line.startswith("v "):
+                positions.extend(line.split()[1:4])
+                if len(positions) % 3:
+                    raise SceneRejected(f"{path}:{number}: a vertex has fewer than 3 coordinates; fetch the file again")
+            elif line.startswith("vt "):
+                uvs.extend((line.split() + ["0"])[1:3])
+            elif line.startswith("f "):
+                words = line.split()[1:]
+                if len(words) < 3:
+                    raise SceneRejected(f"{path}:{number}: a face has {len(words)} corners, expected at least 3")
+                if "-" in line:
+                    words = [_from_the_end(w, len(positions) // 3, len(uvs) // 2) for w in words]
+                corners.extend(words)
+                sizes.append(len(words))
+                material.append(current)
+            elif line.startswith("usemtl"):
+                current = names.setdefault(line[6:].strip(), len(names))
+            elif line.startswith("mtllib"):
+                libraries.append(line[6:].strip())
+        vertices = np.array(positions, float).reshape(-1, 3)
+        uv = np.array(uvs, float).reshape(-1, 2)
+        index, uv_index = _corner_indices(corners)
+    except (ValueError, OverflowError) as error:
+        if isinstance(error, SceneRejected):
+            raise
+        raise SceneRejected(f"{path}: not readable as OBJ ({error}); the file is damaged, fetch it again") from error
+    corner, face = _fans(np.array(sizes, np.int64))
+    faces = index[corner] - 1
+    check_mesh(path, vertices, faces)
+    corner_uv = None
+    if len(uv) and uv_index is not None:
+        if uv_index.min() < 1 or uv_index.max() > len(uv):
+            raise SceneRejected(
+                f"{path}: a face names texture coordinate {int(uv_index.max())} of {len(uv)}; fetch the file again"
+            )
+        corner_uv = uv[uv_index - 1][corner]
+        if not np.isfinite(corner_uv).all():
+            corner_uv = np.where(np.isfinite(corner_uv), corner_uv, 0.0)
+    return ObjMesh(vertices, faces, corner_uv, np.array(material, np.int64)[face], tuple(names), tuple(libraries))
+
+
+def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:
+    """An OBJ corner with negative indices (-1 is the last one so far) made positive."""
+    parts = (word.split("/") + [""])[:2]
+    counts = (n_vertices, n_uv)
+    return "/".join(str(counts[k] + 1 + int(p)) if p.startswith("-") else p for k, p in enumerate(parts) if p or k == 0)
+
+
+def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
+    """(c,) vertex and (c,) texture indices, from 1; None where a corner has no texture coordinate."""
+    if not corners:
+        return np.zeros(0, np.int64), None
+    slashes = corners[0].count("/")
+    if "//" not in corners[0] and all(c.count("/") == slashes for c in corners) and not any("//" in c for c in corners):
+        table = np.array("/".join(corners).split("/"), np.int64).reshape(len(corners), slashes + 1)
+        return table[:, 0], table[:, 1] if slashes else None
+    split = [(c.split("/") + [""])[:2] for c in corners]
+    index = np.array([s[0] for s in split], np.int64)
+    has_uv = all(s[1] for s in split)
+    return index, np.array([s[1] for s in split], np.int64) if has_uv else None
+
+
+def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cuts polygons into triangles around their first corner.
+
+    Args:
+        sizes: (p,) corners of each polygon, at least 3.
+
+    Returns:
+        (m, 3) indices into the list of corners, (m,) polygon of each triangle.
+    """
+    first = np.cumsum(sizes) - sizes
+    face = np.repeat(np.arange(len(sizes)), sizes - 2)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    start = first[face]
+    return np.stack([start, start + step + 1, start + step + 2], axis=1).reshape(-1, 3), face
+
+
+def read_textured_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices (n, 3), faces (m, 3) and texture coordinates of the corners (m, 3, 2) or None, as `read_obj`."""
+    mesh = read_obj(path)
+    return mesh.vertices, mesh.faces, mesh.corner_uv

@@ -1,0 +1,183 @@
+"""A raw Gibson folder in, `RawScene` out; labels, alignments and maps are taken where they are.
+
+Files of the release: `docs/dataset.md` of iGibson 0.0.4; z up, metres, maps of 0.01 m a pixel whose middle is
+the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from converters.read.annotations import inside_scan, parse_annotations
+from converters.read.cad import read_cad
+from converters.read.files import SourceFolder, read_image, read_json, read_npz
+from converters.read.obj import GREY, TexturedMesh, read_scan_obj
+from converters.read.storeys import label_storeys
+from converters.read.surfaces import check_upright
+from converters.records.errors import SceneRejected
+from converters.records.raw import FLOOR, GivenMap, RawScene, ScanMesh, Storey
+
+MESH = "mesh_z_up.obj"
+LABELS = "mesh_z_up.labels.npz"
+ALIGNMENTS = "alignments.json"
+MAP_RESOLUTION_M = 0.01
+"""Gibson's floor maps: 0.01 m a pixel, the middle of the image at the world's origin."""
+STOREY_M = 1.0
+"""Two floors are at least this far apart."""
+MAP_SHARE = 0.5
+"""Of a map's traversable area that must lie inside the mesh, and of the mesh's floor that must lie on the map."""
+
+
+def looks_like(root: Path) -> bool:
+    """True when the folder has Gibson's z-up mesh."""
+    return (root / MESH).is_file()
+
+
+def read_gibson(root: Path, strict: bool = False) -> RawScene:
+    """Reads mesh, texture, labels, floor heights, maps, alignments and CAD models.
+
+    Without labels, floor, walls and ceiling are told by shape; without alignments the scene has structure only.
+
+    Args:
+        root: the folder.
+        strict: refuse what would be repaired with a warning.
+
+    Raises:
+        SceneRejected: a file is missing or damaged, counts differ, or mesh, floors and maps do not fit together.
+    """
+    source = SourceFolder(root, strict)
+    mesh = read_scan_obj(source, MESH, "expected Gibson's textured z-up mesh")
+    heights = read_floors(source)
+    labels = None
+    if source.has(LABELS):
+        labels = _labels(source.use(LABELS, ""))
+        if len(labels) != len(mesh.vertices):
+            raise SceneRejected(
+                f"{root / LABELS}: {len(labels)} labels for the {len(mesh.vertices)} vertices of {MESH}, "
+                "expected one for each 'v' line; label the same mesh again"
+            )
+    check_upright(str(root / MESH), mesh.vertices, mesh.faces, labels, heights[0])
+    if labels is None:
+        source.note(f"{LABELS} is absent: floor, walls and ceiling are told by shape")
+        labels = label_storeys(mesh.vertices, mesh.faces, heights)
+    cads, annotations = {}, ()
+    if source.has(ALIGNMENTS):
+        path = source.use(ALIGNMENTS, "")
+        _, records = parse_annotations(read_json(path), path)
+        cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
+        annotations = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh.vertices)
+        cads = {a.cad_id: cads[a.cad_id] for a in annotations}
+    else:
+        source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")
+    return building(source, "gibson", mesh, labels, heights, cads, annotations)
+
+
+def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heights, cads, annotations) -> RawScene:
+    """The record of a Gibson building: joins what was read with maps, licence and hashes.
+
+    Raises:
+        SceneRejected: a map does not fit the mesh.
+    """
+    grey = np.full((len(mesh.vertices), 3), GREY[0], np.uint8)
+    floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
+    maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
+    licence = read_licence(source)
+    return RawScene(
+        name=source.root.resolve().name,
+        source_format=layout,
+        scan=ScanMesh(
+            mesh.vertices, mesh.faces, labels, None if mesh.texture is not None else grey, mesh.corner_uv, mesh.texture
+        ),
+        cads=cads,
+        annotations=annotations,
+        floor_height_m=heights[0],
+        given_map=maps[0],
+        licence=licence,
+        sources=dict(sorted(source.sha256.items())),
+        storeys=tuple(Storey(h, m) for h, m in zip(heights, maps, strict=True)) if len(heights) > 1 else (),
+        warnings=tuple(source.warnings),
+    )
+
+
+def _labels(path: Path) -> np.ndarray:
+    labels = read_npz(path, "label", "expected an NPZ with the array 'label' of NYU40 ids")
+    if labels.dtype.kind not in "iu":
+        raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
+    return labels.reshape(-1).astype(np.int64)
+
+
+def read_floors(source: SourceFolder) -> tuple[float, ...]:
+    """Heights of the floors, m, lowest first.
+
+    Raises:
+        SceneRejected: no `floors.txt`, no finite number in it, or two floors less than a metre apart.
+    """
+    path = source.use("floors.txt", "expected one floor height in metres a line")
+    words = path.read_text(encoding="utf-8", errors="replace").split()
+    try:
+        heights = sorted(float(word) for word in words)
+    except ValueError as error:
+        raise SceneRejected(f"{path}: {error}; expected one floor height in metres a line") from error
+    if not heights or not np.isfinite(heights).all() or max(map(abs, heights)) > 1e4:
+        raise SceneRejected(f"{path}: holds {words[:4]}, expected one floor height in metres a line")
+    for low, high in zip(heights, heights[1:], strict=False):
+        if high - low < STOREY_M:
+            raise SceneRejected(
+                f"{path}: floors at {low:g} m and {high:g} m are less than {STOREY_M:g} m apart; give each floor once"
+            )
+    return tuple(heights)
+
+
+def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, floor_xy: np.ndarray) -> GivenMap | None:
+    """A floor's own traversable map, less its obstacles; absent maps are computed from the mesh alone.
+
+    Args:
+        source: the folder.
+        number: of the floor, from the lowest.
+        mesh_xy: (n, 2) vertices of the mesh, m.
+        floor_xy: (k, 2) those of this floor's floor.
+
+    Raises:
+        SceneRejected: not a square image, obstacles of another size, or an area other than the mesh's.
+    """
+    name, obstacle_name = f"floor_trav_{number}.png", f"floor_{number}.png"
+    if not source.has(name):
+        return None
+    path = source.use(name, "")
+    image = read_image(path, "L")
+    if image.shape[0] != image.shape[1]:
+        raise SceneRejected(f"{path}: is {image.shape[1]} x {image.shape[0]}, expected a square image")
+    free = image > 127
+    if source.has(obstacle_name):
+        obstacles = read_image(source.use(obstacle_name, ""), "L")
+        if obstacles.shape != free.shape:
+            raise SceneRejected(
+                f"{source.root / obstacle_name}: is {obstacles.shape[1]} x {obstacles.shape[0]}, expected the "
+                f"{free.shape[1]} x {free.shape[0]} of {name}; take both from one release"
+            )
+        free &= obstacles > 0
+    half = image.shape[0] / 2 * MAP_RESOLUTION_M
+    low, high = mesh_xy.min(axis=0) - 0.1, mesh_xy.max(axis=0) + 0.1
+    row, column = np.nonzero(free)
+    at = (np.stack([column, row], axis=1) + 0.5) * MAP_RESOLUTION_M - half
+    inside = ((at > low) & (at < high)).all(axis=1).mean() if len(at) else 1.0
+    covered = (np.abs(floor_xy) < half).all(axis=1).mean() if len(floor_xy) else 1.0
+    if inside < MAP_SHARE or covered < MAP_SHARE:
+        raise SceneRejected(
+            f"{path}: covers {2 * half:.1f} x {2 * half:.1f} m around the origin, the mesh reaches from "
+            f"({low[0] + 0.1:.1f}, {low[1] + 0.1:.1f}) to ({high[0] - 0.1:.1f}, {high[1] - 0.1:.1f}) m: "
+            f"{inside:.0%} of the map's free area lies inside the mesh, {covered:.0%} of the mesh's floor on the map; "
+            "expected maps of the same mesh at 0.01 m a pixel"
+        )
+    return GivenMap(free, MAP_RESOLUTION_M, (-half, -half))
+
+
+def read_licence(source: SourceFolder) -> str:
+    """First 400 characters of the folder's LICENCE, on one line."""
+    licence = "unknown: the source folder has no LICENCE file"
+    if source.has("LICENCE"):
+        text = source.use("LICENCE", "").read_text(encoding="utf-8", errors="replace").strip()
+        licence = " ".join(text.split())[:400] or licence
+    return licence

@@ -1,0 +1,265 @@
+"""A folder of the released interactive Gibson set in, `RawScene` out.
+
+Layout (`docs/dataset.md` of iGibson 0.0.4): `mesh_z_up_cleaned.obj` is the scan without the annotated furniture,
+`plane_z_up_<f>.obj` floor for the holes it left, `alignment_centered_<i>_<synset>.urdf` a piece of furniture
+whose orientation and scale are baked into its mesh, `pos_<i>_<synset>.txt` the x y z of its origin; maps and
+`floors.txt` as in `gibson`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+
+from converters.geometry.boxes import upright_box
+from converters.geometry.faces import merge_vertices, sample_faces
+from converters.geometry.rotations import yaw_matrix
+from converters.read.annotations import inside_scan
+from converters.read.cad import clean_surface
+from converters.read.files import SourceFolder
+from converters.read.gibson import building, read_floors, read_traversable
+from converters.read.meshes import colours_of_faces
+from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj
+from converters.read.storeys import label_storeys
+from converters.read.surfaces import check_upright
+from converters.read.urdf import read_urdf
+from converters.records.errors import SceneRejected
+from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, Hinge, RawScene
+
+MESH = "mesh_z_up_cleaned.obj"
+PREFIX = "alignment_centered"
+CLASSES = SYNSETS | {"00000001": "door"}
+"""Synset ids of the release; doors had none."""
+DOOR_BAND_M = (0.3, 1.8)
+"""Heights above the door's foot at which walls stop a leaf."""
+DOOR_MOST_RAD = math.radians(120)
+NEAR_HINGE_M = 0.15
+"""A wall this close to the hinge carries the leaf and does not stop it."""
+PLANE_CELL_M = 0.1
+SAME_SHARE = 0.5
+"""Two objects of one class that share this much of the smaller one's bounding box are one object."""
+
+
+def looks_like(root: Path) -> bool:
+    """True when the folder has the cleaned mesh and a furniture URDF."""
+    return (root / MESH).is_file() and any(root.glob(f"{PREFIX}*.urdf"))
+
+
+def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
+    """Reads cleaned mesh, floor planes, furniture, floor heights and maps.
+
+    The furniture keeps its own mass, friction and collision meshes. A door's yaw is taken out of its mesh and
+    goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed at the edge that stands
+    at a wall, and turns as far as walls let it.
+
+    Args:
+        root: the folder.
+        strict: refuse what would be repaired with a warning.
+
+    Raises:
+        SceneRejected: a file is missing or damaged, or mesh, floors and maps do not fit together.
+    """
+    source = SourceFolder(root, strict)
+    mesh = read_scan_obj(source, MESH, "expected the scan without its furniture")
+    heights = read_floors(source)
+    check_upright(str(root / MESH), mesh.vertices, mesh.faces, None, heights[0])
+    labels = label_storeys(mesh.vertices, mesh.faces, heights)
+    for k, height in enumerate(heights):
+        mesh, labels = _with_plane(source, k, height, mesh, labels)
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    pairs = [_furniture(source, path) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
+    pairs = [
+        (dataclasses.replace(a, hinge=assume_hinge(c.vertices, a.pose, middle)) if a.category == "door" else a, c)
+        for a, c in pairs
+    ]
+    cads = {a.cad_id: c for a, c in pairs}
+    annotations = _without_doubles(source, tuple(a for a, _ in pairs), cads)
+    if annotations:
+        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh.vertices)
+    cads = {a.cad_id: cads[a.cad_id] for a in annotations}
+    return building(source, "interactive-gibson", mesh, labels, heights, cads, annotations)
+
+
+def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
+    """One piece of furniture and its model."""
+    synset = path.stem.rsplit("_", 1)[-1]
+    if synset not in CLASSES:
+        known = ", ".join(f"{k} ({v})" for k, v in sorted(CLASSES.items()))
+        raise SceneRejected(f"{path}: category id is {synset}, expected one of {known}")
+    category = CLASSES[synset]
+    position = _position(source, path.name)
+    item = read_urdf(source, path.name, "")
+    vertices, faces, keep = merge_vertices(item.surface.vertices, item.surface.faces)
+    colours = colours_of_faces(item.surface)[keep]
+    vertices, faces, colours = clean_surface(source, path.name, vertices, faces, colours)
+    pose = np.eye(4)
+    pose[:3, 3] = position
+    pieces = item.pieces
+    if category == "door":
+        box = upright_box(vertices)
+        yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
+        if box.half[1] > box.half[0]:
+            yaw += math.pi / 2
+        turn = yaw_matrix(yaw)
+        pose[:3, :3] = turn
+        vertices = vertices @ turn
+        pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
+    name = path.stem.removeprefix(PREFIX).strip("_")
+    cad = CadModel(category, name, vertices, faces, colours, pieces, item.mass_kg, item.friction)
+    none = np.zeros((0, 3))
+    return Annotation(category, name, pose, "__SYM_NONE", none, none), cad
+
+
+def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> Hinge:
+    """The upright hinge of a door that came without one.
+
+    Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
+    stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
+    scanned leaf itself.
+
+    Args:
+        leaf: (n, 3) vertices, CAD frame, the leaf along x.
+        pose: (4, 4) CAD frame -> scan frame, upright and unscaled.
+        structure: (m, 3) points of the scan, m.
+    """
+    low, high = leaf.min(axis=0), leaf.max(axis=0)
+    local = (structure - pose[:3, 3]) @ pose[:3, :3]
+    height = local[:, 2] - low[2]
+    local = local[(height > DOOR_BAND_M[0]) & (height < DOOR_BAND_M[1]), :2]
+    across = (low[1] + high[1]) / 2
+    half, length = (high[1] - low[1]) / 2 + 0.02, high[0] - low[0]
+    choices = []
+    for end, inward in ((low[0], 1.0), (high[0], -1.0)):
+        # Distance from the hinge along the leaf as it stands, and across it.
+        point = (local - [end, across]) * [inward, 1.0]
+        radius, angle = np.hypot(*point.T), np.arctan2(point[:, 1], point[:, 0])
+        reach = (radius > NEAR_HINGE_M) & (radius < length + 0.02)
+        own = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
+        turns = np.arctan2(half, np.maximum(radius, half))  # a point stops the leaf this much before its middle line
+        stops = np.asarray(angle - np.sign(angle) * turns)[reach & ~own]
+        ahead, behind = np.sort(stops[stops > 0]), np.sort(np.negative(stops[stops < 0]))
+        # Three points make an obstacle; one or two are noise of the scan.
+        left = min(ahead[2] if len(ahead) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
+        right = min(behind[2] if len(behind) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
+        span = (-right, left) if inward > 0 else (-left, right)
+        choices.append((int((radius < NEAR_HINGE_M + half).sum()), left + right, (end, span)))
+    end, span = max(choices, key=lambda c: c[:2])[2]
+    return Hinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
+
+
+def _position(source: SourceFolder, urdf: str) -> np.ndarray:
+    """(3,) m, of the text file that goes with a URDF."""
+    name = urdf.replace(PREFIX, "pos")[: -len("urdf")] + "txt"
+    path = source.use(name, f"expected x y z of {urdf} in metres")
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    try:
+        position = np.array(lines[0].split(), float)
+    except ValueError as error:
+        raise SceneRejected(f"{path}: {error}; expected x y z in metres") from error
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise SceneRejected(f"{path}: holds {len(position)} numbers, expected x y z in metres, all finite")
+    return position
+
+
+def _without_doubles(
+    source: SourceFolder, annotations: tuple[Annotation, ...], cads: dict[str, CadModel]
+) -> tuple[Annotation, ...]:
+    """Drops objects of one class that stand in an earlier one: the release annotates some furniture twice."""
+    kept: list[tuple[Annotation, np.ndarray, np.ndarray]] = []
+    for annotation in annotations:
+        placed = cads[annotation.cad_id].vertices @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        double = None
+        for other, o_low, o_high in kept:
+            shared = np.prod(np.maximum(np.minimum(high, o_high) - np.maximum(low, o_low), 0.0))
+            smaller = max(min(np.prod(high - low), np.prod(o_high - o_low)), 1e-12)
+            if other.category == annotation.category and shared > SAME_SHARE * smaller:
+                double = other
+        if double is None:
+            kept.append((annotation, low, high))
+        else:
+            source.note(f"{annotation.category} {annotation.cad_id} stands in {double.cad_id}; it is left out")
+    return tuple(a for a, _, _ in kept)
+
+
+def _with_plane(
+    source: SourceFolder, number: int, height_m: float, mesh: TexturedMesh, labels: np.ndarray
+) -> tuple[TexturedMesh, np.ndarray]:
+    """The scan with the release's floor plane where it shows no floor and the floor's map has some."""
+    name = f"plane_z_up_{number}.obj"
+    if not source.has(name):
+        source.note(f"{name} is absent: the floor under the furniture is patched from the floor around it")
+        return mesh, labels
+    plane = read_scan_obj(source, name, "")
+    floor_faces = mesh.faces[(labels[mesh.faces] == FLOOR).all(axis=1)]
+    near = np.abs(mesh.vertices[floor_faces, 2].mean(axis=1) - height_m) < 0.5
+    seen = set()
+    if near.any():
+        seen = {tuple(c) for c in _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0])}
+    floor_xy = mesh.vertices[labels == FLOOR, :2]
+    given = read_traversable(source, number, mesh.vertices[:, :2], floor_xy) if len(floor_xy) else None
+    patch = plane_patch(
+        plane, height_m, seen, given, mesh.vertices[:, :2].min(axis=0), mesh.vertices[:, :2].max(axis=0)
+    )
+    if patch is None:
+        return mesh, labels
+    return join_meshes(mesh, patch), np.concatenate([labels, np.full(len(patch.vertices), FLOOR, np.int64)])
+
+
+def _cells(points: np.ndarray) -> np.ndarray:
+    return np.floor(points[:, :2] / PLANE_CELL_M).astype(np.int64)
+
+
+def plane_patch(
+    plane: TexturedMesh,
+    height_m: float,
+    seen: set[tuple[int, ...]],
+    given: GivenMap | None,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> TexturedMesh | None:
+    """Squares of 0.1 m of a floor plane, where its cells are unseen, inside the mesh and on the map.
+
+    Args:
+        plane: mesh, nearly level.
+        height_m: of the squares.
+        seen: cells (column, row) that the scan shows already.
+        given: map that the squares must lie on, or None.
+        low: (2,) lower bounds of the mesh, m.
+        high: (2,) its upper bounds.
+
+    Returns:
+        The squares with the plane's texture, or None where none is needed.
+    """
+    extent = np.ptp(plane.vertices[:, :2], axis=0)
+    if extent.max() > 1000.0:
+        raise SceneRejected(f"a floor plane is {extent.max():.0f} m long, expected a building's floor in metres")
+    points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
+    cell, first = np.unique(_cells(points), axis=0, return_index=True)
+    middle = (cell + 0.5) * PLANE_CELL_M
+    inside = np.atleast_1d(((middle > low) & (middle < high)).all(axis=1))
+    wanted = np.flatnonzero([tuple(c) not in seen and bool(i) for c, i in zip(cell, inside, strict=True)])
+    if given is not None:
+        index = np.floor((middle - given.origin) / given.resolution_m).astype(np.int64)
+        on = np.atleast_1d(((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1))
+        index = np.where(on[:, None], index, 0)
+        wanted = wanted[on[wanted] & given.traversable[index[wanted, 1], index[wanted, 0]]]
+    cell, face = cell[wanted], face[first[wanted]]
+    if not len(cell):
+        return None
+    corner = (cell[:, None] + np.array([(0, 0), (1, 0), (1, 1), (0, 1)])) * PLANE_CELL_M
+    vertices = np.column_stack([corner.reshape(-1, 2), np.full(4 * len(cell), height_m)])
+    start = 4 * np.arange(len(cell))[:, None]
+    faces = np.concatenate([start + [0, 1, 2], start + [0, 2, 3]])
+    if plane.corner_uv is None or plane.texture is None:
+        return TexturedMesh(vertices, faces, None, None)
+    a, b, c = (plane.vertices[plane.faces[face, k], :2] for k in range(3))
+    matrix = np.stack([b - a, c - a], axis=2)
+    weights = np.einsum("kij,knj->kni", np.linalg.pinv(matrix), corner - a[:, None])
+    uv = plane.corner_uv[face]
+    at = uv[:, None, 0] + weights @ (uv[:, 1:] - uv[:, :1])
+    corner_uv = np.concatenate([at[:, [0, 1, 2]], at[:, [0, 2, 3]]])
+    return dataclasses.replace(plane, vertices=vertices, faces=faces, corner_uv=np.clip(corner_uv, 0.0, 1.0))

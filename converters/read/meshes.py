@@ -1,0 +1,177 @@
+"""A mesh file of any kind that trimesh knows in, a `TexturedMesh` in metres and z up out.
+
+trimesh reads the files that a model names through `SourceResolver`: within the source folder, hashed, and with a
+word about what is missing. A COLLADA file states its unit and up axis; the other formats do not.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.resolvers import Resolver
+from trimesh.visual import ColorVisuals
+
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.files import SourceFolder, check_mesh
+from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, read_texture, texels, use_found
+from converters.records.errors import SceneRejected
+
+UP_AXES = {
+    "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    "Y_UP": Y_UP_TO_Z_UP,
+    "Z_UP": np.eye(3),
+}
+"""COLLADA's word -> turn to z up."""
+
+
+class SourceResolver(Resolver):
+    """Gives trimesh the files that a model names."""
+
+    def __init__(self, source: SourceFolder, model: Path) -> None:
+        """Resolves names in `model`, a path inside of `source`."""
+        self.source = source
+        self.model = model
+        self.refusal: SceneRejected | None = None
+        """What trimesh's loaders swallowed: they go on without a file, whatever the reason."""
+
+    def get(self, key: str) -> bytes:
+        """Content of a named file.
+
+        Raises:
+            FileNotFoundError: there is none, or an image that is not readable; the source has a warning.
+        """
+        try:
+            if Path(key).suffix.lower() in Image.registered_extensions():
+                found = read_texture(self.source, self.model, key) is not None
+            else:
+                found = True
+            path = use_found(self.source, self.model.parent, key, self.model.name) if found else None
+        except SceneRejected as refusal:
+            self.refusal = self.refusal or refusal
+            raise
+        if path is None:
+            raise FileNotFoundError(key)
+        return path.read_bytes()
+
+    def keys(self) -> list[str]:
+        """Nothing is listed: a model's own words alone say what is read."""
+        return []
+
+    def write(self, name: str, data: Any) -> None:
+        """Refused: a source is only read."""
+        raise NotImplementedError(name)
+
+    def namespaced(self, namespace: str) -> SourceResolver:
+        """Resolves names in a folder beside the model."""
+        return SourceResolver(self.source, self.model.parent / namespace / self.model.name)
+
+
+def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
+    """Reads a mesh file of any kind that trimesh knows, with its textures or colours.
+
+    Raises:
+        SceneRejected: missing, damaged or empty, or it names a file by a link that leads out of the source.
+    """
+    if relative.lower().endswith(".obj"):
+        return read_scan_obj(source, relative, remedy)
+    path = source.use(relative, remedy)
+    resolver = SourceResolver(source, path)
+    try:
+        with path.open("rb") as file:
+            loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
+        assert isinstance(loaded, trimesh.Scene)
+        parts = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
+        turn = _collada_turn(path) if path.suffix.lower() == ".dae" else np.eye(3)
+    except Exception as error:  # trimesh's loaders raise anything on a broken file
+        if isinstance(error, SceneRejected):
+            raise
+        reason = " ".join(str(error).split())
+        raise resolver.refusal or SceneRejected(
+            f"{path}: not readable as a mesh ({type(error).__name__}: {reason}); expected OBJ, PLY, STL, GLB or DAE"
+        ) from error
+    if resolver.refusal is not None:
+        raise resolver.refusal
+    if not parts:
+        raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
+    surface = _painted(path, parts[0], turn)
+    for part in parts[1:]:
+        surface = join_meshes(surface, _painted(path, part, turn))
+    return surface
+
+
+def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMesh:
+    vertices, faces = np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)
+    check_mesh(path, vertices, faces)
+    vertices = vertices @ turn.T
+    image = material_image(getattr(part.visual, "material", None))
+    uv = getattr(part.visual, "uv", None)
+    if image is not None and uv is not None and len(uv) == len(vertices):
+        uv = np.where(np.isfinite(uv), uv, 0.0)
+        return TexturedMesh(vertices, faces, uv[faces], np.asarray(image.convert("RGB")))
+    return textured_by_face(vertices, faces, face_colours(part))
+
+
+def _collada_turn(path: Path) -> np.ndarray:
+    """(3, 3) from a COLLADA file's frame to metres and z up; by its standard a silent file is in metres, y up.
+
+    Raises:
+        SceneRejected: a unit that is no positive number, or an unknown axis.
+    """
+    asset = ElementTree.parse(path).getroot().find("{*}asset")
+    unit = None if asset is None else asset.find("{*}unit")
+    axis = (None if asset is None else asset.findtext("{*}up_axis")) or "Y_UP"
+    text = "1" if unit is None else unit.get("meter", "1")
+    try:
+        meter = float(text)
+    except ValueError:
+        meter = math.nan
+    if not 0.0 < meter < math.inf or axis.strip() not in UP_AXES:
+        raise SceneRejected(
+            f"{path}: its unit is '{text}' m and its up axis '{axis}', expected a positive number and one of "
+            f"{', '.join(UP_AXES)}; export it again"
+        )
+    return meter * UP_AXES[axis.strip()]
+
+
+def material_image(material: Any) -> Image.Image | None:
+    """Texture of a trimesh material: of a plain one, or the base colour of a glTF's."""
+    image = getattr(material, "image", None)
+    return getattr(material, "baseColorTexture", None) if image is None else image
+
+
+def face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(m, 3) uint8 colour of every face: its own or its vertices', else the material's; grey without any."""
+    count = len(mesh.faces)
+    if isinstance(mesh.visual, ColorVisuals) and mesh.visual.defined:
+        return np.asarray(mesh.visual.face_colors, np.uint8)[:, :3]
+    material = getattr(mesh.visual, "material", None)
+    diffuse = getattr(material, "diffuse", None)
+    diffuse = getattr(material, "main_color", None) if diffuse is None else diffuse
+    if diffuse is not None:
+        return np.tile(np.asarray(diffuse, np.uint8)[:3], (count, 1))
+    return np.full((count, 3), 160, np.uint8)
+
+
+def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> TexturedMesh:
+    """A mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
+    palette, index = np.unique(np.asarray(colours, np.uint8), axis=0, return_inverse=True)
+    side = math.ceil(math.sqrt(len(palette)))
+    image = np.zeros((side * side, 3), np.uint8)
+    image[: len(palette)] = palette
+    image = np.repeat(np.repeat(image.reshape(side, side, 3), 4, axis=0), 4, axis=1)
+    row, column = np.divmod(index.reshape(-1), side)
+    uv = np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=1)
+    return TexturedMesh(vertices, faces, np.repeat(uv[:, None], 3, axis=1), image)
+
+
+def colours_of_faces(mesh: TexturedMesh) -> np.ndarray:
+    """(m, 3) uint8: the texture at the middle of each face, grey without one."""
+    if mesh.texture is None or mesh.corner_uv is None:
+        return np.full((len(mesh.faces), 3), 170, np.uint8)
+    return texels(mesh.texture, mesh.corner_uv.mean(axis=1))

@@ -1,0 +1,259 @@
+"""A textured OBJ and its MTL in, `TexturedMesh` (vertices in the file's own order, one image) out.
+
+Names of files that an OBJ or MTL gives are sought generously, for folders travel between machines; what is
+missing costs colour only and is a warning.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from PIL import Image
+
+from converters.read.files import ObjMesh, SourceFolder, read_image, read_obj
+from converters.records.errors import SceneRejected
+
+GREY = (170, 170, 170)
+"""Colour of what has none."""
+MAX_TEXTURE_PX = 8192
+"""Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TexturedMesh:
+    """A mesh with at most one image."""
+
+    vertices: np.ndarray
+    """(n, 3) float64, m."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    corner_uv: np.ndarray | None
+    """(m, 3, 2) float64, origin at the lower left, or None without an image."""
+    texture: np.ndarray | None
+    """(h, w, 3) uint8, or None."""
+
+
+def find_file(source: SourceFolder, folder: Path, name: str) -> Path | None:
+    """The file that a model names, sought also by its bare name (paths of another machine, letter case).
+
+    Raises:
+        SceneRejected: what stands under that name is a link that leads out of the source or nowhere.
+    """
+    words = name.strip().strip('"').removeprefix("file://")
+    bare = words.replace("\\", "/")
+    names = dict.fromkeys(n for n in (bare, bare.split()[-1] if bare.split() else bare, unquote(bare)) if n)
+    for candidate in names:
+        path = folder / candidate
+        if _is_there(path) and Path(os.path.abspath(path)).is_relative_to(os.path.abspath(source.root)):
+            source.inside(path)
+            return path
+    wanted = {n.rsplit("/", 1)[-1].lower() for n in names}
+    for path in sorted(folder.iterdir()):
+        if path.name.lower() in wanted and _is_there(path):
+            source.inside(path)
+            return path
+    return None
+
+
+def _is_there(path: Path) -> bool:
+    """A file or a link, a broken one too."""
+    return os.path.isfile(path) or os.path.islink(path)
+
+
+def use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | None:
+    """The named file with its hash recorded; a warning where it stands under another name than the given one.
+
+    Raises:
+        SceneRejected: a link that leads out of the source or nowhere.
+    """
+    found = find_file(source, folder, name)
+    if found is None:
+        return None
+    relative = source.inside(found)
+    if source.relative(folder / unquote(name.strip())) != relative:
+        source.repaired(f"{by}: names '{name.strip()}', which is not there; {relative} is taken")
+    return source.use(relative, "")
+
+
+def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Image of every material of an OBJ's MTL files; a material without a usable texture gets its colour (Kd).
+
+    Args:
+        source: the folder; takes warnings.
+        obj: path of the OBJ, inside the folder.
+        libraries: MTL names in the OBJ.
+
+    Returns:
+        Material -> (h, w, 3) uint8; (1, 1, 3) for a plain colour.
+    """
+    where = source.relative(obj) or obj.name
+    found = [use_found(source, obj.parent, name, where) for name in libraries]
+    paths = [p for p in found if p is not None]
+    if not paths and obj.with_suffix(".mtl").is_file():
+        paths = [source.use(source.relative(obj.with_suffix(".mtl")) or "", "")]
+    if not paths:
+        source.repaired(
+            f"{where}: its material file {', '.join(libraries) or '(none named)'} is missing; it stays grey"
+        )
+    result: dict[str, np.ndarray] = {}
+    for path in paths:
+        for name, (colour, image_name) in parse_mtl(path.read_text(encoding="utf-8", errors="replace")).items():
+            result[name] = np.array(colour, np.uint8).reshape(1, 1, 3)
+            if image_name:
+                image = read_texture(source, path, image_name)
+                result[name] = result[name] if image is None else image
+    return result
+
+
+def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None:
+    """The image (h, w, 3) uint8 that a material file or model names; None and a warning where there is none.
+
+    Raises:
+        SceneRejected: a link that leads out of the source or nowhere; with a strict source, no readable image.
+    """
+    where = source.relative(by) or by.name
+    path = use_found(source, by.parent, name, where)
+    if path is None:
+        lack = "lies outside of the source folder" if os.path.isfile(by.parent / name) else "is missing"
+        source.repaired(f"{where}: names the texture '{name}', which {lack}; the material's plain colour is taken")
+        return None
+    try:
+        return read_image(path, "RGB")
+    except SceneRejected as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        source.repaired(f"{source.relative(path)}: {reason}; the material's plain colour is taken")
+        return None
+
+
+def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
+    """Material -> its diffuse colour (0 to 255) and the name of its texture ('' without one)."""
+    result: dict[str, tuple[tuple[int, int, int], str]] = {}
+    name = None
+    for line in text.splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word.lower() == "newmtl":
+            name = rest.strip()
+            result[name] = (GREY, "")
+        elif name is not None and word.lower() == "kd":
+            try:
+                values = np.clip(np.nan_to_num(np.array(rest.split()[:3], float)), 0, 1)
+            except ValueError:
+                continue
+            if len(values) == 3:
+                r, g, b = (round(255 * float(v)) for v in values)
+                result[name] = ((r, g, b), result[name][1])
+        elif name is not None and word.lower() == "map_kd" and rest.strip():
+            result[name] = (result[name][0], rest.strip())
+    return result
+
+
+def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
+    """Reads an OBJ with all its materials.
+
+    Args:
+        source: the folder; takes hashes and warnings.
+        relative: path of the OBJ in it.
+        remedy: ends the message where the file is missing.
+
+    Returns:
+        The mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
+
+    Raises:
+        SceneRejected: missing or damaged OBJ, or a link that leads out of the source.
+    """
+    path = source.use(relative, remedy)
+    mesh = read_obj(path)
+    if mesh.corner_uv is None and not mesh.libraries:
+        source.note(f"{relative}: has no texture; it stays grey")
+        return mesh, np.zeros(len(mesh.faces), np.int64), []
+    images = read_materials(source, path, mesh.libraries)
+    grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
+    chosen = [images.get(name, grey) for name in mesh.materials]
+    absent = sorted({n for n in mesh.materials if n not in images})
+    if images and absent:
+        source.repaired(f"{relative}: material '{absent[0]}' is in no material file; it stays grey")
+    number = mesh.material.copy()
+    if (number < 0).any():
+        # Faces before any `usemtl`: with one material in the file they mean that one.
+        only = next(iter(images.values())) if len(images) == 1 else grey
+        number[number < 0] = len(chosen)
+        chosen.append(only)
+    return mesh, number, chosen
+
+
+def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
+    """Reads an OBJ with all its materials, their textures joined in one image; arguments as `read_painted_obj`."""
+    mesh, number, images = read_painted_obj(source, relative, remedy)
+    if not images:
+        return TexturedMesh(mesh.vertices, mesh.faces, None, None)
+    uv = mesh.corner_uv if mesh.corner_uv is not None else np.zeros((len(mesh.faces), 3, 2))
+    return TexturedMesh(mesh.vertices, mesh.faces, *join_textures(uv, number, images))
+
+
+def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """(n, 3) uint8 of an image (h, w, 3) at texture coordinates (n, 2); it repeats outside [0, 1]."""
+    height, width = image.shape[:2]
+    u, v = (uv % 1.0).T
+    return image[
+        np.clip(((1.0 - v) * height).astype(int), 0, height - 1), np.clip((u * width).astype(int), 0, width - 1)
+    ]
+
+
+def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Puts several images above one another and moves texture coordinates along.
+
+    Args:
+        corner_uv: (m, 3, 2), origin at the lower left of each face's own image; may leave [0, 1] (repeats).
+        number: (m,) image of each face.
+        images: (h, w, 3) uint8 each.
+
+    Returns:
+        corner_uv (m, 3, 2) in the joint image, the joint image.
+    """
+    if len(images) == 1 and images[0].size > 3:
+        return corner_uv, images[0]
+    # A plain colour needs a few pixels, so that rounding does not reach a neighbour.
+    tiles = [np.tile(i, (4, 4, 1)) if i.shape[:2] == (1, 1) else i for i in images]
+    tiles = [_at_most(t, MAX_TEXTURE_PX) for t in tiles]
+    width, height = max(t.shape[1] for t in tiles), sum(t.shape[0] for t in tiles)
+    joint = np.zeros((height, width, 3), np.uint8)
+    result = np.empty_like(corner_uv)
+    top = 0
+    for k, tile in enumerate(tiles):
+        h, w = tile.shape[:2]
+        joint[top : top + h, :w] = tile
+        of = number == k
+        uv = corner_uv[of]
+        # Repeats end at a face: it is moved to the first copy as a whole and cut off at the image's edge.
+        uv = np.clip(uv - np.floor(uv.min(axis=1, keepdims=True) + 1e-9), 0.0, 1.0)
+        if images[k].shape[:2] == (1, 1):
+            uv = np.full_like(uv, 0.5)
+        result[of, :, 0] = uv[..., 0] * w / width
+        result[of, :, 1] = (height - top - h + uv[..., 1] * h) / height
+        top += h
+    return result, joint
+
+
+def _at_most(image: np.ndarray, side: int) -> np.ndarray:
+    largest = max(image.shape[:2])
+    if largest <= side:
+        return image
+    size = (max(1, image.shape[1] * side // largest), max(1, image.shape[0] * side // largest))
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+
+
+def join_meshes(one: TexturedMesh, other: TexturedMesh) -> TexturedMesh:
+    """Both meshes as one, the second's vertices and faces after the first's."""
+    faces = np.vstack([one.faces, other.faces + len(one.vertices)])
+    vertices = np.vstack([one.vertices, other.vertices])
+    if one.texture is None and other.texture is None:
+        return TexturedMesh(vertices, faces, None, None)
+    grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
+    uv = np.vstack([m.corner_uv if m.corner_uv is not None else np.zeros((len(m.faces), 3, 2)) for m in (one, other)])
+    images = [m.texture if m.texture is not None else grey for m in (one, other)]
+    number = np.repeat([0, 1], [len(one.faces), len(other.faces)])
+    return TexturedMesh(vertices, faces, *join_textures(uv, number, images))

@@ -1,0 +1,41 @@
+"""A raw folder in any layout that we read in, `RawScene` out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from converters.read import gibson, interactive_gibson, scan2cad
+from converters.records.errors import SceneRejected
+from converters.records.raw import RawScene
+
+READERS = {
+    "interactive-gibson": (interactive_gibson.looks_like, interactive_gibson.read_interactive_gibson),
+    "gibson": (gibson.looks_like, gibson.read_gibson),
+    "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
+}
+
+
+def detect_format(source: Path) -> str:
+    """Name of the layout that the folder has.
+
+    Raises:
+        SceneRejected: no known layout.
+    """
+    for name, (looks_like, _) in READERS.items():
+        if looks_like(source):
+            return name
+    if not source.exists():
+        raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
+    raise SceneRejected(
+        f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
+        f"(interactive-gibson) or {scan2cad.ANNOTATION} (scan2cad) in it"
+    )
+
+
+def read_source(source: Path, layout: str = "auto", strict: bool = False) -> RawScene:
+    """Reads a raw folder in the given layout, or in the one that its files show.
+
+    Raises:
+        SceneRejected: no known layout, or bad input.
+    """
+    return READERS[layout if layout != "auto" else detect_format(source)][1](source, strict)

@@ -1,0 +1,149 @@
+"""A scan without semantic labels in; floor, wall and ceiling told by shape out. Also: which way is the floor?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from converters.records.errors import SceneRejected
+from converters.records.raw import CEILING, FLOOR, UNLABELLED, WALL
+
+NEAR_FLOOR_M = 0.15
+"""Faces this close to the floor's height may be floor."""
+WALL_REACH_M = (0.2, 1.8)
+"""A wall is seen at most heights between these."""
+WALL_CELL_M = 0.10
+WALL_SHARE = 0.6
+"""Of the height bins of a cell that must show a steep surface."""
+CEILING_FROM_M = 1.8
+FLOOR_SHARE = 0.05
+"""Least share of the scan's footprint that must lie level at the floor's height."""
+
+
+def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m, 3) normals of the faces, as long as their areas (m2)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: float) -> np.ndarray:
+    """NYU40 labels by shape, for scans that come without: floor, wall, ceiling; everything else stays unlabelled.
+
+    Floor is level, faces up and lies at the floor's height; ceiling faces down, 1.8 m above it or more; wall is
+    steep in a column that shows steep surface over most of 0.2 to 1.8 m (furniture is lower).
+
+    Args:
+        vertices: (n, 3) m, z up.
+        faces: (m, 3).
+        floor_height_m: of the scan frame.
+
+    Returns:
+        (n,) int64.
+    """
+    normal = np.zeros_like(vertices)
+    area = face_vectors(vertices, faces)
+    for k in range(3):
+        for axis in range(3):
+            normal[:, axis] += np.bincount(faces[:, k], area[:, axis], len(vertices))
+    length = np.linalg.norm(normal, axis=1)
+    up = np.divide(normal[:, 2], length, out=np.zeros(len(vertices)), where=length > 0)
+    z = vertices[:, 2] - floor_height_m
+    labels = np.full(len(vertices), UNLABELLED, np.int64)
+    labels[(up > 0.8) & (np.abs(z) < NEAR_FLOOR_M)] = FLOOR
+    labels[(up < -0.7) & (z > CEILING_FROM_M)] = CEILING
+    steep = (length > 0) & (np.abs(up) < 0.35)
+    labels[steep & _in_wall_columns(vertices, z, steep)] = WALL
+    return labels
+
+
+def _in_wall_columns(vertices: np.ndarray, z: np.ndarray, steep: np.ndarray) -> np.ndarray:
+    """(n,) bool: vertices in columns whose steep surface reaches from near the floor to man's height."""
+    low, high = WALL_REACH_M
+    bins = round((high - low) / 0.2)
+    cell = np.floor((vertices[:, :2] - vertices[:, :2].min(axis=0)) / WALL_CELL_M).astype(np.int64)
+    columns = int(cell[:, 0].max(initial=0)) + 3
+    rows = int(cell[:, 1].max(initial=0)) + 3
+    if columns * rows > 50_000_000:  # a scan of square kilometres: stray vertices, no building
+        return np.zeros(len(vertices), bool)
+    flat = (cell[:, 1] + 1) * columns + cell[:, 0] + 1
+    level = np.floor((z - low) / 0.2).astype(np.int64)
+    chosen = steep & (level >= 0) & (level < bins)
+    shown = np.zeros((columns * rows, bins), bool)
+    shown[flat[chosen], level[chosen]] = True
+    # Neighbouring columns count: scanned walls wave by some centimetres.
+    grid = shown.reshape(rows, columns, bins)
+    wide = grid.copy()
+    for shift in (-1, 1):
+        wide |= np.roll(grid, shift, 0) | np.roll(grid, shift, 1)
+    wall = (wide.mean(axis=2) >= WALL_SHARE) & wide[..., -2:].any(axis=2)
+    return wall.reshape(-1)[flat]
+
+
+def check_upright(
+    where: str, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | None, height_m: float | None
+):
+    """Refuses meshes that are not z up, or whose floor faces down, by the floor that they show.
+
+    Args:
+        where: file named in errors.
+        vertices: (n, 3) m.
+        faces: (m, 3).
+        labels: (n,) NYU40, or None: then the level faces at `height_m` are taken for floor.
+        height_m: of the floor; needed without labels.
+
+    Raises:
+        SceneRejected: no floor faces up.
+    """
+    area = face_vectors(vertices, faces)
+    if labels is not None:
+        is_floor = (labels[faces] == FLOOR).all(axis=1)
+        seen = np.abs(area[is_floor]).sum(axis=0)
+        if not is_floor.any() or not seen.sum():
+            return  # no floor label at all is another error, told where the floor is needed
+        if seen[2] < max(seen[0], seen[1]):
+            axis = "xy"[int(np.argmax(seen[:2]))]
+            raise SceneRejected(f"{where}: the floor lies across the {axis} axis: {_turn(axis)}")
+        up = float(area[is_floor, 2].sum())
+        _refuse_face_down(where, max(up, 0.0), max(-up, 0.0))
+        return
+    assert height_m is not None
+    footprint = float(np.prod(np.ptp(vertices[:, :2], axis=0)))
+    middle = vertices[faces].mean(axis=1)
+    up, down = _level_area(area, middle, 2, height_m)
+    if up + down >= FLOOR_SHARE * footprint:
+        _refuse_face_down(where, up, down)
+        return
+    for axis in (1, 0):
+        side = float(np.prod(np.delete(np.ptp(vertices, axis=0), axis)))
+        if max(sum(_level_area(area, middle, axis, s * height_m)) for s in (1, -1)) >= FLOOR_SHARE * side:
+            raise SceneRejected(
+                f"{where}: nothing lies level at the floor's height of {height_m:g} m, but a floor lies across the "
+                f"{'xy'[axis]} axis: {_turn('xy'[axis])}"
+            )
+    raise SceneRejected(
+        f"{where}: {up + down:.2f} m2 lie level at the floor's height of {height_m:g} m, expected at least "
+        f"{FLOOR_SHARE * footprint:.2f} m2; check floors.txt, the mesh's axes (z up) and its unit (m)"
+    )
+
+
+def _turn(axis: str) -> str:
+    return (
+        "the mesh is y up, expected z up; turn it: (x, y, z) becomes (x, -z, y)"
+        if axis == "y"
+        else "the mesh is x up, expected z up; turn it"
+    )
+
+
+def _level_area(area: np.ndarray, middle: np.ndarray, axis: int, height_m: float) -> tuple[float, float]:
+    """Area (m2) of the faces square to an axis near a height that face along it, and against it."""
+    size = np.linalg.norm(area, axis=1)
+    level = (np.abs(area[:, axis]) > 0.9 * size) & (np.abs(middle[:, axis] - height_m) < NEAR_FLOOR_M)
+    along = area[level, axis]
+    return float(along[along > 0].sum()), float(-along[along < 0].sum())
+
+
+def _refuse_face_down(where: str, up: float, down: float) -> None:
+    if down > 2 * up:
+        raise SceneRejected(
+            f"{where}: the floor faces down ({down:.1f} m2 down, {up:.1f} m2 up): the mesh is left-handed (mirrored) "
+            "or inside out; mirror one axis back, or turn the order of each face's corners if only that is wrong"
+        )

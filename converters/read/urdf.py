@@ -1,0 +1,255 @@
+"""A URDF of one rigid object in; its surface, convex pieces, mass and friction out.
+
+Inertia is not read: released URDFs carry placeholders (1 kg m2 about every axis), and both mass and hulls are
+known, from which it follows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
+
+from converters.read.files import SourceFolder, read_obj
+from converters.read.meshes import read_surface
+from converters.read.obj import TexturedMesh, find_file, join_meshes
+from converters.records.errors import SceneRejected
+
+MAX_PIECES = 16
+"""Convex pieces of one object; the gates' limit (`hulls_per_object`)."""
+CONVEX_SHARE = 0.9
+"""A piece that fills this share of its convex hull counts as convex."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RigidObject:
+    """One rigid object, z up, in its own frame."""
+
+    name: str
+    surface: TexturedMesh
+    pieces: tuple[tuple[np.ndarray, np.ndarray], ...] | None
+    """Convex pieces (vertices (n, 3), faces (m, 3)) of the collision mesh; None: it is not made of convex pieces."""
+    collision: tuple[np.ndarray, np.ndarray]
+    """The collision mesh itself, to be decomposed where there are no pieces; the surface without a collision mesh."""
+    mass_kg: float | None
+    friction: float | None
+
+
+def convex_pieces(
+    vertices: np.ndarray, faces: np.ndarray, most: int = MAX_PIECES
+) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
+    """Connected pieces of a mesh, if all of them are convex; the closest are joined until at most `most` are left.
+
+    Pieces are connected through shared vertex indices, as V-HACD writes them (neighbours only touch).
+
+    Returns:
+        Vertices (n, 3) and faces (m, 3) of each piece's hull, or None where a piece is not convex.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1)
+    points: list[np.ndarray] = []
+    for group in groups:
+        own = vertices[np.unique(faces[group])]
+        full = _hull_volume(own)
+        if full <= 0:
+            continue  # flat slivers
+        if abs(trimesh.triangles.mass_properties(vertices[faces[group]]).volume) < CONVEX_SHARE * full:
+            return None
+        points.append(own)
+    if not points:
+        return None
+    points = merge_pieces(points, most)
+    hulls = [trimesh.convex.convex_hull(p) for p in points]
+    return tuple((np.asarray(h.vertices, float), np.asarray(h.faces, np.int64)) for h in hulls)
+
+
+def _hull_volume(points: np.ndarray) -> float:
+    """m3; 0 for points in a plane."""
+    try:
+        return float(ConvexHull(points).volume) if len(points) > 3 else 0.0
+    except QhullError:
+        return 0.0
+
+
+def merge_pieces(points: list[np.ndarray], most: int) -> list[np.ndarray]:
+    """Joins pairs of convex pieces, each time the pair whose common hull encloses least that neither does."""
+    pieces = list(points)
+    volume = [_hull_volume(p) for p in pieces]
+
+    def cost(i: int, j: int) -> float:
+        return _hull_volume(np.vstack([pieces[i], pieces[j]])) - volume[i] - volume[j]
+
+    alive = set(range(len(pieces)))
+    costs = {(i, j): cost(i, j) for i in alive for j in alive if i < j} if len(alive) > most else {}
+    while len(alive) > most:
+        i, j = min(costs, key=lambda pair: (costs[pair], pair))
+        joined = np.vstack([pieces[i], pieces[j]])
+        pieces.append(joined[ConvexHull(joined).vertices])
+        volume.append(_hull_volume(joined))
+        alive -= {i, j}
+        costs = {pair: c for pair, c in costs.items() if not {i, j} & set(pair)}
+        new = len(pieces) - 1
+        costs |= {(k, new): cost(k, new) for k in alive}
+        alive.add(new)
+    return [pieces[k] for k in sorted(alive)]
+
+
+def read_urdf(source: SourceFolder, relative: str, remedy: str) -> RigidObject:
+    """Reads a URDF whose links, if several, hang together by fixed joints.
+
+    Args:
+        source: the folder; takes hashes and warnings.
+        relative: path of the URDF in it.
+        remedy: ends the message where the file is missing.
+
+    Raises:
+        SceneRejected: no XML, no link, a joint that moves, no mesh, or a number that is none.
+    """
+    path = source.use(relative, remedy)
+    try:
+        root = ElementTree.parse(path).getroot()
+        links = {str(e.get("name")): e for e in root.findall("link")}
+        places = _link_places(path, root, links)
+        visual = [_place(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual")]
+        solid = [_place(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision")]
+        masses = [_value(e, "inertial/mass") for e in links.values()]
+        frictions = [_value(e, "contact/lateral_friction") for e in links.values()]
+    except (ElementTree.ParseError, ValueError, KeyError, LookupError) as error:
+        if isinstance(error, SceneRejected):
+            raise
+        raise SceneRejected(f"{path}: not readable as URDF ({type(error).__name__}: {error})") from error
+    surface = _joined(visual or solid)
+    if surface is None:
+        raise SceneRejected(f"{path}: names no mesh to see or to collide with; expected a <visual> with geometry")
+    if not solid:
+        source.note(f"{relative}: has no collision mesh; the visual one is decomposed")
+    body = _joined(solid) or surface
+    mass = sum(m for m in masses if m is not None)
+    friction = [f for f in frictions if f is not None and f > 0]
+    if mass <= 0:
+        source.note(f"{relative}: its mass is {mass:g} kg; mass comes from density and volume")
+    return RigidObject(
+        name=str(root.get("name") or path.stem),
+        surface=surface,
+        pieces=convex_pieces(body.vertices, body.faces) if solid else None,
+        collision=(body.vertices, body.faces),
+        mass_kg=mass if mass > 0 else None,
+        friction=max(friction) if friction else None,
+    )
+
+
+def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
+    values = np.array((text or "").split() or default, float)
+    if values.shape != np.shape(default) or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e6:
+        raise ValueError(f"'{text}' is not {len(default)} usable numbers")
+    return values
+
+
+def _value(link: ElementTree.Element, tag: str) -> float | None:
+    element = link.find(tag)
+    return None if element is None else float(_numbers(element.get("value"), (0.0,))[0])
+
+
+def _origin(element: ElementTree.Element) -> np.ndarray:
+    """(4, 4) of an element's `<origin>`; roll, pitch, yaw about fixed axes."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    matrix = trimesh.transformations.euler_matrix(*_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)), axes="sxyz")
+    matrix[:3, 3] = _numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
+    return matrix
+
+
+def _link_places(path: Path, root: ElementTree.Element, links: dict[str, ElementTree.Element]) -> dict[str, np.ndarray]:
+    """Link -> (4, 4) in the frame of the root link."""
+    if not links:
+        raise SceneRejected(f"{path}: has no <link>, expected a URDF of one object")
+    parents = {}
+    for joint in root.findall("joint"):
+        kind, child, parent = joint.get("type"), joint.find("child"), joint.find("parent")
+        if child is None or parent is None:
+            raise SceneRejected(f"{path}: joint '{joint.get('name')}' lacks a parent or child")
+        if kind != "fixed":
+            raise SceneRejected(
+                f"{path}: joint '{joint.get('name')}' is {kind}, expected fixed joints only; "
+                "articulated objects are not supported, give each rigid part a URDF of its own"
+            )
+        parents[str(child.get("link"))] = (str(parent.get("link")), _origin(joint))
+    places = {}
+    for name in links:
+        place, at, seen = np.eye(4), name, set()
+        while at in parents:
+            if at in seen:
+                raise SceneRejected(f"{path}: its joints form a loop at link '{at}'")
+            seen.add(at)
+            at, origin = parents[at]
+            place = origin @ place
+        places[name] = place
+    return places
+
+
+def _geometries(source: SourceFolder, path: Path, link: ElementTree.Element, kind: str) -> list[TexturedMesh]:
+    """Meshes of a link's `<visual>` or `<collision>` elements, in the link's frame."""
+    found = []
+    for element in link.findall(kind):
+        geometry = element.find("geometry")
+        shape = None if geometry is None else next(iter(geometry), None)
+        if shape is None:
+            continue
+        if shape.tag == "mesh":
+            name = str(shape.get("filename") or "").removeprefix("package://").removeprefix("file://")
+            target = find_file(source, path.parent, name) if name else None
+            if target is None:
+                raise SceneRejected(f"{path}: names the mesh '{name}', which is not there; put it beside the URDF")
+            inside = source.inside(target)
+            mesh = read_surface(source, inside, "") if kind == "visual" else _bare(source, inside)
+            mesh = _place(mesh, np.diag([*_numbers(shape.get("scale"), (1.0, 1.0, 1.0)), 1.0]))
+        else:
+            mesh = _primitive(path, shape)
+        found.append(_place(mesh, _origin(element)))
+    return found
+
+
+def _bare(source: SourceFolder, relative: str) -> TexturedMesh:
+    """A collision mesh: no colours, and no word about missing ones."""
+    if not relative.lower().endswith(".obj"):
+        return read_surface(source, relative, "")
+    mesh = read_obj(source.use(relative, ""))
+    return TexturedMesh(mesh.vertices, mesh.faces, None, None)
+
+
+def _primitive(path: Path, shape: ElementTree.Element) -> TexturedMesh:
+    if shape.tag == "box":
+        solid = trimesh.creation.box(_numbers(shape.get("size"), (0.0, 0.0, 0.0)))
+    elif shape.tag == "cylinder":
+        solid = trimesh.creation.cylinder(
+            _numbers(shape.get("radius"), (0.0,))[0], _numbers(shape.get("length"), (0.0,))[0], sections=16
+        )
+    elif shape.tag == "sphere":
+        solid = trimesh.creation.icosphere(2, _numbers(shape.get("radius"), (0.0,))[0])
+    else:
+        raise SceneRejected(f"{path}: geometry <{shape.tag}>, expected mesh, box, cylinder or sphere")
+    return TexturedMesh(np.asarray(solid.vertices, float), np.asarray(solid.faces, np.int64), None, None)
+
+
+def _place(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
+    faces = mesh.faces if np.linalg.det(matrix[:3, :3]) > 0 else mesh.faces[:, ::-1]
+    corner_uv = mesh.corner_uv
+    if faces is not mesh.faces and corner_uv is not None:
+        corner_uv = corner_uv[:, ::-1]
+    return dataclasses.replace(
+        mesh, vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], faces=faces, corner_uv=corner_uv
+    )
+
+
+def _joined(meshes: list[TexturedMesh]) -> TexturedMesh | None:
+    if not meshes:
+        return None
+    result = meshes[0]
+    for other in meshes[1:]:
+        result = join_meshes(result, other)
+    return result

@@ -1,0 +1,216 @@
+"""A recipe file in, scene folders out: every scene of a set generated, converted and drawn by one call.
+
+A recipe names a seed, a split and how the building departs from `BuildingConfig`'s defaults; the split decides
+which CAD models may be used. The same recipes give the same scenes, byte for byte.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from converters.check.preview import preview
+from converters.generate import generate_building
+from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
+from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
+from converters.pipeline import ConvertConfig, convert
+from interactive_nav_common.files import part_folder, publish
+
+MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
+"""Split -> CAD models: held-out models are held out here."""
+_CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
+_FIXED = ("models",)
+GENERATE, CONVERT, DRAW = 0.55, 0.35, 0.10
+"""Shares of one scene's time, hulls cached: weights of the progress bar."""
+
+Report = Callable[[str, float], None]
+"""Called with what is being done and the share (0..1) that is done."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneRecipe:
+    """How one scene is made."""
+
+    name: str
+    split: str
+    seed: int
+    building: BuildingConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipes:
+    """Content of a recipe file."""
+
+    scenes: tuple[SceneRecipe, ...]
+    conversion: dict[str, Any]
+    """Settings of `ConvertConfig` that all scenes share: how large meshes and textures may be."""
+
+
+def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> None:
+    known = tuple(known)
+    for key in given:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
+            raise GenerationError(f"{where}: unknown key '{key}'; {hint}")
+
+
+def _building(settings: dict[str, Any], split: str, where: str) -> BuildingConfig:
+    fields = {f.name: f.default for f in dataclasses.fields(BuildingConfig) if f.name not in _FIXED}
+    _refuse_unknown(settings, fields, where)
+    values: dict[str, Any] = {}
+    for key, value in settings.items():
+        if key in NAMES:
+            if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+                raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
+            value = tuple(value)
+        elif isinstance(fields[key], tuple):
+            pair = value if isinstance(value, list) else [value, value]
+            if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
+                raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
+            value = tuple(pair)
+        elif not isinstance(value, int | float) or isinstance(value, bool) != isinstance(fields[key], bool):
+            raise GenerationError(f"{where}: {key} is {value!r}, expected a {type(fields[key]).__name__}")
+        values[key] = value
+    try:
+        return BuildingConfig(**values, models=MODELS[split]).validate()
+    except GenerationError as error:
+        raise GenerationError(f"{where}: {error}") from error
+
+
+def parse_recipes(data: Any, where: str) -> Recipes:
+    """Decoded YAML -> recipes.
+
+    Args:
+        data: the decoded file: `scenes` {name: {split, seed, building}}, `conversion`, and `shared`, which only
+            holds anchors.
+        where: file named in errors.
+
+    Raises:
+        GenerationError: an unknown or missing key, a wrong type, or a building that `BuildingConfig` refuses.
+    """
+    if not isinstance(data, dict) or not isinstance(data.get("scenes"), dict):
+        raise GenerationError(f"{where}: expected a mapping with the key 'scenes', each a name and its recipe")
+    _refuse_unknown(data, ("scenes", "conversion", "shared"), where)
+    conversion = data.get("conversion") or {}
+    if not isinstance(conversion, dict):
+        raise GenerationError(f"{where}: conversion is {conversion!r}, expected a mapping")
+    _refuse_unknown(conversion, _CONVERSION, f"{where}: conversion")
+    for key, value in conversion.items():
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise GenerationError(f"{where}: conversion: {key} is {value!r}, expected a whole number of 0 or more")
+    scenes = []
+    for name, recipe in data["scenes"].items():
+        here = f"{where}: scenes: {name}"
+        if not isinstance(recipe, dict):
+            raise GenerationError(f"{here}: got {recipe!r}, expected a mapping with split, seed and building")
+        _refuse_unknown(recipe, ("split", "seed", "building"), here)
+        if recipe.get("split") not in MODELS:
+            raise GenerationError(f"{here}: split is {recipe.get('split')!r}, expected one of {', '.join(MODELS)}")
+        seed = recipe.get("seed")
+        if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
+            raise GenerationError(f"{here}: seed is {seed!r}, expected a whole number of 0 or more")
+        building = _building(recipe.get("building") or {}, recipe["split"], f"{here}: building")
+        scenes.append(SceneRecipe(str(name), recipe["split"], seed, building))
+    return Recipes(tuple(scenes), dict(conversion))
+
+
+def load_recipes(path: Path) -> Recipes:
+    """Reads a recipe file.
+
+    Raises:
+        GenerationError: no such file, not YAML, or wrong content.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise GenerationError(f"{path}: no such file; give the recipes with --recipes") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise GenerationError(f"{path}: not readable as YAML ({error})") from error
+    return parse_recipes(data, str(path))
+
+
+def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report) -> list[str]:
+    """Generates, converts and draws one scene; `folder` appears whole or not at all.
+
+    Args:
+        recipe: what to make.
+        conversion: settings of `ConvertConfig`.
+        folder: scene folder to make or replace.
+        jobs: decompositions side by side.
+        report: progress callback.
+
+    Returns:
+        Names of the gates that fail.
+
+    Raises:
+        FileError: it cannot be written; an older one is untouched.
+    """
+    with part_folder(folder, overwrite=True) as work:
+        generate_building(work / "raw", recipe.seed, lambda s, share: report(s, GENERATE * share), recipe.building)
+        config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
+        made = work / folder.name
+        result = convert(work / "raw", made, config, lambda s, share: report(s, GENERATE + CONVERT * share))
+        report("drawing", GENERATE + CONVERT)
+        preview(made, made / "preview.png")
+        publish({made: folder})
+    report("done", 1.0)
+    return [g.name for g in result.gates if not g.passed]
+
+
+def make_scenes(
+    recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False, jobs: int = 2,
+    report: Report | None = None, tell: Callable[[str], None] | None = None,
+) -> dict[str, list[str]]:  # fmt: skip
+    """Makes the scenes of a recipe file that are not there yet.
+
+    Interrupted, it goes on where it was: a scene is there whole or not at all, and one that is there is kept.
+
+    Args:
+        recipes: what to make.
+        out: folder of scene folders.
+        names: scenes to make; empty: all.
+        overwrite: make those again that are there.
+        jobs: decompositions side by side.
+        report: progress over all of them.
+        tell: told one line a scene.
+
+    Returns:
+        Name -> gates that fail, of the scenes made now.
+
+    Raises:
+        GenerationError: an unknown name, or a building that cannot be generated.
+        SceneRejected, StageFailed: a conversion failed.
+    """
+    report, tell = report or (lambda stage, share: None), tell or (lambda line: None)
+    known = [r.name for r in recipes.scenes]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+            raise GenerationError(f"no recipe named '{name}'; {hint}")
+    wanted = [r for r in recipes.scenes if not names or r.name in names]
+    todo = [r for r in wanted if overwrite or not (out / r.name).exists()]
+    for recipe in wanted:
+        if recipe not in todo:
+            tell(f"{recipe.name}: is there, kept")
+    weight = [sum(r.building.floor_area_m2) for r in todo]
+    failed: dict[str, list[str]] = {}
+    for k, recipe in enumerate(todo):
+
+        def inner(stage: str, share: float, k: int = k, recipe: SceneRecipe = recipe) -> None:
+            done = (sum(weight[:k]) + weight[k] * share) / sum(weight)
+            report(f"{k + 1}/{len(todo)} {recipe.name}: {stage}", done)
+
+        if not overwrite and (out / recipe.name).exists():  # another generator's, made since
+            tell(f"{recipe.name}: is there, kept")
+            continue
+        failed[recipe.name] = make_scene(recipe, recipes.conversion, out / recipe.name, jobs, inner)
+        verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
+        tell(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")
+    return failed

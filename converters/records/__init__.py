@@ -1,0 +1,1 @@
+"""What every reader fills and every stage takes."""

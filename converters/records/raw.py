@@ -1,0 +1,150 @@
+"""Records that every reader fills and every stage takes: scan, CAD library, annotations.
+
+Frames: *scan frame* = the scan's own, z up, floor anywhere; *CAD frame* = the library's model turned to z
+up, not scaled; *world frame* (`_w`) = scan frame with the floor at z = 0; *body frame* (`_b`) = a placed
+object's own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from converters.records.cache import NOT_HASHED
+
+# ShapeNet synset -> category. 02747177 is ShapeNet's trash bin, which the benchmark calls a basket.
+SYNSETS = {
+    "03001627": "chair",
+    "04256520": "sofa",
+    "04379243": "table",
+    "03179701": "desk",
+    "03221720": "door",
+    "02747177": "basket",
+}
+
+# NYU40 ids used by the stages (Gupta et al. 2013, the 40-class mapping that ScanNet labels with).
+UNLABELLED, WALL, FLOOR, CEILING, WINDOW, DOOR = 0, 1, 2, 22, 9, 8
+STRUCTURE_LABELS = (WALL, FLOOR, DOOR, WINDOW, 11, 13, 16, 19, CEILING, 28, 30, 38)
+"""Wall, floor, door, window, picture, blinds, curtain, mirror, ceiling, shower curtain, whiteboard,
+otherstructure."""
+SMALL_LABELS = (UNLABELLED, 18, 20, 21, 23, 26, 27, 29, 35, 37, 40)
+"""Unlabelled, pillow, mat, clothes, books, paper, towel, box, lamp, bag, otherprop: may lie on furniture."""
+CATEGORY_LABELS = {
+    "chair": (5,),
+    "sofa": (6,),
+    "table": (7, 14),
+    "desk": (14, 7),
+    "door": (DOOR,),
+    "basket": (39, 40),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ScanMesh:
+    """A triangle mesh with a colour source and semantic labels."""
+
+    vertices: np.ndarray
+    """(n, 3) float64, m."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    labels: np.ndarray
+    """(n,) int64, NYU40 id of each vertex; 0 is unlabelled."""
+    vertex_colours: np.ndarray | None
+    """(n, 3) uint8, or None where the scan has a texture."""
+    corner_uv: np.ndarray | None = None
+    """(m, 3, 2) float64, texture coordinates of each face corner (origin at the lower left), or None."""
+    texture: np.ndarray | None = None
+    """(h, w, 3) uint8, or None."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CadModel:
+    """One model of the CAD library, in the CAD frame."""
+
+    category: str
+    cad_id: str
+    vertices: np.ndarray
+    """(n, 3) float64, z up, unscaled."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    face_colours: np.ndarray
+    """(m, 3) uint8: diffuse colour of the material, or of the texture at the face."""
+    pieces: tuple[tuple[np.ndarray, np.ndarray], ...] | None = None
+    """Convex pieces (vertices (n, 3), faces (m, 3)) that came with the model; None: they are to be computed."""
+    mass_kg: float | None = None
+    """The source's own mass; None: density times volume."""
+    friction: float | None = None
+    """The source's own sliding coefficient; None: the category's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Hinge:
+    """A door's vertical hinge in the CAD frame; angle 0 is the pose as scanned."""
+
+    origin: np.ndarray
+    """(3,) a point on the axis."""
+    sign: float
+    """+1 when positive angles turn counter-clockwise seen from above, -1 otherwise."""
+    range_rad: tuple[float, float]
+    assumed: bool = False
+    """True when the source had no articulation and a hinge at one edge was taken."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Annotation:
+    """One annotated object: which model, where, and the keypoint pairs that it was fitted to."""
+
+    category: str
+    cad_id: str
+    pose: np.ndarray
+    """(4, 4) CAD frame -> scan frame, with scale."""
+    symmetry: str
+    """Scan2CAD's `sym` word."""
+    keypoints_cad: np.ndarray
+    """(k, 3) CAD frame."""
+    keypoints_scan: np.ndarray
+    """(k, 3) scan frame, m."""
+    hinge: Hinge | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class GivenMap:
+    """A traversable map that came with the scan, in the scan frame."""
+
+    traversable: np.ndarray
+    """[rows along y, columns along x] bool."""
+    resolution_m: float
+    origin: tuple[float, float]
+    """x, y of the outer corner of cell [0, 0]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Storey:
+    """One floor of a building with several."""
+
+    height_m: float
+    """Of its floor, scan frame."""
+    given_map: GivenMap | None
+
+
+@dataclasses.dataclass(frozen=True)
+class RawScene:
+    """Everything that a reader hands to the pipeline."""
+
+    name: str = dataclasses.field(metadata=NOT_HASHED)
+    source_format: str = dataclasses.field(metadata=NOT_HASHED)
+    scan: ScanMesh
+    cads: dict[str, CadModel]
+    """By `cad_id`."""
+    annotations: tuple[Annotation, ...]
+    floor_height_m: float | None
+    """Of the scan frame, the lowest of several; None: the pipeline finds it from the floor labels."""
+    given_map: GivenMap | None
+    licence: str = dataclasses.field(metadata=NOT_HASHED)
+    sources: dict[str, str] = dataclasses.field(metadata=NOT_HASHED)
+    """Path relative to the source folder -> sha256."""
+    storeys: tuple[Storey, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    """From the lowest up, where there are several; `converters.read.storeys.split_storeys` takes them apart."""
+    warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    """What the reader repaired or found missing, for scene.json."""

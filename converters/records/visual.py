@@ -1,0 +1,35 @@
+"""What is drawn: coloured points of a scan, and meshes with their images."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class ColourCloud:
+    """Coloured points of a surface."""
+
+    points: np.ndarray
+    """(n, 3) m."""
+    normals: np.ndarray
+    """(n, 3) unit, or zero where unknown."""
+    colours: np.ndarray
+    """(n, 3) float64, 0 to 255."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VisualMesh:
+    """A mesh with texture coordinates of its own index."""
+
+    vertices: np.ndarray
+    """(n, 3) m."""
+    faces: np.ndarray
+    """(m, 3) into `vertices`."""
+    uv: np.ndarray
+    """(k, 2) in [0, 1], origin at the lower left."""
+    uv_faces: np.ndarray
+    """(m, 3) into `uv`."""
+    image: np.ndarray
+    """(h, w, 3) uint8, first row at the top."""

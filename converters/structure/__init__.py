@@ -1,0 +1,1 @@
+"""Scan in; levelled floor, scan without furniture, maps and wall boxes out."""

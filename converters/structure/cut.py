@@ -1,0 +1,148 @@
+"""Scan mesh and placed objects in; which faces go, and which object each removed vertex showed, out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.boxes import Hull, rotation_of
+from converters.geometry.faces import face_areas, face_labels
+from converters.records.raw import CATEGORY_LABELS, FLOOR, SMALL_LABELS, STRUCTURE_LABELS
+
+NEAR_OWN_M = 0.15
+"""Own-label faces this close to the model are the object's: alignments are off by several centimetres."""
+NEAR_OTHER_M = 0.04
+"""Any furniture face this close is the object's, whatever its label."""
+LYING_ABOVE_M = 0.30
+"""Small things (bags, pillows) on an object go with it up to this height above it."""
+FLOOR_CLEARANCE_M = 0.10
+"""A floor label higher than this is a mislabelled leg."""
+DEBRIS_AREA_M2 = 0.02
+"""Pieces of scan smaller than this, left hanging after the cut, go too."""
+INSTANCE_SHARE = 0.6
+"""When this share of a connected same-label piece is cut, the rest of the piece is too."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CutResult:
+    """Outcome of the cut."""
+
+    keep: np.ndarray
+    """(m,) bool, faces of the scan that stay."""
+    owner: np.ndarray
+    """(m,) int64, index of the object that a removed face belonged to, -1 elsewhere."""
+
+
+def face_pieces(faces: np.ndarray, n_vertices: int) -> np.ndarray:
+    """(m,) number of the connected piece that each face lies in (faces that share a vertex are connected)."""
+    if len(faces) == 0:
+        return np.zeros(0, np.int64)
+    rows = np.concatenate([faces[:, 0], faces[:, 1]])
+    columns = np.concatenate([faces[:, 1], faces[:, 2]])
+    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n_vertices, n_vertices))
+    return connected_components(graph, directed=False)[1][faces[:, 0]].astype(np.int64)
+
+
+def depth_in_hulls(points: np.ndarray, hulls: tuple[Hull, ...]) -> np.ndarray:
+    """(n,) signed distance-like value: negative inside a hull (largest plane value, least over hulls), m."""
+    best = np.full(len(points), np.inf)
+    for hull in hulls:
+        a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1)
+        normal, a = normal[length > 1e-12] / length[length > 1e-12, None], a[length > 1e-12]
+        best = np.minimum(best, (points @ normal.T - (normal * a).sum(axis=1)).max(axis=1))
+    return best
+
+
+def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """(count, 3) points spread over a surface by area; the same seed gives the same points."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+
+
+def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> np.ndarray:
+    """(m,) bool: faces that show this object, by place and label."""
+    local = (centres - placed.position_w) @ rotation_of(placed.quaternion_w)
+    low, high = placed.vertices_b.min(axis=0), placed.vertices_b.max(axis=0)
+    around = ((local > low - NEAR_OWN_M) & (local < high + [NEAR_OWN_M, NEAR_OWN_M, LYING_ABOVE_M])).all(axis=1)
+    index = np.flatnonzero(around)
+    points, label = local[index], labels[index]
+    distance = KDTree(surface_samples(placed.vertices_b, placed.faces, 20000)).query(points, workers=1)[0]
+    inside = depth_in_hulls(points, placed.hulls_b)
+    near = (distance < NEAR_OTHER_M) | (inside < 0.02)
+    over = ((points > low - 0.03) & (points < high + [0.03, 0.03, LYING_ABOVE_M])).all(axis=1)
+    own = np.isin(label, CATEGORY_LABELS[placed.category])
+    structure = np.isin(label, STRUCTURE_LABELS) & ~own
+    gone = (own & ((distance < NEAR_OWN_M) | (inside < NEAR_OWN_M / 2))) | (~structure & near)
+    gone |= np.isin(label, SMALL_LABELS) & over
+    # Legs that the labeller took for floor.
+    gone |= (label == FLOOR) & (centres[index, 2] > FLOOR_CLEARANCE_M) & near
+    if placed.category == "door":
+        gone |= structure & (label != FLOOR) & (inside < 0.02)
+    result = np.zeros(len(centres), bool)
+    result[index[gone]] = True
+    return result
+
+
+def cut_furniture(
+    vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray, objects: tuple[PlacedObject, ...]
+) -> CutResult:
+    """Decides which scan faces are annotated furniture.
+
+    Floor and walls stay, whatever stands against them: only faces with the object's own label, with no
+    label or of small things lying on it, and other furniture faces that touch the model, go.
+
+    Args:
+        vertices_w: (n, 3) m, floor at z = 0.
+        faces: (m, 3).
+        labels: (n,) NYU40.
+        objects: placed by their annotations.
+    """
+    label = face_labels(labels, faces)
+    centres = vertices_w[faces].mean(axis=1)
+    owner = np.full(len(faces), -1, np.int64)
+    for k, placed in enumerate(objects):
+        owner[_faces_of(centres, label, placed) & (owner < 0)] = k
+    area = face_areas(vertices_w, faces)
+    for category in sorted({o.category for o in objects}):
+        _take_rest_of_instances(owner, faces, label, centres, area, objects, category, len(vertices_w))
+    keep = owner < 0
+    kept = np.flatnonzero(keep)
+    piece = face_pieces(faces[kept], len(vertices_w))
+    if len(kept):
+        piece_area = np.bincount(piece, area[kept])
+        keep[kept[piece_area[piece] < DEBRIS_AREA_M2]] = False
+    return CutResult(keep, owner)
+
+
+def _take_rest_of_instances(
+    owner: np.ndarray,
+    faces: np.ndarray,
+    label: np.ndarray,
+    centres: np.ndarray,
+    area: np.ndarray,
+    objects: tuple[PlacedObject, ...],
+    category: str,
+    n_vertices: int,
+) -> None:
+    """Extends `owner` in place: a connected piece of a category's label that is mostly cut goes entirely."""
+    index = np.flatnonzero(np.isin(label, CATEGORY_LABELS[category]))
+    if len(index) == 0:
+        return
+    piece = face_pieces(faces[index], n_vertices)
+    total = np.bincount(piece, area[index])
+    gone = np.bincount(piece, area[index] * (owner[index] >= 0))
+    rest = index[(gone[piece] > INSTANCE_SHARE * total[piece]) & (owner[index] < 0)]
+    if len(rest) == 0:
+        return
+    members = [k for k, o in enumerate(objects) if o.category == category]
+    middles = np.array([to_world(objects[k], objects[k].vertices_b).mean(axis=0) for k in members])
+    nearest = KDTree(middles).query(centres[rest])[1]
+    owner[rest] = np.array(members)[nearest]

@@ -1,0 +1,309 @@
+"""Cleaned scan and object footprints in, grid of floor, obstacles and traversable cells out.
+
+The working grid is turned by the building's main direction, so that its walls run along rows and columns
+(fewer and flatter wall boxes); `resample` brings the result to the axis-aligned map that the scene folder
+stores.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from scipy import ndimage
+from shapely import MultiPoint, contains_xy
+
+from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.faces import face_labels, sample_faces
+from converters.geometry.rotations import yaw_matrix
+from converters.records.errors import SceneRejected
+from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
+
+RESOLUTION_M = 0.05
+BAND_M = (0.02, 1.2)
+"""Heights at which a robot meets things."""
+WHOLE_POINTS = 8
+"""Points (a third of a cell apart) that show a cell's floor entirely."""
+NOISE_M = 0.08
+"""Reconstructed floors wave by a few centimetres: what is lower than this is floor, not obstacle."""
+CLOSE_CELLS = 2
+"""Gaps of up to twice this many cells in seen floor are floor."""
+MAX_HOLE_M2 = 4.0
+"""Larger holes inside seen floor are not taken for floor."""
+MAX_CORNER_M2 = 0.5
+"""Of unseen regions between floor and wall."""
+MIN_OBSTACLE_CELLS = 3
+MIN_FREE_M2 = 0.25
+PAD_M = 0.4
+HEIGHT_STEP_M = 0.1
+"""Heights of low static furniture are rounded up to this: few boxes."""
+LEAF_MARGIN_M = 0.04
+"""Kept free around the space that a door's leaf sweeps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """A turned grid: cell [r, c] has its middle at `Rz(yaw) @ (origin + (c + 0.5, r + 0.5) * resolution)`."""
+
+    yaw: float
+    """rad."""
+    origin: tuple[float, float]
+    """m, in the turned frame."""
+    shape: tuple[int, int]
+    resolution_m: float
+
+    def cells(self, points_w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row, column and inside flag of (n, 2+) world points."""
+        turned = points_w[:, :2] @ yaw_matrix(self.yaw)[:2, :2]
+        index = np.floor((turned - self.origin) / self.resolution_m).astype(np.int64)
+        row, column = index[:, 1], index[:, 0]
+        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
+        return row, column, inside
+
+    def centres_w(self) -> np.ndarray:
+        """(rows, columns, 2) middles of the cells in the world, m."""
+        rows, columns = np.indices(self.shape)
+        turned = np.stack([columns + 0.5, rows + 0.5], axis=-1) * self.resolution_m + self.origin
+        return turned @ yaw_matrix(self.yaw)[:2, :2].T
+
+    def count(self, points_w: np.ndarray) -> np.ndarray:
+        """(rows, columns) number of points in each cell."""
+        row, column, inside = self.cells(points_w)
+        flat = row[inside] * self.shape[1] + column[inside]
+        return np.bincount(flat, minlength=self.shape[0] * self.shape[1]).reshape(self.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class FloorPlan:
+    """What the scan says about each cell."""
+
+    grid: Grid
+    floor: np.ndarray
+    """(rows, columns) bool: floor seen, or taken to be there."""
+    floor_seen: np.ndarray
+    """(rows, columns) bool: floor seen at least in part of the cell."""
+    floor_whole: np.ndarray
+    """(rows, columns) bool: floor seen in all of the cell."""
+    occupied: np.ndarray
+    """(rows, columns) bool: static structure in the robot's height band."""
+    traversable: np.ndarray
+    """(rows, columns) bool: floor, nothing static in the band, in a piece worth standing on."""
+    wall_height_m: float
+    leaf: np.ndarray | None = None
+    """(rows, columns) bool: wall that a door's leaf touches as it turns, at the hinge mostly, cells being coarser than
+    leaves. Not traversable, but no box may stand there. None: no such cell."""
+    height_m: np.ndarray | None = None
+    """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing is known.
+    None: the wall's height everywhere."""
+
+
+def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
+    """Direction of the walls modulo 90 degrees, rad in [-pi/4, pi/4): mode of wall normals, by area.
+
+    Less than 1 degree counts as 0: the map then needs no turning."""
+    wall = np.isin(face_labels(labels, faces), [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)])
+    a, b, c = (vertices_w[faces[wall, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    steep = (length > 0) & (np.abs(normal[:, 2]) < 0.2 * length)
+    if not steep.any():
+        return 0.0
+    angle = np.arctan2(normal[steep, 1], normal[steep, 0]) % (math.pi / 2)
+    bins = 180
+    histogram = np.bincount((angle / (math.pi / 2) * bins).astype(int) % bins, length[steep], bins)
+    smooth = ndimage.gaussian_filter1d(histogram, 2.0, mode="wrap")
+    peak = (np.argmax(smooth) + 0.5) / bins * math.pi / 2
+    # Mean of the angles near the peak, on the circle of period 90 degrees.
+    offset = (angle - peak + math.pi / 4) % (math.pi / 2) - math.pi / 4
+    near = np.abs(offset) < math.radians(5)
+    yaw = peak + float(np.average(offset[near], weights=length[steep][near]))
+    yaw = (yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
+    return 0.0 if abs(yaw) < math.radians(1.0) else yaw
+
+
+def _footprint(grid: Grid, placed: PlacedObject) -> np.ndarray:
+    """(rows, columns) bool: cells under the object's hulls."""
+    mask = np.zeros(grid.shape, bool)
+    centres = grid.centres_w()
+    for hull in placed.hulls_b:
+        shadow = MultiPoint(to_world(placed, hull.vertices)[:, :2]).convex_hull.buffer(grid.resolution_m / 2)
+        mask |= contains_xy(shadow, centres[..., 0], centres[..., 1])
+    return mask
+
+
+def swept_by_door(grid: Grid, placed: PlacedObject) -> np.ndarray:
+    """(rows, columns) bool: cells that the leaf passes over its whole range, with a margin."""
+    assert placed.hinge is not None
+    mask = np.zeros(grid.shape, bool)
+    centres = grid.centres_w()
+    flat = np.vstack([h.vertices for h in placed.hulls_b])
+    low, high = placed.hinge.range_rad
+    for angle in np.linspace(low, high, max(int((high - low) / math.radians(3)), 2)):
+        turned = (flat - placed.hinge.origin_b) @ yaw_matrix(angle).T + placed.hinge.origin_b
+        leaf = MultiPoint(to_world(placed, turned)[:, :2]).convex_hull.buffer(LEAF_MARGIN_M)
+        mask |= contains_xy(leaf, centres[..., 0], centres[..., 1])
+    return mask
+
+
+def label_pieces(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, int]:
+    """Numbered connected pieces and how many there are (`scipy.ndimage.label`, its type stated)."""
+    numbered = np.zeros(mask.shape, np.int32)
+    count = ndimage.label(mask, structure, output=numbered)
+    assert isinstance(count, int)
+    return numbered, count
+
+
+def _drop_small(mask: np.ndarray, least_cells: int) -> np.ndarray:
+    pieces, _ = label_pieces(mask, np.ones((3, 3)))
+    size = np.bincount(pieces.ravel())
+    size[0] = 0
+    return (size >= least_cells)[pieces]
+
+
+def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Adds unseen regions enclosed by floor, where nothing stands, and small ones between floor and wall.
+
+    The small ones are corners that furniture hid; the inside of a wall touches no floor and stays out.
+    """
+    known = floor | occupied
+    enclosed = np.asarray(ndimage.binary_fill_holes(known), bool) & ~known
+    holes, count = label_pieces(enclosed)
+    result = floor.copy()
+    for k in range(1, count + 1):
+        hole = holes == k
+        rim = ndimage.binary_dilation(hole, np.ones((3, 3))) & ~hole
+        area, share = hole.sum() * resolution_m**2, floor[rim].mean()
+        if (area <= MAX_HOLE_M2 and share > 0.7) or (area <= MAX_CORNER_M2 and share > 0.15):
+            result |= hole
+    return result
+
+
+def make_floor_plan(
+    vertices_w: np.ndarray,
+    faces: np.ndarray,
+    labels: np.ndarray,
+    objects: tuple[PlacedObject, ...],
+    given: GivenMap | None,
+    yaw: float,
+    resolution_m: float = RESOLUTION_M,
+) -> FloorPlan:
+    """Reads floor and obstacles off the cleaned scan.
+
+    Args:
+        vertices_w: (n, 3) m, floor at z = 0, after the cut.
+        faces: (m, 3) that stay.
+        labels: (n,) NYU40.
+        objects: their footprints stand on floor that the scan could not see; door leaves need room to swing.
+        given: the source's own traversable map, or None.
+        yaw: of the grid: the building's `main_direction`, rad.
+        resolution_m: cell side.
+
+    Raises:
+        SceneRejected: no traversable cell.
+    """
+    turn = yaw_matrix(yaw)
+    used = vertices_w[np.unique(faces)] @ turn
+    low, high = used[:, :2].min(axis=0) - PAD_M, used[:, :2].max(axis=0) + PAD_M
+    low = np.floor(low / resolution_m) * resolution_m
+    columns, rows = np.ceil((high - low) / resolution_m).astype(int)
+    grid = Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), resolution_m)
+
+    points, face = sample_faces(vertices_w, faces, resolution_m / 3)
+    label, z = face_labels(labels, faces)[face], points[:, 2]
+    floor_points = ((label == FLOOR) & (np.abs(z) < 0.2)) | ((label == UNLABELLED) & (np.abs(z) < NOISE_M))
+    floor_count = grid.count(points[floor_points])
+    floor_seen = floor_count >= 2
+    solid = (z > max(NOISE_M, BAND_M[0])) & (z < BAND_M[1]) & ~np.isin(label, (FLOOR, CEILING))
+    occupied = _drop_small(grid.count(points[solid]) >= 3, MIN_OBSTACLE_CELLS)
+    # Reconstruction holes in walls: join along rows and columns only, so that doorways stay open.
+    for line in (np.ones((1, 4)), np.ones((4, 1))):
+        occupied |= ndimage.binary_closing(occupied, line)
+
+    under = np.zeros(grid.shape, bool)
+    swept = np.zeros(grid.shape, bool)
+    for placed in objects:
+        under |= _footprint(grid, placed)
+        if placed.hinge is not None:
+            swept |= swept_by_door(grid, placed)
+    # What is left of the door's scan in its sweep goes, walls stay.
+    walls = np.isin(label, STRUCTURE_LABELS) & (label != DOOR)
+    occupied &= ~swept | (grid.count(points[solid & walls]) >= 3)
+    leaf = occupied & swept
+    closed = ndimage.binary_closing(floor_seen, iterations=CLOSE_CELLS) | under | floor_seen
+    if given is not None:
+        closed |= _given_floor(grid, given)
+    # What lies behind a line of obstacles (the inside of a wall, the far side of one that a chair's annotated
+    # pose cuts) is no floor: it must connect to floor that was seen.
+    floor = np.asarray(ndimage.binary_propagation(floor_seen & ~occupied, mask=closed & ~occupied), bool)
+    floor = _fill_holes(floor, occupied, resolution_m)
+    traversable = _drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2))
+    if not traversable.any():
+        raise SceneRejected(
+            "scan: no traversable floor is left (no floor label below 1.2 m of free height); "
+            "check the floor's labels and height"
+        )
+    heights = points[np.isin(label, STRUCTURE_LABELS) & (label != FLOOR) & (label != CEILING), 2]
+    tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
+    tall = round(tall, 3)
+    height = _heights(grid, points, label, occupied, tall)
+    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, tall, leaf, height)
+
+
+def _heights(grid: Grid, points: np.ndarray, label: np.ndarray, occupied: np.ndarray, tall_m: float) -> np.ndarray:
+    """(rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
+
+    A cell is low where no wall, window or the like is labelled in the robot's band and the highest point lies
+    within it; the highest of its neighbours counts, so that a ragged edge does not lower a cabinet.
+    """
+    z = points[:, 2]
+    solid = (z > NOISE_M) & ~np.isin(label, (FLOOR, CEILING))
+    structural = np.isin(label, STRUCTURE_LABELS)
+    wall = grid.count(points[solid & structural & (z < BAND_M[1])]) >= 3
+    row, column, inside = grid.cells(points[solid & ~structural])
+    top = np.zeros(grid.shape)
+    np.maximum.at(top, (row[inside], column[inside]), z[solid & ~structural][inside])
+    low = occupied & ~wall & (top < BAND_M[1])
+    around = ndimage.maximum_filter(np.where(low, top, 0.0), 5)
+    low &= around > 0
+    rounded = np.ceil(around / HEIGHT_STEP_M - 1e-9) * HEIGHT_STEP_M
+    return np.where(low, np.minimum(rounded, tall_m), tall_m).round(3)
+
+
+def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
+    """(rows, columns) bool: cells whose middle is traversable in the source's own map."""
+    centres = grid.centres_w()
+    index = np.floor((centres - given.origin) / given.resolution_m).astype(int)
+    row, column = index[..., 1], index[..., 0]
+    inside = (row >= 0) & (column >= 0) & (row < given.traversable.shape[0]) & (column < given.traversable.shape[1])
+    result = np.zeros(grid.shape, bool)
+    result[inside] = given.traversable[row[inside], column[inside]]
+    return result
+
+
+def resample(grid: Grid, mask: np.ndarray, resolution_m: float) -> tuple[np.ndarray, tuple[float, float]]:
+    """Brings a mask to an axis-aligned grid, conservatively: a cell is true where its middle and corners are.
+
+    Returns:
+        mask [rows along y, columns along x], and the x, y of the outer corner of cell [0, 0], m.
+    """
+    centres = grid.centres_w()[mask]
+    low = np.floor((centres.min(axis=0) - grid.resolution_m) / resolution_m) * resolution_m
+    high = centres.max(axis=0) + grid.resolution_m
+    columns, rows = np.ceil((high - low) / resolution_m).astype(int) + 1
+    result = np.ones((int(rows), int(columns)), bool)
+    inset = 0.0 if grid.yaw else 0.25  # corner samples, drawn in a little where cells coincide
+    for dy, dx in (
+        (0.5, 0.5),
+        (inset, inset),
+        (inset, 1 - inset),
+        (1 - inset, inset),
+        (1 - inset, 1 - inset),
+    ):
+        r, c = np.indices(result.shape)
+        sample = np.stack([c + dx, r + dy], axis=-1).reshape(-1, 2) * resolution_m + low
+        row, column, inside = grid.cells(sample)
+        value = np.zeros(len(sample), bool)
+        value[inside] = mask[row[inside], column[inside]]
+        result &= value.reshape(result.shape)
+    return result, (float(low[0]), float(low[1]))

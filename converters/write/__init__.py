@@ -1,0 +1,1 @@
+"""Stages' results in, the files of a scene folder out."""

@@ -1,0 +1,73 @@
+"""Results of the stages in, `SceneManifest` (scene.json) out."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.metadata import version
+from typing import Any
+
+from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig
+from converters.records.gate import Gate
+from converters.records.raw import RawScene
+from converters.write.emit import SceneParts
+from scenes_mjcf.schema import SceneManifest, SceneObject
+
+PACKAGES = (
+    "mujoco",
+    "coacd",
+    "trimesh",
+    "fast-simplification",
+    "xatlas",
+    "numpy",
+    "scipy",
+    "pillow",
+    "shapely",
+)
+
+
+def make_manifest(
+    raw: RawScene,
+    split: str,
+    parts: SceneParts,
+    floor_area_m2: float,
+    alignment: list[dict[str, Any]],
+    gates: tuple[Gate, ...],
+    decompose: DecomposeConfig,
+    fallbacks: dict[str, str] | None = None,
+) -> SceneManifest:
+    """Collects what a scene is, where it came from and which gates it passed; all paths are relative.
+
+    `fallbacks` names the models whose one convex hull stands for them, and why.
+    """
+    fell = fallbacks or {}
+    objects = tuple(
+        SceneObject(
+            name=placed.name,
+            category=placed.category,
+            mass_kg=round(physical.mass_kg, 4),
+            friction=physical.friction,
+            n_hulls=len(placed.hulls_b),
+            cad_id=placed.cad_id,
+        )
+        for placed, physical in zip(parts.objects, parts.physical, strict=True)
+    )
+    parameters = {k: v for k, v in dataclasses.asdict(decompose).items() if k != "timeout_s"}
+    return SceneManifest(
+        name=parts.name,
+        split=split,
+        source={"format": raw.source_format, "sha256": raw.sources},
+        licence=raw.licence,
+        floor_area_m2=round(floor_area_m2, 3),
+        objects=objects,
+        collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES}
+        | parameters
+        | {"convex_hull_only": sorted(fell), "from_source": sorted(k for k, c in raw.cads.items() if c.pieces)},
+        gates={g.name: g.as_dict() for g in gates},
+        versions={name: version(name) for name in PACKAGES},
+        alignment=tuple(alignment),
+        warnings=(
+            *raw.warnings,
+            *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items())),
+            *(warning for gate in gates for warning in gate.warnings),
+        ),
+    )

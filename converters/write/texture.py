@@ -1,0 +1,264 @@
+"""Meshes and a cloud of coloured scan points in, simplified meshes with UVs and baked textures out."""
+
+from __future__ import annotations
+
+import fast_simplification
+import numpy as np
+import trimesh
+import xatlas
+from PIL import Image
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from converters.geometry.faces import merge_vertices, sample_faces
+from converters.records.raw import ScanMesh
+from converters.records.visual import ColourCloud, VisualMesh
+
+SEEN_M = 0.08
+"""A scan point this close to the model's surface shows it: alignments are off by several centimetres."""
+AGREE = 0.5
+"""Least |cosine| between the normals of model and scan (CAD models do not agree with themselves on inside
+and out)."""
+TEXTURE_SPACING_M = 0.025
+"""Sampling of a textured scan's surface; a vertex-coloured scan is sampled at its vertices."""
+
+
+def colour_cloud(
+    scan: ScanMesh,
+    vertices_w: np.ndarray,
+    faces: np.ndarray,
+    face_index: np.ndarray,
+    spacing_m: float = TEXTURE_SPACING_M,
+) -> ColourCloud:
+    """Coloured points of some faces of the scan: their vertices, or a sampling of the texture.
+
+    Args:
+        scan: colour source.
+        vertices_w: (n, 3) the scan's vertices in the world, m.
+        faces: (m, 3) the scan's faces.
+        face_index: (k,) which of them to take.
+        spacing_m: of the points on a textured scan.
+    """
+    chosen = faces[face_index]
+    a, b, c = (vertices_w[chosen[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    if scan.texture is None or scan.corner_uv is None:
+        assert scan.vertex_colours is not None
+        summed = np.zeros_like(vertices_w)
+        for k in range(3):
+            np.add.at(summed, chosen[:, k], normal)
+        used = np.unique(chosen)
+        return ColourCloud(vertices_w[used], _unit(summed[used]), scan.vertex_colours[used].astype(float))
+    points, index = sample_faces(vertices_w, chosen, spacing_m)
+    middle = sample_faces(
+        scan.corner_uv[face_index].reshape(-1, 2) @ np.eye(2, 3),
+        np.arange(3 * len(chosen)).reshape(-1, 3),
+        np.inf,
+    )[0][:, :2]
+    uv = _uv_at(points, a[index], b[index], c[index], scan.corner_uv[face_index][index], middle[index])
+    height, width = scan.texture.shape[:2]
+    column = np.clip((uv[:, 0] % 1.0 * width).astype(int), 0, width - 1)
+    row = np.clip(((1.0 - uv[:, 1] % 1.0) * height).astype(int), 0, height - 1)
+    return ColourCloud(points, _unit(normal)[index], scan.texture[row, column].astype(float))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
+
+
+def _uv_at(
+    points: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    c: np.ndarray,
+    corner_uv: np.ndarray,
+    fallback: np.ndarray,
+) -> np.ndarray:
+    """(n, 2) texture coordinates of points in triangles (barycentric); the middle's on degenerate ones."""
+    e1, e2, d = b - a, c - a, points - a
+    d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
+    q1, q2 = (d * e1).sum(1), (d * e2).sum(1)
+    det = d11 * d22 - d12 * d12
+    good = det > 1e-16
+    safe = np.where(good, det, 1.0)
+    v, w = (d22 * q1 - d12 * q2) / safe, (d11 * q2 - d12 * q1) / safe
+    uv = corner_uv[:, 0] * (1 - v - w)[:, None] + corner_uv[:, 1] * v[:, None] + corner_uv[:, 2] * w[:, None]
+    return np.where(good[:, None], uv, fallback)
+
+
+def simplify(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadric simplification to at most about `max_faces` faces; equal positions are joined first."""
+    vertices, faces, _ = merge_vertices(vertices, faces)
+    if len(faces) > max_faces:
+        points, triangles = fast_simplification.simplify(
+            np.asarray(vertices, np.float64), faces.astype(np.int32), target_count=max_faces
+        )[:2]
+        vertices, faces, _ = merge_vertices(np.asarray(points, float), np.asarray(triangles, np.int64))
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], inverse.reshape(-1, 3)
+
+
+def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texture atlas of a mesh.
+
+    Returns:
+        uv (k, 2) in [0, 1], uv_faces (m, 3).
+    """
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
+    chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
+    pack.resolution, pack.padding, pack.bilinear = size, 1, True
+    atlas.generate(chart, pack)
+    _, uv_faces, uv = atlas[0]
+    return np.asarray(uv, float), np.asarray(uv_faces, np.int64)
+
+
+def texel_surface(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where each covered texel lies on the surface.
+
+    Returns:
+        texel (k,) flat index into the (size, size) image, point (k, 3) m, face (k,).
+    """
+    corners = uv[uv_faces] * size
+    corners[..., 1] = size - corners[..., 1]  # image rows run downwards
+    low = np.clip(np.floor(corners.min(axis=1)).astype(int), 0, size - 1)
+    high = np.clip(np.ceil(corners.max(axis=1)).astype(int), low + 1, size)
+    extent = high - low
+    count = extent.prod(axis=1)
+    face = np.repeat(np.arange(len(faces)), count)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+    column = low[face, 0] + step % extent[face, 0]
+    row = low[face, 1] + step // extent[face, 0]
+    a, b, c = (corners[face, k] for k in range(3))
+    middle = np.stack([column + 0.5, row + 0.5], axis=1)
+    det = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+    good = np.abs(det) > 1e-12
+    det = np.where(good, det, 1.0)
+    v = ((middle[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1])) / det
+    w = ((b[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1]) - (middle[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])) / det
+    slack = 0.02
+    inside = good & (v >= -slack) & (w >= -slack) & (v + w <= 1 + slack)
+    face, v, w = face[inside], v[inside], w[inside]
+    texel = row[inside] * size + column[inside]
+    texel, first = np.unique(texel, return_index=True)
+    face, v, w = face[first], v[first], w[first]
+    p, q, r = (vertices[faces[face, k]] for k in range(3))
+    return texel, p * (1 - v - w)[:, None] + q * v[:, None] + r * w[:, None], face
+
+
+def fill_image(texel: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
+    """(size, size, 3) uint8 image; texels outside every chart take the nearest chart's colour."""
+    image = np.zeros((size * size, 3))
+    covered = np.zeros(size * size, bool)
+    image[texel], covered[texel] = colours, True
+    nearest = ndimage.distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
+    assert nearest is not None
+    return np.clip(np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]]), 0, 255).astype(np.uint8)
+
+
+def quantise(image: np.ndarray, colours: int) -> Image.Image:
+    """Palette image: a third of the bytes, and scan colours carry no more."""
+    return Image.fromarray(image).quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+
+
+def bake_structure(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cloud: ColourCloud,
+    max_faces: int,
+    size: int,
+) -> VisualMesh:
+    """Simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
+
+    Args:
+        vertices: (n, 3) of the scan with its patches, m.
+        faces: (m, 3) that stay.
+        cloud: coloured points of scan and patches.
+        max_faces: of the simplified scan.
+        size: of the texture, pixels.
+    """
+    vertices, faces = simplify(vertices, faces, max_faces)
+    uv, uv_faces = unwrap(vertices, faces, size)
+    texel, point, _ = texel_surface(vertices, faces, uv, uv_faces, size)
+    distance, index = KDTree(cloud.points).query(point, k=min(3, len(cloud.points)))
+    distance, index = distance.reshape(len(point), -1), index.reshape(len(point), -1)
+    weight = 1.0 / (distance + 0.002)
+    colours = (cloud.colours[index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)
+    return VisualMesh(vertices, faces, uv, uv_faces, fill_image(texel, colours, size))
+
+
+def bake_object(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    face_colours: np.ndarray,
+    cloud: ColourCloud,
+    max_faces: int,
+    size: int,
+) -> tuple[VisualMesh, float]:
+    """Simplified CAD model, retextured from the scan points that showed the object.
+
+    A texel takes the mean of the near scan points whose normal agrees. One that no scan point shows is
+    in-painted from the nearest shown texels of the same CAD material, else of any; an object that the scan
+    does not show at all keeps its CAD colours.
+
+    Args:
+        vertices: (n, 3) CAD surface in the world, m.
+        faces: (m, 3).
+        face_colours: (m, 3) uint8 of the CAD materials.
+        cloud: scan points that were cut as this object.
+        max_faces: of the result.
+        size: of the texture, pixels.
+
+    Returns:
+        The mesh (world frame, as given) and the share of texels that the scan showed.
+    """
+    low_vertices, low_faces = simplify(vertices, faces, max_faces)
+    uv, uv_faces = unwrap(low_vertices, low_faces, size)
+    texel, point, face = texel_surface(low_vertices, low_faces, uv, uv_faces, size)
+    normal = np.asarray(trimesh.triangles.normals(low_vertices[low_faces])[0])
+    if len(normal) != len(low_faces):  # degenerate faces are dropped by the library
+        a, b, c = (low_vertices[low_faces[:, k]] for k in range(3))
+        normal = _unit(np.cross(b - a, c - a))
+    sample, sample_face = sample_faces(vertices, faces, max(0.02, float(np.ptp(vertices, axis=0).max()) / 60))
+    on_face = sample_face[KDTree(sample).query(point)[1]]
+    cad_colour = face_colours[on_face].astype(float)
+    material = np.unique(face_colours, axis=0, return_inverse=True)[1].reshape(-1)[on_face]
+
+    seen = np.zeros(len(point), bool)
+    colours = cad_colour.copy()
+    if len(cloud.points):
+        count = min(8, len(cloud.points))
+        distance, index = KDTree(cloud.points).query(point, k=count, distance_upper_bound=SEEN_M)
+        distance, index = distance.reshape(-1, count), index.reshape(-1, count)
+        found = np.isfinite(distance)
+        index = np.where(found, index, 0)
+        cosine = np.abs(np.einsum("kd,knd->kn", normal[face], cloud.normals[index]))
+        weight = np.where(found & (cosine > AGREE), 1.0 / (distance + 0.005), 0.0)
+        weight = np.where(found, weight, 0.0)
+        total = weight.sum(axis=1)
+        seen = total > 0
+        mixed = (cloud.colours[index] * weight[..., None]).sum(axis=1)
+        colours[seen] = mixed[seen] / total[seen, None]
+    colours = _inpaint(point, colours, seen, material)
+    image = fill_image(texel, colours, size)
+    return VisualMesh(low_vertices, low_faces, uv, uv_faces, image), float(seen.mean()) if len(seen) else 0.0
+
+
+def _inpaint(point: np.ndarray, colours: np.ndarray, seen: np.ndarray, material: np.ndarray) -> np.ndarray:
+    """Unseen texels take the mean of their eight nearest seen ones of the same material, else of any."""
+    result = colours.copy()
+    if not seen.any():
+        return result
+    for m in np.unique(material):
+        wanted = (material == m) & ~seen
+        source = (material == m) & seen
+        if source.sum() < 8:
+            source = seen
+        if wanted.any():
+            count = min(8, int(source.sum()))
+            index = KDTree(point[source]).query(point[wanted], k=count)[1].reshape(-1, count)
+            result[wanted] = colours[source][index].mean(axis=1)
+    return result

@@ -1,0 +1,1 @@
+"""The environment for other libraries: Gymnasium, Stable-Baselines3, PyTorch."""

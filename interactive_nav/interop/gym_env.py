@@ -1,0 +1,374 @@
+"""The environment for those who do not use JAX: Gymnasium's API, NumPy arrays (or PyTorch tensors) in and out.
+
+    import gymnasium
+    import interactive_nav.gym_env  # registers the ids
+    envs = gymnasium.make_vec("InteractiveNav-TurtleBot-v0", num_envs=64, scenes=["scenes_mjcf/apartment_0"])
+
+Ids are InteractiveNav-<Robot>-v0, one for each name in `robot_names()`. `make` gives one environment,
+`make_vec` a batch that steps as one compiled program. Keyword arguments are those of `interactive_nav.make`.
+Environment i of a batch reset with seed s plays the episodes of a single environment reset with seed s + i; with
+`scene_choice="slot"` it keeps scene i modulo their number, as a single one made with `slot=i`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+import interactive_nav
+from interactive_nav.interop.gym_steps import STEPS, reset_all, reset_where
+from interactive_nav.interop.torch_bridge import to_jax, to_torch
+from interactive_nav.pictures.views import ThirdPerson
+from interactive_nav.robots import robot_names
+from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
+from interactive_nav.task.wrappers import scene_of_slot
+from interactive_nav_common.errors import ConfigError
+
+ARRAYS = ("numpy", "jax", "torch")
+VERSION = 0
+"""Raised whenever reported numbers would move."""
+_SPELLING = {"turtlebot": "TurtleBot", "jackrabbot": "JackRabbot"}
+
+
+def env_id(robot: str) -> str:
+    """Gymnasium's id of a robot's environment: turtlebot -> InteractiveNav-TurtleBot-v0."""
+    name = _SPELLING.get(robot, "".join(part.capitalize() for part in robot.split("_")))
+    return f"InteractiveNav-{name}-v{VERSION}"
+
+
+def register_envs() -> None:
+    """Registers every robot's environment with Gymnasium; a second call changes nothing."""
+    for robot in robot_names():
+        if env_id(robot) not in gymnasium.registry:
+            gymnasium.register(
+                env_id(robot),
+                entry_point="interactive_nav.gym_env:InteractiveNavEnv",
+                vector_entry_point="interactive_nav.gym_env:InteractiveNavVectorEnv",
+                kwargs={"robot": robot},
+            )
+
+
+def observation_space_of(env: InteractiveNav) -> spaces.Space:
+    """A `Box` for a flat observation, a `Dict` of boxes for one in parts.
+
+    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 to 1 in their own type.
+    """
+    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+    obs = jax.eval_shape(env.reset, key).obs
+
+    def box(name: str, x: Any) -> spaces.Box:
+        image, dtype = name.startswith("pixels/"), np.dtype(x.dtype)
+        high = 255 if dtype == np.uint8 else 1.0 if image else np.inf
+        return spaces.Box(0 if image else -np.inf, high, x.shape, dtype.type)
+
+    if isinstance(obs, Mapping):
+        return spaces.Dict({name: box(name, x) for name, x in obs.items()})
+    return box("state", obs)
+
+
+def action_space_of(env: InteractiveNav) -> spaces.Box:
+    """[-1, 1], one per actuator."""
+    return spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
+
+
+def _key(rng: np.random.Generator) -> np.ndarray:
+    """(2,) u32 key drawn from a generator."""
+    return rng.integers(0, 2**32, size=2, dtype=np.uint32)
+
+
+def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
+    unknown = [name for name in options or {} if name not in known]
+    if unknown:
+        raise ValueError(f"reset option {unknown[0]!r} is unknown; known options: {', '.join(known)}")
+    return options or {}
+
+
+def _to_numpy(tree: Any) -> Any:
+    """Copies that the caller owns: what JAX hands out is read-only."""
+    return jax.tree.map(np.array, tree)
+
+
+class InteractiveNavEnv(gymnasium.Env):
+    """One environment.
+
+    Observation: float32 (29,) by default, see `interactive_nav.sensing.observation`; a dictionary where it has images.
+    Action: float32 (A,) in [-1, 1].
+    `terminated` on success or a state that is no longer finite, `truncated` at the time limit.
+    `info` holds the step's reward terms (`reward/...`) and, on an episode's last step, its scores
+    (`EPISODE_METRICS`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
+    `reset(options={"start": EpisodeStart})` plays a given episode.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        robot: str,
+        scenes: Sequence[str],
+        render_mode: str | None = None,
+        slot: int | None = None,
+        **settings: Any,
+    ):
+        """Builds it.
+
+        Args:
+            robot: a name from `robot_names()`.
+            scenes: scene folders; each episode draws one.
+            render_mode: none, or "rgb_array": `render` returns a third-person view.
+            slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
+            **settings: fields of `NavConfig`.
+
+        Raises:
+            ValueError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
+        """
+        self.env = interactive_nav.make(robot, scenes, **settings)
+        kept = _checked_slot(self.env, slot)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
+        self.render_mode = _checked_render_mode(render_mode)
+        self.observation_space = observation_space_of(self.env)
+        self.action_space = action_space_of(self.env)
+        self._reset = jax.jit(lambda key: self.env.reset(key, kept))
+        self._reset_to = jax.jit(self.env.reset_to)
+        self._step = jax.jit(self.env.step)
+        self._state: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draws an episode; with a seed, always the same sequence of episodes from here on."""
+        super().reset(seed=seed)
+        given = _check_options(options, ("start",))
+        fresh = seed is not None or self._state is None
+        key = jnp.asarray(_key(self.np_random)) if fresh else self._state.info["rng"]  # pyright: ignore[reportOptionalMemberAccess]
+        self._state = self._reset_to(given["start"], key) if "start" in given else self._reset(key)
+        return _to_numpy(self._state.obs), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One control period."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step was called before reset")
+        self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        done, truncated = bool(state.done > 0), bool(state.info["truncation"] > 0)
+        info = {name: float(state.metrics[name]) for name in REWARD_TERMS}
+        if done:
+            info |= {name: float(state.metrics[name]) for name in EPISODE_METRICS}
+        return _to_numpy(state.obs), float(state.reward), done and not truncated, truncated, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
+        if self.render_mode is None or self._state is None:
+            return None
+        state: Any = self._state
+        nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
+        return self._camera.frame(int(nav.scene_index), qpos, np.asarray(nav.goal_xy_w))
+
+    @functools.cached_property
+    def _camera(self) -> ThirdPerson:
+        return ThirdPerson(self.env)
+
+
+class InteractiveNavVectorEnv(VectorEnv):
+    """N environments stepped by one compiled program.
+
+    `autoreset_mode` says what follows an episode's end (https://farama.org/Vector-Autoreset-Mode):
+    SAME_STEP (default): the same `step` returns the new episode's observation, the old one's last is in
+    `info["final_obs"]` and its scores are in `info["final_info"]`; NEXT_STEP: the next `step` ignores
+    the action and resets; DISABLED: `reset(options={"reset_mask": ended})` does.
+
+    `arrays` says what goes in and out: "numpy", "jax", or "torch" tensors that share JAX's memory
+    (`interactive_nav.interop.torch_bridge`). For the latter two nothing leaves the device, and `final_obs` is a batch
+    in which the rows of `_final_obs` count; for NumPy it is Gymnasium's array of objects.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        scenes: Sequence[str],
+        num_envs: int = 1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        arrays: str = "numpy",
+        render_mode: str | None = None,
+        **settings: Any,
+    ):
+        """Builds it.
+
+        Args:
+            robot: a name from `robot_names()`.
+            scenes: scene folders; each episode draws one.
+            num_envs: N.
+            autoreset_mode: an `AutoresetMode` or its value ("SameStep", "NextStep", "Disabled").
+            arrays: "numpy", "jax" or "torch".
+            render_mode: none, or "rgb_array": `render` returns a third-person view of each.
+            **settings: fields of `NavConfig`.
+
+        Raises:
+            ValueError: as `interactive_nav.make`, or another choice that does not exist.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}, expected at least 1")
+        if arrays not in ARRAYS:
+            raise ValueError(f"arrays is {arrays!r}, expected one of {', '.join(ARRAYS)}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.env = interactive_nav.make(robot, scenes, **settings)
+        self.num_envs, self.arrays = num_envs, arrays
+        self.render_mode = _checked_render_mode(render_mode)
+        self.metadata = {
+            **InteractiveNavEnv.metadata,
+            "render_fps": round(1.0 / self.env.dt),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space = observation_space_of(self.env)
+        self.single_action_space = action_space_of(self.env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._reset = jax.jit(functools.partial(reset_all, self.env))
+        self._reset_to = jax.jit(jax.vmap(self.env.reset_to))
+        self._reset_where = jax.jit(functools.partial(reset_where, self.env))
+        self._step = jax.jit(functools.partial(STEPS[self.autoreset_mode], self.env))
+        self._state: Any = None
+        self._ended = jnp.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Draws an episode for each environment, or for some of them.
+
+        Args:
+            seed: s gives environment i the seed s + i; or a list with one (or None) each. None: each goes
+                on with its own sequence.
+            options: `reset_mask` [N] bool: only these; `start`: an `EpisodeStart` with leaves [N, ...] to play.
+        """
+        seed = int(seed) if isinstance(seed, np.integer) else seed
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        given = _check_options(options, ("reset_mask", "start"))
+        if "reset_mask" in given and ("start" in given or self._state is None):
+            raise ValueError("reset option 'reset_mask' excludes 'start' and needs an earlier reset without it")
+        keys = self._keys(seed)
+        if "reset_mask" in given:
+            mask = np.asarray(given["reset_mask"])
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+                raise ValueError(
+                    f"reset_mask is {mask.dtype} of shape {mask.shape} with {np.count_nonzero(mask)} set, "
+                    f"expected bool of shape ({self.num_envs},) with at least one set"
+                )
+            self._state = self._reset_where(self._state, keys, mask)
+            self._ended = self._ended & ~mask
+        else:
+            self._state = self._reset_to(given["start"], keys) if "start" in given else self._reset(keys)
+            self._ended = jnp.zeros(self.num_envs, bool)
+        return self._out(self._state.obs), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One control period; see the class for what follows an episode's end."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step was called before reset")
+        if self.autoreset_mode is AutoresetMode.DISABLED and bool(self._ended.any()):
+            raise gymnasium.error.ResetNeeded(
+                f"episodes of environments {np.flatnonzero(self._ended).tolist()} are over: "
+                "reset(options={'reset_mask': terminated | truncated})"
+            )
+        actions = jnp.asarray(to_jax(actions) if self.arrays == "torch" else actions, jnp.float32)
+        self._state, was_over, stepped = self._step(self._state, actions, self._ended)
+        obs, reward, terminated, truncated, metrics = stepped
+        self._ended = terminated | truncated
+        info = self._info(obs, metrics, was_over)
+        now = self._state.obs if self.autoreset_mode is AutoresetMode.SAME_STEP else obs
+        return (*self._out((now, reward, terminated, truncated)), info)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A third-person view of each environment; None without a render mode."""
+        if self.render_mode is None or self._state is None:
+            return None
+        nav, qpos = self._state.info["nav"], np.asarray(self._state.pipeline_state.qpos)
+        each = zip(np.asarray(nav.scene_index), qpos, np.asarray(nav.goal_xy_w), strict=True)
+        return tuple(self._camera.frame(int(scene), row, goal) for scene, row, goal in each)
+
+    @functools.cached_property
+    def _camera(self) -> ThirdPerson:
+        return ThirdPerson(self.env)
+
+    def _keys(self, seed: int | Sequence[int | None] | None) -> jax.Array:
+        n = self.num_envs
+        seeds = list(range(seed, seed + n)) if isinstance(seed, int) else [None] * n if seed is None else list(seed)
+        if len(seeds) != n:
+            raise ValueError(f"seed has {len(seeds)} entries, expected one for each of {n} environments")
+        if self._state is not None:
+            keys = np.array(self._state.info["rng"])
+        else:
+            keys = np.stack([_key(self.np_random) for _ in range(n)])
+        for i, given in enumerate(seeds):
+            if given is not None:
+                keys[i] = _key(seeding.np_random(int(given))[0])
+        return jnp.asarray(keys)
+
+    def _out(self, tree: Any) -> Any:
+        if self.arrays == "numpy":
+            return _to_numpy(tree)
+        return to_torch(tree) if self.arrays == "torch" else tree
+
+    def _info(self, obs: Any, metrics: dict[str, jax.Array], was_over: jax.Array) -> dict[str, Any]:
+        """Values with their masks `_name`, in the places where `SyncVectorEnv` has them."""
+        same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
+        if self.arrays != "numpy":
+            terms = {name: metrics[name] for name in REWARD_TERMS}
+            scores = {name: metrics[name] for name in EPISODE_METRICS}
+            final = {"final_obs": obs, "final_info": {**terms, **scores}} if same_step else scores
+            return self._out({**terms, **final, **{f"_{name}": self._ended for name in final}})
+        ended = np.array(self._ended)
+        running = ~ended if same_step else ~np.array(was_over)
+        info = _masked({name: metrics[name] for name in REWARD_TERMS}, running)
+        if not ended.any():
+            return info
+        scores = {name: metrics[name] for name in EPISODE_METRICS}
+        if not same_step:
+            return info | _masked(scores, ended)
+        rows = _to_numpy(obs)
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended):
+            final_obs[i] = jax.tree.map(lambda x, i=i: x[i].copy(), rows)
+        final_info = _masked({name: metrics[name] for name in (*REWARD_TERMS, *EPISODE_METRICS)}, ended)
+        masks = {"_final_obs": ended, "_final_info": ended.copy()}
+        return {**info, "final_obs": final_obs, "final_info": final_info, **masks}
+
+
+def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.ndarray]:
+    """name -> values, 0 outside the mask, and _name -> mask; nothing where the mask is empty."""
+    if not mask.any():
+        return {}
+    out = {}
+    for name, value in values.items():
+        out[name], out[f"_{name}"] = np.where(mask, np.asarray(value, np.float64), 0.0), mask.copy()
+    return out
+
+
+def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
+    """The scene that a single environment keeps; None: each episode draws one."""
+    chosen, count = env.config.scene_choice == "slot", len(env.scenes)
+    if slot is not None and (not chosen or slot < 0):
+        raise ConfigError(
+            f"slot is {slot} with scene_choice={env.config.scene_choice!r}, expected 0 or more, with 'slot'"
+        )
+    if chosen and slot is None and count > 1:
+        raise ConfigError(
+            f"scene_choice is 'slot' for one environment of {count} scenes, expected its number in a batch: give "
+            "slot=I, make a batch (gymnasium.make_vec), or set scene_choice='episode'"
+        )
+    return scene_of_slot(env, jnp.asarray(slot or 0, jnp.int32))
+
+
+def _checked_render_mode(mode: str | None) -> str | None:
+    known = InteractiveNavEnv.metadata["render_modes"]
+    if mode is not None and mode not in known:
+        raise ValueError(f"render_mode is {mode!r}, expected one of {', '.join(known)} or none")
+    return mode
+
+
+register_envs()

@@ -1,0 +1,58 @@
+"""A batch of environments and its state in, the next state out, for each way of Gymnasium's to begin new episodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from gymnasium.vector import AutoresetMode
+
+from interactive_nav.task.env import InteractiveNav
+from interactive_nav.task.wrappers import scene_of_slot
+
+
+def _where(mask: jax.Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
+
+
+def reset_all(env: InteractiveNav, keys: jax.Array) -> Any:
+    """New episodes, each in the scene that its environment keeps, if it keeps one."""
+    scene = scene_of_slot(env, jnp.arange(keys.shape[0]))
+    return jax.vmap(env.reset)(keys) if scene is None else jax.vmap(env.reset)(keys, scene)
+
+
+def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Array) -> Any:
+    """New episodes where `mask`."""
+    return _where(mask, reset_all(env, keys), state)
+
+
+def _outcome(state: Any) -> tuple[Any, ...]:
+    truncated = state.info["truncation"] > 0
+    return state.obs, state.reward, (state.done > 0) & ~truncated, truncated, dict(state.metrics)
+
+
+def _step_same(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
+    stepped = jax.vmap(env.step)(state, actions)
+    done = stepped.done > 0
+    new = jax.lax.cond(done.any(), lambda s: reset_where(env, s, s.info["rng"], done), lambda s: s, stepped)
+    return new, jnp.zeros_like(done), _outcome(stepped)
+
+
+def _step_next(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
+    stepped = jax.vmap(env.step)(state, actions)
+    new = jax.lax.cond(ended.any(), lambda s: _where(ended, reset_all(env, state.info["rng"]), s), lambda s: s, stepped)
+    return new, ended, _outcome(new)
+
+
+def _step_only(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
+    stepped = jax.vmap(env.step)(state, actions)
+    return stepped, jnp.zeros_like(ended), _outcome(stepped)
+
+
+STEPS = {
+    AutoresetMode.SAME_STEP: _step_same,
+    AutoresetMode.NEXT_STEP: _step_next,
+    AutoresetMode.DISABLED: _step_only,
+}
+"""What follows an episode's end: (env, state, actions, ended) -> (state, was over, outcome)."""

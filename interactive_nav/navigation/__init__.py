@@ -1,0 +1,1 @@
+"""Where a robot can go: tables built once, looked up inside jit."""

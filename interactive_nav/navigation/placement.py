@@ -1,0 +1,153 @@
+"""Random keys and scene tables in, an episode's start, goal and clutter out, inside jit.
+
+Each draw is uniform over tabulated free places and judged from a bounded number of candidates, so nothing
+retries for ever; a small object that finds no place is parked outside, and counted, as is an episode without a pair
+of start and goal at the distances that were asked for.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+
+import jax
+import jax.numpy as jnp
+
+from interactive_nav.navigation.lookup import geodesic_at, goal_field
+from interactive_nav.types import EpisodeStart, SceneTables
+
+PAIR_CANDIDATES = 64
+"""Start-goal pairs tried at first; and in each round that follows, of those in a straight line as far as asked."""
+WIDER_CANDIDATES = 1024
+"""Pairs drawn in each round: the straight line is cheap to measure, the way round is not."""
+MAX_ROUNDS = 64
+"""Rounds that follow where no pair qualifies; without one after all, the nearest to it is taken, and counted."""
+DISTANCE_TOLERANCE_M = 1e-3
+"""Rounding of distances that are measured again."""
+CLUTTER_CANDIDATES = 16
+"""Places tried per small object."""
+CLEARANCE_M = 0.02
+"""Least gap between bodies at the start of an episode."""
+
+
+def _uniform_places(key: jax.Array, shape: tuple[int, ...], cells: jax.Array, count: jax.Array, side_m: float):
+    """[*shape, 2] points, uniform over the first `count` of square cells [p, 2] given by their middles."""
+    key_cell, key_within = jax.random.split(key)
+    index = jnp.minimum((jax.random.uniform(key_cell, shape) * count).astype(jnp.int32), count - 1)
+    return cells[index] + side_m * jax.random.uniform(key_within, (*shape, 2), minval=-0.5, maxval=0.5)
+
+
+def miss_m(
+    tables: SceneTables, scene: jax.Array, start: jax.Array, goal: jax.Array, least_m: float, largest_m: float
+) -> jax.Array:
+    """[] m by which a start and a goal (2,) miss a least planar and a largest geodesic distance; 0: they do not."""
+    miss = jnp.maximum(least_m - jnp.linalg.norm(start - goal), 0.0)
+    if math.isfinite(largest_m):
+        way_m = geodesic_at(tables, scene, goal_field(tables, scene, goal), start)
+        miss += jnp.maximum(way_m - largest_m, 0.0)
+    return miss
+
+
+def _draw_pair(
+    key_start: jax.Array, key_goal: jax.Array, tables: SceneTables, scene: jax.Array, least_m: float, largest_m: float
+) -> tuple[jax.Array, jax.Array]:
+    """The first of uniform pairs of start and goal that is as far apart as asked; else the nearest to it."""
+
+    start_places = tables.start_xy_w[scene], tables.num_starts[scene], tables.fine_m
+    goal_places = tables.goal_xy_w[scene], tables.num_goals[scene], tables.fine_m
+
+    def candidates(key_start, key_goal, count):
+        return _uniform_places(key_start, (count,), *start_places), _uniform_places(key_goal, (count,), *goal_places)
+
+    def best(starts, goals):
+        miss = jax.vmap(lambda a, b: miss_m(tables, scene, a, b, least_m, largest_m))(starts, goals)
+        at = jnp.argmin(miss)
+        return starts[at], goals[at], miss[at]
+
+    def unmet(carry):
+        i, (_, _, miss) = carry
+        return (miss > 0) & (i < MAX_ROUNDS)
+
+    def again(carry):
+        i, old = carry
+        starts, goals = candidates(jax.random.fold_in(wider[0], i), jax.random.fold_in(wider[1], i), WIDER_CANDIDATES)
+        straight = jnp.linalg.norm(starts - goals, axis=-1)
+        # No way is shorter than the straight line: what is too far already need not be measured.
+        kept = jnp.nonzero((straight >= least_m) & (straight <= largest_m), size=PAIR_CANDIDATES, fill_value=0)[0]
+        new = best(starts[kept], goals[kept])
+        return i + 1, jax.tree.map(lambda a, b: jnp.where(new[2] < old[2], a, b), new, old)
+
+    # By name, not by a small number, which would be one of the keys that `candidates` splits off.
+    wider = [jax.random.fold_in(key, zlib.crc32(b"wider")) for key in (key_start, key_goal)]
+    first = best(*candidates(key_start, key_goal, PAIR_CANDIDATES))
+    _, (start, goal, _) = jax.lax.while_loop(unmet, again, (jnp.zeros((), jnp.int32), first))
+    return start, goal
+
+
+def draw_episode(
+    key: jax.Array,
+    tables: SceneTables,
+    small_radius_m: jax.Array,
+    robot_radius_m: float,
+    min_goal_distance_m: float,
+    max_goal_distance_m: float,
+    scene: jax.Array | None = None,
+    goal_clear: bool = True,
+    random_yaw: bool = True,
+) -> EpisodeStart:
+    """Draws scene, start, goal and small objects uniformly (paper section IV).
+
+    Start and goal are the first of independent uniform pairs that are as far apart as asked, so uniform among
+    such pairs; each small object lies at the first of `CLUTTER_CANDIDATES` uniform places that
+    is clear of what lies already.
+
+    Args:
+        key: consumed.
+        tables: constants of the scenes.
+        small_radius_m: [k] radii of the small objects' footprints.
+        robot_radius_m: footprint of the robot.
+        min_goal_distance_m: least planar distance from start to goal.
+        max_goal_distance_m: largest geodesic distance from start to goal.
+        scene: [] i32; None: drawn.
+        goal_clear: keep small objects off the robot's footprint at the goal.
+        random_yaw: turn small objects at random; else yaw 0.
+
+    Returns:
+        The episode's start. Nothing touches: small objects keep clear of the robot at the start, at the goal
+        (with `goal_clear`), and of each other.
+    """
+    key_scene, key_start, key_goal, key_yaw, key_place, key_turn = jax.random.split(key, 6)
+    if scene is None:
+        scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
+    start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, min_goal_distance_m, max_goal_distance_m)
+
+    count = small_radius_m.shape[0]
+    shape = (count, CLUTTER_CANDIDATES)
+    places = _uniform_places(key_place, shape, tables.clutter_xy_w[scene], tables.num_clutter[scene], tables.fine_m)
+
+    def place(carry, i):
+        xys, oks = carry
+        xy = places[i]
+        reach = small_radius_m[i] + CLEARANCE_M
+        gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - small_radius_m
+        ok = ((gaps > reach) | ~oks).all(-1)
+        ok &= jnp.linalg.norm(xy - start_xy, axis=-1) > robot_radius_m + reach
+        if goal_clear:
+            ok &= jnp.linalg.norm(xy - goal_xy, axis=-1) > robot_radius_m + reach
+        ok &= tables.num_clutter[scene] > 0
+        best = jnp.argmax(ok)
+        return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None
+
+    small_xy, small_placed = jnp.zeros((count, 2)), jnp.zeros((count,), bool)
+    if count:
+        (small_xy, small_placed), _ = jax.lax.scan(place, (small_xy, small_placed), jnp.arange(count))
+    turn = jax.random.uniform(key_turn, (count,), minval=-jnp.pi, maxval=jnp.pi)
+    return EpisodeStart(
+        scene_index=scene,
+        start_xy_w=start_xy,
+        start_yaw_rad=jax.random.uniform(key_yaw, (), minval=-jnp.pi, maxval=jnp.pi),
+        goal_xy_w=goal_xy,
+        small_xy_w=small_xy,
+        small_yaw_rad=turn if random_yaw else jnp.zeros((count,)),
+        small_placed=small_placed,
+    )

@@ -1,0 +1,263 @@
+"""A `World` and its settings in, `SceneTables` on the device out: all that `reset` and `step` look up."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+
+from interactive_nav.config import NavConfig
+from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
+from interactive_nav.navigation.lookup import geodesic_at, goal_field
+from interactive_nav.navigation.placement import CLEARANCE_M
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.scenes.world import World
+from interactive_nav.types import SceneTables
+from scenes_mjcf.schema import SceneError
+
+FINE_CELLS = 2
+"""Fine cells along the side of a navigation cell: corners and places are 0.05 m fine, nodes 0.1 m apart."""
+GOALS_TRIED = 256
+"""Goals of each scene that `check_distances` looks from."""
+SIGHT_STEP_CELLS = 2.0
+"""Fine cells between samples of a line of sight inside jit. What is blocked for the robot's centre is at least a
+robot wide, so nothing is stepped over; a corner clipped between two samples is cut by centimetres at most."""
+
+
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    """[3, 3] from w x y z."""
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
+    """Cells of the scene's map over which furniture stands below a height.
+
+    Args:
+        scene: with its map.
+        poses: body name -> (position, quaternion w x y z), world.
+        height_m: of the robot; what hangs higher does not count.
+
+    Returns:
+        [rows, columns] bool.
+    """
+    maps = scene.maps
+    rows, columns = maps.traversable.shape
+    x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
+    y = maps.origin_w[1] + (np.arange(rows) + 0.5) * maps.resolution_m
+    z = np.arange(0.02, height_m, 0.03)
+    covered = np.zeros((rows, columns), bool)
+    for movable in scene.movables:
+        pos, quat = poses[movable.name]
+        body = _rotation(quat)
+        for row in movable.boxes:
+            centre, axes, half = pos + body @ row[:3], body @ _rotation(row[3:7]), row[7:10]
+            reach = np.abs(axes) @ half
+            cs = np.flatnonzero(np.abs(x - centre[0]) <= reach[0] + maps.resolution_m)
+            rs = np.flatnonzero(np.abs(y - centre[1]) <= reach[1] + maps.resolution_m)
+            if not len(cs) or not len(rs):
+                continue
+            grid = np.stack(np.meshgrid(x[cs], y[rs], z, indexing="xy"), -1)
+            inside = (np.abs((grid - centre) @ axes) <= half + maps.resolution_m / 2).all(-1).any(-1)
+            covered[np.ix_(rs, cs)] |= inside
+    return covered
+
+
+def _sample(values: np.ndarray, resolution_m: float, shape: tuple[int, int], cell_m: float) -> np.ndarray:
+    """Bilinear sample of a map's cell values at the navigation cells' centres."""
+    r = (np.arange(shape[0]) + 0.5) * cell_m / resolution_m - 0.5
+    c = (np.arange(shape[1]) + 0.5) * cell_m / resolution_m - 0.5
+    return scipy.ndimage.map_coordinates(values, np.meshgrid(r, c, indexing="ij"), order=1, cval=0.0)
+
+
+def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
+    qpos, layout = world.rest_qpos[index], world.layout
+    rest = {m.name: (m.pos_w, m.quat_w) for m in world.scenes[index].movables}
+    for name, kind, at in zip(world.names[index], layout.slot_kind, layout.slot_qpos, strict=True):
+        if kind == "free" and name:
+            rest[name] = (qpos[at : at + 3], qpos[at + 3 : at + 7])
+    return rest
+
+
+def _scene_places(
+    world: World, index: int, config: NavConfig
+) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:
+    """Shortest paths, start cells [p, 2], goal cells [g, 2] and clutter cells [q, 2] of one scene."""
+    scene, robot = world.scenes[index], world.robot
+    maps, fine = scene.maps, config.nav_cell_m / FINE_CELLS
+    free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, fine)
+    if not free.any():
+        raise SceneError(
+            f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "
+            "map; use a smaller robot or check the scan's floor"
+        )
+    graph = corner_graph(free, fine, config.nav_cell_m, maps.origin_w)
+
+    def room(blocked: np.ndarray | bool) -> np.ndarray:
+        """Clearance in metres that every point of a fine cell has."""
+        open_m = clearance(maps.traversable & ~np.asarray(blocked), maps.resolution_m)
+        return _sample(open_m, maps.resolution_m, free.shape, fine) - math.sqrt(0.5) * fine
+
+    furnished = room(furniture_map(scene, rest_poses(world, index), robot.height_m))
+    largest = max((o.radius_m for o in world.small_objects), default=0.0)
+    needed = robot.footprint_radius_m + CLEARANCE_M
+
+    def centres(mask: np.ndarray) -> np.ndarray:
+        r, c = np.nonzero(mask)
+        return np.stack([maps.origin_w[0] + (c + 0.5) * fine, maps.origin_w[1] + (r + 0.5) * fine], -1)
+
+    starts = centres(graph.free & (furnished >= needed))
+    # Unless the option says otherwise the robot must fit at the goal too, or one under a sofa could never be reached.
+    goals = starts if config.goal_clear else centres(graph.free & (room(False) >= needed))
+    clutter = centres(furnished >= largest + CLEARANCE_M)
+    far = len(starts) and len(goals) and _farthest(starts, goals) >= config.min_goal_distance_m
+    if not far:
+        raise SceneError(
+            f"{scene.path}: no room for a start and a goal {config.min_goal_distance_m} m apart for robot "
+            f"'{robot.name}'; lower min_goal_distance_m or use a larger scene"
+        )
+    return graph, starts, goals, clutter
+
+
+def check_distances(world: World, tables: SceneTables, config: NavConfig) -> None:
+    """Refuses scenes without a start and a goal at the distances that are asked for.
+
+    The planar distance alone is settled with the places. Here a sample of goals is held against every start: where
+    none has one, drawing pairs at random would find none either.
+
+    Raises:
+        SceneError: a scene with no such pair.
+    """
+    if not math.isfinite(config.max_goal_distance_m):
+        return
+
+    # Places are anywhere in their cells: two of them may be nearer or farther than the middles by this.
+    slack_m = math.sqrt(2) * tables.fine_m
+
+    @jax.jit
+    def some_fit(scene: jax.Array, goal: jax.Array) -> jax.Array:
+        starts = tables.start_xy_w[scene]
+        field = goal_field(tables, scene, goal)
+        way_m = jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(starts)
+        far = jnp.linalg.norm(starts - goal, axis=-1) >= config.min_goal_distance_m - slack_m
+        fits = far & (way_m <= config.max_goal_distance_m + slack_m)
+        return (fits & (jnp.arange(len(starts)) < tables.num_starts[scene])).any()
+
+    for i, scene in enumerate(world.scenes):
+        goals = tables.goal_xy_w[i]
+        sample = np.unique(np.linspace(0, int(tables.num_goals[i]) - 1, GOALS_TRIED).astype(int))
+        if not any(bool(some_fit(jnp.asarray(i), goals[k])) for k in sample):
+            raise SceneError(
+                f"{scene.path}: no start and goal of robot '{world.robot.name}' are at least "
+                f"{config.min_goal_distance_m} m apart and at most {config.max_goal_distance_m} m by the way; "
+                "raise max_goal_distance_m or lower min_goal_distance_m"
+            )
+
+
+def _farthest(a: np.ndarray, b: np.ndarray) -> float:
+    """Largest distance between points [p, 2] and [g, 2], to within 4 %: by their extent along 16 directions."""
+    angle = np.arange(16) * np.pi / 16
+    along = np.stack([np.cos(angle), np.sin(angle)])
+    first, second = a @ along, b @ along
+    return float(np.maximum(first.max(0) - second.min(0), second.max(0) - first.min(0)).max())
+
+
+def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
+    """Stacks arrays padded at the end of their first `axes` axes to common sizes."""
+    sizes = [max(a.shape[i] for a in arrays) for i in range(axes)]
+    padded = [
+        np.pad(a, [(0, s - n) for s, n in zip(sizes, a.shape, strict=False)] + [(0, 0)] * (a.ndim - axes),
+               constant_values=fill)
+        for a in arrays
+    ]  # fmt: skip
+    return np.stack(padded)
+
+
+def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
+    """The shortest paths of all scenes, padded; in each the last corner is none."""
+    count = max(len(g.corner_xy_w) for g in graphs)
+    # The tables are large: the smallest type that numbers every corner.
+    index = np.uint16 if count < 2**16 else np.int32
+
+    def squared(table: np.ndarray, fill: float) -> np.ndarray:
+        missing = count + 1 - len(table)
+        return np.pad(table, [(0, missing), (0, missing)], constant_values=fill)
+
+    seen = [np.where(g.seen < len(g.corner_xy_w), g.seen, count) for g in graphs]
+    extent = max(math.hypot(*g.free.shape) * g.fine_m for g in graphs)
+    return {
+        "node_of_cell": jnp.asarray(_pad([g.node_of_cell for g in graphs], 2), jnp.int32),
+        "grid_origin_w": jnp.asarray([g.origin_w for g in graphs], jnp.float32),
+        "node_xy_w": jnp.asarray(_pad([g.node_xy_w for g in graphs], 1), jnp.float32),
+        "seen": jnp.asarray(_pad(seen, 2, fill=count).astype(index)),
+        "corner_xy_w": jnp.asarray(
+            np.stack([np.pad(g.corner_xy_w, [(0, count + 1 - len(g.corner_xy_w)), (0, 0)]) for g in graphs])
+        ),
+        "corner_distance_m": jnp.asarray(np.stack([squared(g.distance_m, np.inf) for g in graphs]), jnp.float32),
+        "next_corner": jnp.asarray(np.stack([squared(g.next_corner, count) for g in graphs]).astype(index)),
+        "free": jnp.asarray(_pad([g.free for g in graphs], 2)),
+        "cell_m": graphs[0].cell_m,
+        "fine_m": graphs[0].fine_m,
+        "sight_samples": math.ceil(extent / (SIGHT_STEP_CELLS * graphs[0].fine_m)),
+    }
+
+
+def build_tables(world: World, config: NavConfig) -> SceneTables:
+    """Solves navigation for every scene and stacks all constants on the device.
+
+    Raises:
+        SceneError: a scene with no room for the robot, or for a start and a goal as far apart as asked.
+    """
+    with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
+        places = list(pool.map(lambda i: _scene_places(world, i, config), range(len(world.scenes))))
+    layout, slots = world.layout, world.layout.num_slots
+    com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
+    hinge = {
+        k: np.zeros((len(world.scenes), slots, n)) for k, n in (("pos", 3), ("quat", 4), ("axis", 3), ("anchor", 3))
+    }
+    hinge["quat"][..., 0] = 1.0
+    for s, model in enumerate(world.models):
+        for k in range(slots):
+            if layout.slot_kind[k] == "hinge":
+                body = layout.slot_body[k]
+                joint = model.body_jntadr[body]
+                hinge["pos"][s, k], hinge["quat"][s, k] = model.body_pos[body], model.body_quat[body]
+                hinge["axis"][s, k], hinge["anchor"][s, k] = model.jnt_axis[joint], model.jnt_pos[joint]
+    mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.mass_kg], 1)
+
+    def f32(value) -> jnp.ndarray:
+        return jnp.asarray(value, jnp.float32)
+
+    def i32(value) -> jnp.ndarray:
+        return jnp.asarray(value, jnp.int32)
+
+    tables = SceneTables(
+        rest_qpos=f32(world.rest_qpos),
+        mass_kg=f32(mass),
+        com_m=f32(com),
+        hinge_pos_w=f32(hinge["pos"]),
+        hinge_quat_w=f32(hinge["quat"]),
+        hinge_axis=f32(hinge["axis"]),
+        hinge_anchor_m=f32(hinge["anchor"]),
+        **navigation_tables([p[0] for p in places]),
+        start_xy_w=f32(_pad([p[1] for p in places], 1)),
+        num_starts=i32([len(p[1]) for p in places]),
+        goal_xy_w=f32(_pad([p[2] for p in places], 1)),
+        num_goals=i32([len(p[2]) for p in places]),
+        clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
+        num_clutter=i32([len(p[3]) for p in places]),
+    )
+    check_distances(world, tables, config)
+    return tables

@@ -1,0 +1,298 @@
+"""One episode, step by step: an environment and a policy in, a `Replay` of world poses out, and its file.
+
+A replay names bodies and holds their poses in the world frame, so that it can be drawn from the scene folder
+alone: without the policy, the physics, or the other scenes of the environment that it was played in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from interactive_nav.scenes.object_folders import small_objects
+from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav_common.errors import UserError
+from interactive_nav_common.files import whole_file
+
+FORMAT = 1
+_CHUNK_STEPS = 50
+_ARRAYS = (
+    *("start_xy_w", "goal_xy_w", "body_pos_w", "body_quat_w", "action", "reward", "force_n"),
+    *("touches_movable", "touches_structure"),
+)
+
+
+class ReplayError(UserError):
+    """A file that is no replay, or one that does not fit what is there to draw it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """T control steps of one episode; B bodies: the robot's, then the movable objects of its scene."""
+
+    robot: str
+    """Name of the robot."""
+    scene: str
+    """Scene folder."""
+    scene_digest: str
+    """SHA-256 of its scene.xml and maps.npz."""
+    control_dt_s: float
+    num_objects: int
+    """Small objects; `small` says which."""
+    policy: str
+    episode: int
+    label: str
+    """Where the policy comes from: a run and its checkpoint, or empty."""
+    bodies: tuple[str, ...]
+    """Names: the robot's base first."""
+    num_robot_bodies: int
+    """How many of the bodies are the robot's."""
+    start_xy_w: np.ndarray
+    """(2,) f32, m."""
+    goal_xy_w: np.ndarray
+    """(2,) f32, m."""
+    body_pos_w: np.ndarray
+    """[T + 1, B, 3] f32, m."""
+    body_quat_w: np.ndarray
+    """[T + 1, B, 4] f32, w x y z."""
+    action: np.ndarray
+    """[T, A] f32."""
+    reward: np.ndarray
+    """[T] f32."""
+    force_n: np.ndarray
+    """[T] f32: F_t of the Interactive Navigation Score, N."""
+    touches_movable: np.ndarray
+    """[T] bool."""
+    touches_structure: np.ndarray
+    """[T] bool."""
+    metrics: dict[str, float]
+    """The episode's scores, `EPISODE_METRICS`."""
+    small_objects: str = "train"
+    """Whose models the small objects are; this and what follows is not in older files."""
+    objects: tuple[str, ...] = ()
+    """Their folders, absolute, where they are not the built-in ones."""
+    segmentation_classes: int = 4
+    """As in `NavConfig`."""
+    success_distance_m: float | None = None
+    """Of the goal; None, in older files: not known, taken for the robot's width."""
+
+    @property
+    def small(self) -> tuple[SmallObject, ...]:
+        """The small objects.
+
+        Raises:
+            SceneError: a folder of `objects` is not there or no object.
+        """
+        return small_objects(self.num_objects, self.small_objects, self.objects)
+
+    @property
+    def num_steps(self) -> int:
+        """T."""
+        return len(self.action)
+
+    @property
+    def robot_xy_w(self) -> np.ndarray:
+        """[T + 1, 2] path of the robot's base, m."""
+        return self.body_pos_w[:, 0, :2]
+
+
+class Player:
+    """Plays episodes of one environment with one policy, compiled once."""
+
+    def __init__(
+        self,
+        env: InteractiveNav,
+        policy: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
+        name: str = "policy",
+        label: str = "",
+        planner: Callable[[Any, int, int], Any] | None = None,
+    ):
+        """Wires it.
+
+        Args:
+            env: one environment, not batched, not resetting itself.
+            policy: pure (observation, key) -> action (A,) in [-1, 1].
+            name: of the policy, for captions.
+            label: where the policy comes from, for captions.
+            planner: in place of a policy, (state with leaves [1, ...], episode, step) -> actions [1, A], on the
+                host: something that looks at the whole state or keeps a plan.
+
+        Raises:
+            ValueError: both a policy and a planner, or neither.
+        """
+        if (policy is None) == (planner is None):
+            raise ValueError("Player got policy and planner, expected exactly one of them")
+        self.env, self.name, self.label = env, name, label
+        self._reset = jax.jit(jax.vmap(env.reset))
+        self._planner = planner
+        self._chunk = jax.jit(functools.partial(_play_chunk, env, policy)) if policy else None
+        self._step = jax.jit(functools.partial(_play_step, env))
+
+    def play(self, key: jax.Array, episode: int = 0, on_progress: Callable[[int], None] = lambda step: None) -> Replay:
+        """Plays one episode to its end.
+
+        Args:
+            key: the episode is drawn from it, and the policy's chances follow from it.
+            episode: its number, for captions.
+            on_progress: told the number of steps taken, now and then.
+        """
+        state = self._reset(key[None])
+        policy_key = jax.random.fold_in(key, 0)
+        first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
+        parts, qpos = [], [np.asarray(state.pipeline_state.qpos)]
+        ended, step = False, 0
+        while not ended:
+            if self._chunk is not None:
+                state, steps = self._chunk(state, policy_key, step)
+            else:
+                assert self._planner is not None
+                state, steps = self._step(state, jnp.asarray(self._planner(state, episode, step), jnp.float32))
+                steps = jax.tree.map(lambda x: x[None], steps)
+            steps = jax.tree.map(np.asarray, steps)
+            done = np.flatnonzero(steps["done"])
+            ended = len(done) > 0
+            last = int(done[0]) + 1 if ended else len(steps["done"])
+            parts.append({name: values[:last] for name, values in steps.items()})
+            qpos.append(parts[-1]["qpos"])
+            step += last
+            on_progress(step)
+        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return _replay_of(self, episode, first, joined, np.concatenate(qpos))
+
+
+def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.ndarray], qpos: np.ndarray) -> Replay:
+    env = player.env
+    scene = int(first.scene_index)
+    bodies, num_robot, pos, quat = world_poses(env, scene, qpos)
+    counts = {name: np.diff(joined[name], prepend=0) > 0 for name in ("interaction_steps", "structure_steps")}
+    return Replay(
+        robot=env.robot.name,
+        scene=str(env.scenes[scene].path),
+        scene_digest=env.scenes[scene].digest,
+        control_dt_s=env.config.control_dt_s,
+        num_objects=env.config.num_objects,
+        policy=player.name,
+        episode=episode,
+        label=player.label,
+        bodies=bodies,
+        num_robot_bodies=num_robot,
+        start_xy_w=first.start_xy_w,
+        goal_xy_w=first.goal_xy_w,
+        body_pos_w=pos,
+        body_quat_w=quat,
+        action=joined["action"],
+        reward=joined["reward"],
+        force_n=np.diff(joined["force_sum_n"], prepend=0.0).astype(np.float32),
+        touches_movable=counts["interaction_steps"],
+        touches_structure=counts["structure_steps"],
+        metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
+        small_objects=env.config.small_objects,
+        objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
+        segmentation_classes=env.config.segmentation_classes,
+        success_distance_m=env.success_distance_m,
+    )
+
+
+def _play_chunk(env: InteractiveNav, policy: Any, state: Any, key: jax.Array, step: jax.Array) -> Any:
+    """`_CHUNK_STEPS` steps; what `_play_step` tells, stacked."""
+
+    def one_step(state: Any, t: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        obs = jax.tree.map(lambda x: x[0], state.obs)
+        action = jnp.asarray(policy(obs, jax.random.fold_in(key, step + t)), jnp.float32)
+        return _play_step(env, state, action[None])
+
+    return jax.lax.scan(one_step, state, jnp.arange(_CHUNK_STEPS))
+
+
+def _play_step(env: InteractiveNav, state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+    state = jax.vmap(env.step)(state, action)
+    nav = state.info["nav"]
+    out = {
+        "qpos": state.pipeline_state.qpos[0],
+        "action": action[0],
+        "reward": state.reward[0],
+        "done": state.done[0],
+        "force_sum_n": nav.force_sum_n[0],
+        "interaction_steps": nav.interaction_steps[0],
+        "structure_steps": nav.structure_steps[0],
+    }
+    return state, out | {f"metrics/{name}": state.metrics[name][0] for name in EPISODE_METRICS}
+
+
+def world_poses(env: InteractiveNav, scene: int, qpos: np.ndarray) -> tuple[Any, ...]:
+    """World poses of the robot's bodies and of a scene's movable objects.
+
+    Args:
+        env: for its models.
+        scene: index.
+        qpos: [T, nq]; a row that is not finite repeats the one before it.
+
+    Returns:
+        Names (B), how many of them are the robot's, positions [T, B, 3] f32 and orientations [T, B, 4] f32.
+    """
+    world, layout = env.world, env.world.layout
+    model = world.models[scene]
+    data = mujoco.MjData(model)
+    used = [slot for slot, name in enumerate(world.names[scene]) if name]
+    ids = np.concatenate([layout.robot_bodies, layout.slot_body[used]])
+    names = [model.body(int(b)).name for b in layout.robot_bodies] + [world.names[scene][slot] for slot in used]
+    pos, quat = np.zeros((len(qpos), len(ids), 3), np.float32), np.zeros((len(qpos), len(ids), 4), np.float32)
+    for t, row in enumerate(qpos):
+        if np.isfinite(row).all():
+            data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        pos[t], quat[t] = data.xpos[ids], data.xquat[ids]
+    return tuple(names), len(layout.robot_bodies), pos, quat
+
+
+def save(replay: Replay, path: str | Path) -> None:
+    """Writes a replay as npz, whole or not at all.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
+    header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
+
+
+def load(path: str | Path) -> Replay:
+    """Reads a replay.
+
+    Raises:
+        ReplayError: the file is missing, damaged, or of another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ReplayError(f"{path}: no such file, expected a replay (npz)")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if "policies" in stored.files:
+                raise ReplayError(
+                    f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "
+                    f"bodies; draw the paths (python -m train.figures {path.parent}), or play the episode again "
+                    "(python -m train.replay RUN_DIR)"
+                )
+            header = json.loads(str(stored["header"]))
+            arrays = {name: stored[name] for name in _ARRAYS}
+    except ReplayError:
+        raise
+    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise ReplayError(f"{path}: is no replay or damaged ({error}); record the episode again") from error
+    if header.pop("format", None) != FORMAT:
+        raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
+    for name in ("bodies", "objects"):
+        header[name] = tuple(header.get(name, ()))
+    return Replay(**header, **arrays)

@@ -1,0 +1,1 @@
+"""What robots really do, measured and drawn."""

@@ -1,0 +1,242 @@
+"""Robots in, pictures out: one PNG each, and the figure `docs/robots.png` with what was measured of them.
+
+Pictures come from MuJoCo's renderer where OpenGL is found (EGL, no display needed) and are
+otherwise drawn with matplotlib from the same geoms.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from interactive_nav.robot_study.evidence import Evidence
+from interactive_nav.robots import get_robot
+from interactive_nav.robots.spec import RobotSpec
+
+_SIZE = (480, 480)
+_VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG = 145.0, -22.0
+
+
+def stage(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot alone on a floor, standing in its home pose."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = _SIZE
+    spec.visual.headlight.ambient = [0.3, 0.3, 0.3]
+    spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[1, 1, 1],
+        rgb2=[1, 1, 1],
+        width=8,
+        height=48,
+    )
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[9, 9, 0.1])
+    floor.rgba = [0.93, 0.93, 0.95, 1]
+    spec.worldbody.add_light(pos=[1, 2, 4], dir=[-0.2, -0.45, -0.9])
+    robot.add_to(spec)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    at = model.jnt_qposadr[model.joint(robot.base_joint).id]
+    data.qpos[at : at + 7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]
+    for name, value in robot.home_qpos:
+        data.qpos[model.joint(name).qposadr[0]] = value
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def _shown(model: mujoco.MjModel) -> list[int]:
+    """Geoms to draw: visual ones, or the collision geoms of a robot that has none."""
+    own = [g for g in range(model.ngeom) if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE]
+    visual = [g for g in own if model.geom_group[g] == 2]
+    if not visual:
+        return own
+    # A wheel's sphere is not drawn where a visual tyre is.
+    bare = set(model.geom_bodyid[g] for g in own) - set(model.geom_bodyid[g] for g in visual)
+    return visual + [g for g in own if model.geom_bodyid[g] in bare]
+
+
+def _span(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
+    """Centre and half diagonal of the drawn geoms."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for g in _shown(model):
+        radius = model.geom_rbound[g]
+        half = np.minimum(radius, np.abs(data.geom_xmat[g].reshape(3, 3)) @ model.geom_aabb[g, 3:])
+        low, high = np.minimum(low, data.geom_xpos[g] - half), np.maximum(high, data.geom_xpos[g] + half)
+    return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+
+
+def _with_gl(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    shown = set(_shown(model))
+    for g in range(model.ngeom):
+        if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE:
+            model.geom_group[g] = 0 if g in shown else 5
+    centre, half = _span(model, data)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.distance = centre, 2.9 * half
+    camera.azimuth, camera.elevation = _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG
+    # mujoco.Renderer asks for a window system unless MUJOCO_GL was set before mujoco's import, and then aborts
+    # the process where there is no display: EGL is used directly.
+    from mujoco.egl import GLContext
+
+    context = GLContext(*_SIZE)
+    context.make_current()
+    scene = mujoco.MjvScene(model, 1000)
+    drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, drawn)
+    option, view = mujoco.MjvOption(), mujoco.MjrRect(0, 0, *_SIZE)
+    mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+    mujoco.mjr_render(view, scene, drawn)
+    image = np.zeros((_SIZE[1], _SIZE[0], 3), np.uint8)
+    mujoco.mjr_readPixels(image, None, view, drawn)
+    drawn.free()
+    context.free()
+    return image[::-1].copy()
+
+
+def _faces(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """[n, 4, 3] quadrilaterals of a primitive's surface, world frame."""
+    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+    around, along = 12, 6
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+        faces = []
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                face = np.insert(corner, axis, sign, axis=1)
+                faces.append(face * size)
+        local = np.asarray(faces)
+    else:
+        if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            profile = np.array([[0, -size[1]], [size[0], -size[1]], [size[0], size[1]], [0, size[1]]])
+        else:
+            angle = np.linspace(-np.pi / 2, np.pi / 2, 2 * along)
+            if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+                shift = np.where(angle < 0, -size[1], size[1])
+                profile = np.stack([size[0] * np.cos(angle), size[0] * np.sin(angle) + shift], -1)
+            else:
+                tall = size[2] if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0]
+                profile = np.stack([size[0] * np.cos(angle), tall * np.sin(angle)], -1)
+        turn = np.linspace(0, 2 * np.pi, around + 1)
+        flat = size[1] / size[0] if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else 1.0
+        ring = np.stack([np.cos(turn), flat * np.sin(turn)], -1)
+        grid = np.concatenate(
+            [profile[:, None, :1] * ring[None], np.broadcast_to(profile[:, None, 1:], (len(profile), around + 1, 1))],
+            -1,
+        )
+        local = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], 2).reshape(-1, 4, 3)
+    return local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+
+
+def _with_matplotlib(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    figure = Figure(figsize=(_SIZE[0] / 100, _SIZE[1] / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    axes: Any = figure.add_subplot(projection="3d")
+    light = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
+    faces, colours = [], []
+    for geom in _shown(model):
+        own = _faces(model, data, geom)
+        normal = np.cross(own[:, 2] - own[:, 0], own[:, 3] - own[:, 1])
+        length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        shade = 0.55 + 0.45 * np.abs(normal / length @ light)
+        faces.append(own)
+        colours.append(np.clip(shade[:, None] * model.geom_rgba[geom, :3], 0, 1))
+    axes.add_collection3d(Poly3DCollection(np.concatenate(faces), facecolors=np.concatenate(colours)))
+    centre, half = _span(model, data)
+    for setter, middle in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, strict=True):
+        setter(middle - 0.7 * half, middle + 0.7 * half)
+    axes.set_box_aspect((1, 1, 1))
+    axes.view_init(elev=-_VIEW_ELEVATION_DEG, azim=_VIEW_AZIMUTH_DEG - 180)
+    axes.set_axis_off()
+    figure.subplots_adjust(0, 0, 1, 1)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def picture(robot: RobotSpec, renderer: str = "auto") -> np.ndarray:
+    """[480, 480, 3] uint8 image of the robot in its home pose.
+
+    Args:
+        robot: its spec.
+        renderer: `gl`, `matplotlib`, or `auto`: OpenGL where there is one.
+    """
+    model, data = stage(robot)
+    if renderer != "matplotlib":
+        try:
+            return _with_gl(model, data)
+        except Exception:  # OpenGL's loaders raise what they like where there is none
+            if renderer == "gl":
+                raise
+            model, data = stage(robot)
+    return _with_matplotlib(model, data)
+
+
+def save_pictures(names: tuple[str, ...], folder: Path) -> list[Path]:
+    """Writes one PNG per robot; returns their paths."""
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name in names:
+        path = folder / f"{name}.png"
+        Image.fromarray(picture(get_robot(name))).save(path)
+        paths.append(path)
+    return paths
+
+
+def save_figure(evidence: dict[str, Evidence | None], path: Path) -> None:
+    """One row per robot: its picture, the straight drive, the turn on the spot, and its checks.
+
+    Args:
+        evidence: robot -> what was measured; none: a picture only.
+        path: of the PNG.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(17, 2.9 * len(evidence)))
+    axes = figure.subplots(len(evidence), 4, width_ratios=(1, 1.3, 1.3, 2.6), squeeze=False)
+    for (image, straight, turn, table), (name, own) in zip(axes, evidence.items(), strict=True):
+        robot = get_robot(name)
+        image.imshow(picture(robot))
+        image.set_title(f"{name}, {robot.mass_kg:.4g} kg" if robot.mass_kg else name, fontsize=10)
+        for axis in (image, table):
+            axis.set_axis_off()
+        if own is None:
+            straight.set_axis_off()
+            turn.set_axis_off()
+            continue
+        curves = (
+            (straight, own.speed_m_s, own.commanded_m_s, "m/s", "straight, then stop"),
+            (turn, own.turn_rad_s, own.commanded_rad_s, "rad/s", "turn on the spot, then stop"),
+        )
+        for axis, got, asked, unit, title in curves:
+            axis.plot(own.time_s, asked, "--", color="0.5", linewidth=1, label="asked")
+            axis.plot(own.time_s, got, color="tab:blue", linewidth=1.5, label="measured")
+            axis.set_ylabel(unit, fontsize=8)
+            axis.set_title(title, fontsize=8)
+            axis.set_xlabel("s", fontsize=8)
+            axis.tick_params(labelsize=7)
+            axis.legend(fontsize=7, loc="lower left")
+        half = (len(own.checks) + 1) // 2
+        for column, part in enumerate((own.checks[:half], own.checks[half:])):
+            for row, check in enumerate(part):
+                table.text(
+                    0.5 * column,
+                    1.0 - row / half,
+                    f"{check.name}: {check.value:.3g}",
+                    fontsize=8,
+                    color="black" if check.passed else "red",
+                    transform=table.transAxes,
+                    va="top",
+                )
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)

@@ -1,0 +1,1 @@
+"""Scene folders in, MuJoCo models of equal layout out."""

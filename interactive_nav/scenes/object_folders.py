@@ -1,0 +1,107 @@
+"""Folders made by `python -m converters object` in, small objects out: what `NavConfig.objects` names."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from interactive_nav.scenes.objects import Box, SmallObject, pick
+from interactive_nav.scenes.scene import Movable, read_movable
+from scenes_mjcf.schema import CATEGORIES, SceneError
+
+RGBA = (0.6, 0.6, 0.6, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ConvertedObject(SmallObject):
+    """A small object from a folder; its boxes are those of `object.xml` as it stands at rest, lowest point at 0."""
+
+    sha256: str
+    """Of object.xml and the hulls."""
+    movable: Movable = dataclasses.field(repr=False, compare=False)
+    """Its body in the same frame: mass properties and hulls as converted."""
+
+
+def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple[SmallObject, ...]:
+    """The small objects of an environment: the folders in turn where there are some, else the built-in ones.
+
+    Args:
+        num_objects: how many.
+        split: whose built-in models, train or test.
+        folders: of `NavConfig.objects`.
+
+    Raises:
+        SceneError: a folder that is no object.
+    """
+    if not folders:
+        return pick(num_objects, split)
+    models = [load_object(folder) for folder in folders]
+    return tuple(models[i % len(models)] for i in range(num_objects))
+
+
+def load_object(folder: str | Path) -> ConvertedObject:
+    """Reads and checks a folder with `object.xml`, `object.json` and `assets/`.
+
+    Raises:
+        SceneError: a file is missing, damaged or does not compile.
+    """
+    from scenes_mjcf.categories import class_id  # which imports the world that small objects are part of
+
+    folder = Path(folder)
+    xml = folder / "object.xml"
+    try:
+        about = json.loads((folder / "object.json").read_text(encoding="utf-8"))
+        name, category, friction = str(about["name"]), str(about["category"]), float(about["friction"])
+        hulls = sorted((folder / "assets").glob("*_hull_*.obj"))
+        sha256 = hashlib.sha256(b"".join(p.read_bytes() for p in (xml, *hulls))).hexdigest()
+        model = mujoco.MjModel.from_xml_path(str(xml))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        reason = f"no key {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
+        raise SceneError(
+            f"{folder}: is no usable object ({reason}), expected a folder made by 'python -m converters object'"
+        ) from error
+    if category not in CATEGORIES:
+        raise SceneError(f"{folder}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
+    movable = _standing(read_movable(model, xml, name, category, friction))
+    boxes = tuple(
+        Box(_numbers(row[:3]), _numbers(row[7:10]), _numbers(row[3:7]))  # type: ignore[arg-type]
+        for row in movable.boxes
+    )
+    return ConvertedObject(
+        name, category, class_id(category), movable.mass_kg, friction, boxes, RGBA, (), sha256, movable
+    )
+
+
+def _numbers(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(v) for v in values)
+
+
+def _standing(movable: Movable) -> Movable:
+    """The body as it stands at rest over the origin: its frame level, its boxes' lowest corner at z = 0."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, movable.quat_w)
+    turn = turn.reshape(3, 3)
+
+    def turned(quat: np.ndarray) -> np.ndarray:
+        out = np.zeros(4)
+        mujoco.mju_mulQuat(out, movable.quat_w, quat)
+        return out
+
+    boxes = np.asarray([[*(turn @ r[:3]), *turned(r[3:7]), *r[7:]] for r in movable.boxes])
+    drop = np.array([0.0, 0.0, min(z for r in boxes for _, _, z in Box(r[:3], r[7:], r[3:7]).corners_m)])
+    boxes[:, :3] -= drop
+    return dataclasses.replace(
+        movable,
+        pos_w=np.zeros(3),
+        quat_w=np.array([1.0, 0.0, 0.0, 0.0]),
+        com_m=turn @ movable.com_m - drop,
+        inertia_quat=turned(movable.inertia_quat),
+        boxes=boxes,
+        hulls=tuple(h @ turn.T - drop for h in movable.hulls),
+    )

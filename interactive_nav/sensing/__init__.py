@@ -1,0 +1,33 @@
+"""Cameras and scanners: poses in, depth, class ids and distances out; `make_renderer` picks who draws."""
+
+from __future__ import annotations
+
+from interactive_nav.sensing.base import CameraPose, Lens, Renderer, look_along
+from interactive_nav.sensing.boxes import BoxTables, build_boxes
+
+
+def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str) -> Renderer:
+    """Builds a renderer.
+
+    Args:
+        tables: what is drawn.
+        lens: the camera's.
+        name: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
+        backend: of the physics: warp, jax or native.
+
+    Raises:
+        ValueError: warp where the package warp-lang is not installed.
+    """
+    from interactive_nav.physics import resolve_backend
+
+    if name == "warp" or (name == "auto" and backend == "warp"):
+        resolve_backend("warp")
+        from interactive_nav.sensing.warp import WarpRenderer
+
+        return WarpRenderer(tables, lens)
+    from interactive_nav.sensing.rays import RayRenderer
+
+    return RayRenderer(tables, lens)
+
+
+__all__ = ["BoxTables", "CameraPose", "Lens", "Renderer", "build_boxes", "look_along", "make_renderer"]

@@ -1,0 +1,103 @@
+"""Robot state in, pose of its camera out."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from interactive_nav.robots.spec import Camera
+from interactive_nav.sensing.base import CameraPose, look_along
+from interactive_nav.sensing.boxes import compose, rotate
+from interactive_nav.sensing.observation import rotation_from_quat
+
+
+@dataclasses.dataclass(frozen=True)
+class _Link:
+    pos: np.ndarray
+    axes: np.ndarray
+    joints: tuple[tuple[bool, int, float, np.ndarray, np.ndarray], ...]
+    """(slides, address in qpos, qpos0, axis, anchor) in order."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mount:
+    """A camera fixed to a body of the robot: its base, or a link that hinges and slides carry."""
+
+    base_qpos: int
+    links: tuple[_Link, ...]
+    pos_b: np.ndarray
+    """(3,) of the camera in its body's frame, m."""
+    forward_b: np.ndarray
+    """(3,)."""
+
+    def pose(self, qpos: jax.Array) -> CameraPose:
+        """The camera's pose, without roll.
+
+        Args:
+            qpos: [..., nq].
+        """
+        at = self.base_qpos
+        pos, axes = qpos[..., at : at + 3], rotation_from_quat(qpos[..., at + 3 : at + 7])
+        for link in self.links:
+            pos = pos + rotate(axes, jnp.asarray(link.pos, qpos.dtype))
+            axes = compose(axes, jnp.asarray(link.axes, qpos.dtype))
+            for slides, address, zero, axis, anchor in link.joints:
+                value, axis = qpos[..., address] - zero, jnp.asarray(axis, qpos.dtype)
+                if slides:
+                    pos = pos + rotate(axes, axis) * value[..., None]
+                    continue
+                half = 0.5 * value[..., None]
+                turn = rotation_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
+                anchor = jnp.asarray(anchor, qpos.dtype)
+                pos = pos + rotate(axes, anchor - rotate(turn, anchor))
+                axes = compose(axes, turn)
+        where = pos + rotate(axes, jnp.asarray(self.pos_b, qpos.dtype))
+        return look_along(where, rotate(axes, jnp.asarray(self.forward_b, qpos.dtype)))
+
+
+def _axes(quat: np.ndarray) -> np.ndarray:
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, quat)
+    return out.reshape(3, 3)
+
+
+def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:
+    """Finds the chain of bodies from a robot's base to its camera.
+
+    Args:
+        model: with the robot.
+        base_body: the body with the free joint.
+        camera: its body lies in the base's subtree.
+
+    Raises:
+        ValueError: no such body, or one that is not part of the robot.
+    """
+    base, body = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in (base_body, camera.body))
+    own = [model.body(b).name for b in range(model.nbody) if model.body_rootid[b] == base]
+    if body < 0 or model.body_rootid[body] != base:
+        near = difflib.get_close_matches(camera.body, own, 1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ValueError(f"camera body '{camera.body}' is no body of the robot; {hint}its bodies: {', '.join(own)}")
+    links = []
+    while body != base:
+        joints = []
+        first = model.body_jntadr[body]
+        for j in range(first, first + model.body_jntnum[body]):
+            slides = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
+            address = int(model.jnt_qposadr[j])
+            zero = float(model.qpos0[address])
+            joints.append((bool(slides), address, zero, model.jnt_axis[j].copy(), model.jnt_pos[j].copy()))
+        links.append(_Link(model.body_pos[body].copy(), _axes(model.body_quat[body]), tuple(joints)))
+        body = model.body_parentid[body]
+    return Mount(
+        base_qpos=int(model.jnt_qposadr[model.body_jntadr[base]]),
+        links=tuple(reversed(links)),
+        pos_b=np.asarray(camera.pos_m, float),
+        forward_b=np.array([math.cos(camera.pitch_rad), 0.0, -math.sin(camera.pitch_rad)]),
+    )

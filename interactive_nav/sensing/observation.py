@@ -1,0 +1,94 @@
+"""Pose, velocity, path and other signals in, the flat observation out, in the original benchmark's order.
+
+Layout by default (reference benchmark, section 1.1), robot frame, full roll-pitch-yaw inverse, no clipping:
+
+| slice | content | unit |
+|---|---|---|
+| 0-19 | ten waypoints x0, y0, ..., x9, y9 | m |
+| 20-22 | goal minus robot position x, y, z | m |
+| 23-25 | base linear velocity | m/s |
+| 26-28 | base angular velocity | rad/s |
+
+Then, where asked for: localisation, odometry, collision, joints, lidar. Images stand beside the
+vector, not in it: `interactive_nav.sensing.sensors`.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def rotation_from_quat(quat: jax.Array) -> jax.Array:
+    """(..., 4) w x y z -> (..., 3, 3), the body's axes as columns."""
+    w, x, y, z = jnp.moveaxis(quat, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
+
+
+def waypoints_in_body(waypoints_w: jax.Array, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
+    """World waypoints (W, 2), lifted to the robot's own height, in the robot's frame (W, 2)."""
+    offset = jnp.concatenate([waypoints_w - pos_w[:2], jnp.zeros((waypoints_w.shape[0], 1))], -1)
+    return (offset @ rotation)[:, :2]
+
+
+def task_parts(
+    pos_w: jax.Array,
+    rotation: jax.Array,
+    linear_velocity_w: jax.Array,
+    angular_velocity_b: jax.Array,
+    goal_xy_w: jax.Array,
+    waypoints_b: jax.Array,
+) -> dict[str, jax.Array]:
+    """The task's parts of the observation of one environment, in the vector's order.
+
+    Args:
+        pos_w: (3,) base position, m.
+        rotation: (3, 3) base axes as columns.
+        linear_velocity_w: (3,) m/s.
+        angular_velocity_b: (3,) rad/s, base frame (as MuJoCo's free joint has it).
+        goal_xy_w: (2,) m; the goal lies on the floor, z = 0.
+        waypoints_b: (W, 2) m.
+
+    Returns:
+        Name -> (n,) f32.
+    """
+    goal_w = jnp.concatenate([goal_xy_w, jnp.zeros(1)])
+    return {
+        "waypoints": waypoints_b.reshape(-1),
+        "goal": (goal_w - pos_w) @ rotation,
+        "velocity": jnp.concatenate([linear_velocity_w @ rotation, angular_velocity_b]),
+    }
+
+
+def advance_odometry(
+    pose: jax.Array, moved_w: jax.Array, yaw_rad: jax.Array, turned_rad: jax.Array, noise: jax.Array
+) -> jax.Array:
+    """Dead reckoning over one control step, in the frame of the episode's start.
+
+    Args:
+        pose: (3,) x, y (m), yaw (rad) reckoned so far.
+        moved_w: (2,) m, true displacement.
+        yaw_rad: [] true yaw before the step.
+        turned_rad: [] true change of yaw.
+        noise: (2,) relative error of the distance and of the angle of this step.
+
+    Returns:
+        (3,) the new pose; its yaw is not wrapped.
+    """
+    cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
+    ahead, left = cos * moved_w[0] + sin * moved_w[1], -sin * moved_w[0] + cos * moved_w[1]
+    ahead, left = ahead * (1 + noise[0]), left * (1 + noise[0])
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    return jnp.stack(
+        [pose[0] + cos * ahead - sin * left, pose[1] + sin * ahead + cos * left, pose[2] + turned_rad * (1 + noise[1])]
+    )
+
+
+def wrap_angle(angle_rad: jax.Array) -> jax.Array:
+    """To [-pi, pi)."""
+    return (angle_rad + jnp.pi) % (2 * jnp.pi) - jnp.pi

@@ -1,0 +1,194 @@
+"""Physics state and task memory in, what the robot observes out: a vector, and images where asked for.
+
+Without images the observation is the flat f32 vector of `interactive_nav.sensing.observation`. With them it is a dict,
+its keys named as Brax's networks for pixels want them:
+
+| key | content |
+|---|---|
+| `state` | the vector (left out if no part of it is asked for) |
+| `pixels/depth` | (H, W, 1): distance along the optical axis over `depth_range_m`, cut at 1; 0 where nothing is met |
+| `pixels/segmentation` | (H, W, 1): class id over 11, see `interactive_nav.sensing.boxes` |
+
+Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded. Noise is as in iGibson: a share of the readings
+drops out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It depends on the episode's key
+and the step alone.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from interactive_nav.config import IMAGES, NavConfig
+from interactive_nav.physics.base import PhysicsState
+from interactive_nav.scenes.world import World
+from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
+from interactive_nav.sensing.boxes import NUM_CLASSES, rotate
+from interactive_nav.sensing.mount import make_mount
+from interactive_nav.sensing.observation import rotation_from_quat, task_parts, wrap_angle
+from interactive_nav.sensing.rays import cast_fan
+from interactive_nav.types import NavInfo
+
+LIDAR_NEAR_M = 0.05
+"""Beams begin this far from the scanner (iGibson)."""
+
+
+def stream(rng: jax.Array, name: str, step_count: jax.Array) -> jax.Array:
+    """A sensor's key of one control step.
+
+    Its name is folded into the episode's key, so that each sensor has a stream of its own. A small number would not
+    do: `fold_in(key, 1)` is `split(key)[1]`, which the next episode is drawn from.
+    """
+    return jax.random.fold_in(jax.random.fold_in(rng, zlib.crc32(name.encode())), step_count)
+
+
+class Sensors:
+    """All that one world's robots can sense under one configuration."""
+
+    renderer: Renderer | None
+
+    def __init__(self, world: World, config: NavConfig, backend: str):
+        """Builds tables, and the renderer if images are asked for.
+
+        Args:
+            world: of the environment.
+            config: its settings.
+            backend: of the physics: warp, jax or native.
+        """
+        self._layout, self._config = world.layout, config
+        model = world.models[0]
+        self._joints = _own_joints(model, world)
+        self._images = tuple(name for name in IMAGES if name in config.observations)
+        self.five_classes = config.segmentation_classes == 5
+        self.boxes = build_boxes(world, self.five_classes)
+        self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
+        self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
+        self.renderer = make_renderer(self.boxes, self.lens, config.renderer, backend) if self._images else None
+        angles = -0.5 * config.lidar_fov_deg + np.arange(config.lidar_rays) * config.lidar_fov_deg / config.lidar_rays
+        beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
+        self._beams_b = np.stack(beams, -1).astype(np.float32)
+        sizes = {
+            "waypoints": 2 * config.num_waypoints,
+            "goal": 3,
+            "velocity": 6,
+            "localisation": 3,
+            "odometry": 3,
+            "collision": 2,
+            "joints": 2 * len(self._joints[0]),
+            "lidar": config.lidar_rays,
+        }
+        self.sizes = {name: size for name, size in sizes.items() if name in config.observations}
+        """Parts of the vector in order -> their lengths."""
+
+    @property
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:
+        """Length of the vector, or with images the shape under each key."""
+        length = sum(self.sizes.values())
+        if not self._images:
+            return length
+        side = self._config.image_size
+        shapes: dict[str, tuple[int, ...]] = {"state": (length,)} if length else {}
+        return shapes | {f"pixels/{name}": (side, side, 1) for name in self._images}
+
+    def observe(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array | dict[str, jax.Array]:
+        """The observation of one environment.
+
+        Args:
+            physics: its state.
+            nav: its task memory, up to date with it.
+            rng: the episode's key, read for sensor noise and not consumed.
+        """
+        vector = self._vector(physics, nav, rng)
+        if not self._images:
+            return vector
+        out = {"state": vector} if self.sizes else {}
+        depth_m, ids = self.render(physics, nav)
+        images = {
+            "depth": self._noisy_depth(jnp.clip(depth_m / self._config.depth_range_m, 0.0, 1.0), nav, rng),
+            "segmentation": ids.astype(jnp.float32) / NUM_CLASSES,
+        }
+        dtype = jnp.dtype(self._config.image_dtype)
+        for name in self._images:
+            image = images[name][..., None]
+            image = jnp.round(255.0 * image) if dtype == jnp.uint8 else image
+            out[f"pixels/{name}"] = image.astype(dtype)
+        return out
+
+    def render(self, physics: PhysicsState, nav: NavInfo) -> tuple[jax.Array, jax.Array]:
+        """What the robot's camera sees, without noise: depth [H, W] f32, m, and class ids [H, W] u8."""
+        assert self.renderer is not None
+        # A broken world's numbers must not reach the renderer's search tree.
+        qpos = jnp.where(jnp.isfinite(physics.qpos), physics.qpos, 0.0)
+        return self.renderer.render(nav.scene_index, qpos, self.mount.pose(qpos))
+
+    def odometry_error(self, rng: jax.Array, step_count: jax.Array) -> jax.Array:
+        """(2,) relative errors of a step's distance and angle."""
+        if not self._config.odometry_noise:
+            return jnp.zeros(2)
+        key = stream(rng, "odometry", step_count)
+        return self._config.odometry_noise * jax.random.normal(key, (2,))
+
+    def _vector(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array:
+        v, q = self._layout.robot_qvel, self._layout.robot_qpos
+        rotation = rotation_from_quat(physics.qpos[q + 3 : q + 7])
+        values = task_parts(
+            nav.robot_pos_w,
+            rotation,
+            physics.qvel[v : v + 3],
+            physics.qvel[v + 3 : v + 6],
+            nav.goal_xy_w,
+            nav.waypoints_b,
+        )
+        if "localisation" in self.sizes:
+            values["localisation"] = jnp.append(nav.robot_pos_w[:2], nav.yaw_rad)
+        if "odometry" in self.sizes:
+            values["odometry"] = nav.odometry.at[2].set(wrap_angle(nav.odometry[2]))
+        if "collision" in self.sizes:
+            values["collision"] = nav.touching.astype(jnp.float32)
+        if "joints" in self.sizes:
+            position, velocity, turns = self._joints
+            angle = physics.qpos[position]
+            angle = jnp.where(turns, wrap_angle(angle), angle)
+            values["joints"] = jnp.concatenate([angle, physics.qvel[velocity]])
+        if "lidar" in self.sizes:
+            values["lidar"] = self._scan(physics, nav, rotation, rng)
+        return jnp.concatenate([values[name] for name in self.sizes] or [jnp.zeros(0)])
+
+    def _scan(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array, rng: jax.Array) -> jax.Array:
+        config = self._config
+        origin = nav.robot_pos_w + rotate(rotation, jnp.asarray(config.lidar_pos_m, jnp.float32))
+        beams = rotate(rotation, jnp.asarray(self._beams_b))
+        distance = cast_fan(self.boxes, nav.scene_index, physics.qpos, origin, beams)
+        scan = jnp.clip(distance / config.lidar_range_m, LIDAR_NEAR_M / config.lidar_range_m, 1.0)
+        key = stream(rng, "lidar", nav.step_count)
+        return _noisy(scan, config.lidar_noise, config.lidar_dropout, 1.0, key)
+
+    def _noisy_depth(self, depth: jax.Array, nav: NavInfo, rng: jax.Array) -> jax.Array:
+        key = stream(rng, "depth", nav.step_count)
+        return _noisy(depth, self._config.depth_noise, self._config.depth_dropout, 0.0, key)
+
+
+def _noisy(reading: jax.Array, noise: float, dropout: float, lost: float, key: jax.Array) -> jax.Array:
+    """Readings in [0, 1] with a Gaussian error in proportion, some replaced by `lost`."""
+    key_noise, key_dropout = jax.random.split(key)
+    if noise:
+        reading = jnp.clip(reading * (1 + noise * jax.random.normal(key_noise, reading.shape)), 0.0, 1.0)
+    if dropout:
+        reading = jnp.where(jax.random.bernoulli(key_dropout, dropout, reading.shape), lost, reading)
+    return reading
+
+
+def _own_joints(model: mujoco.MjModel, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The robot's joints but its free one: addresses in qpos and in qvel, and whether they turn without limit."""
+    own = [
+        j
+        for j in range(model.njnt)
+        if model.jnt_bodyid[j] in world.layout.robot_bodies
+        and int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    ]
+    turns = (model.jnt_type[own] == mujoco.mjtJoint.mjJNT_HINGE) & ~model.jnt_limited[own].astype(bool)
+    return model.jnt_qposadr[own], model.jnt_dofadr[own], turns

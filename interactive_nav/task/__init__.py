@@ -1,0 +1,1 @@
+"""The environment, its batches and its devices."""

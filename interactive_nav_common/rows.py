@@ -1,0 +1,79 @@
+"""Tables of rows in, Parquet files out, whole or not at all, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import whole_file
+
+if TYPE_CHECKING:
+    pass
+
+
+IDENTITY = ("run", "robot", "policy", "evaluation_seed", "scene", "episode")
+"""Columns that name an episode that was played."""
+
+
+def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = None) -> None:
+    """Writes rows whole or not at all.
+
+    Args:
+        table: the rows.
+        path: of the file.
+        notes: kept in the file beside them.
+
+    Raises:
+        FileError: the file cannot be written.
+    """
+    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    others = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
+    with whole_file(path) as partial:
+        pq.write_table(
+            table.replace_schema_metadata(notes),
+            partial,
+            compression="zstd",
+            compression_level=15,
+            use_dictionary=others,  # type: ignore[arg-type]
+            use_byte_stream_split=floats,  # type: ignore[arg-type]
+        )
+
+
+def read_notes(path: Path) -> dict[str, str]:
+    """What `write_parquet` kept beside the rows; nothing where the file is damaged."""
+    try:
+        found = pq.read_schema(path).metadata or {}
+    except (OSError, pa.ArrowInvalid):
+        return {}
+    return {key.decode(): value.decode() for key, value in found.items()}
+
+
+def read_rows(paths: Sequence[Path]) -> pa.Table:
+    """The rows of several files as one table; a column that a file lacks is empty there.
+
+    An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name.
+
+    Raises:
+        FileError: a file is not readable as Parquet, or columns do not fit each other.
+    """
+    tables = []
+    for path in sorted(paths):
+        try:
+            tables.append(pq.read_table(path).replace_schema_metadata(None))
+        except (OSError, pa.ArrowInvalid) as error:
+            raise FileError(f"{path}: not readable as Parquet ({error}); evaluate the run again") from None
+    try:
+        rows = pa.concat_tables(tables, promote_options="permissive")
+    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        raise FileError(f"rows do not fit each other ({error}); draw their folders one by one") from None
+    if not set(IDENTITY) <= set(rows.column_names):
+        return rows
+    order = rows.select(list(IDENTITY)).append_column("at", pa.array(np.arange(len(rows))))
+    last = order.group_by(list(IDENTITY)).aggregate([("at", "max")])["at_max"].to_numpy()
+    return rows.take(np.sort(last))

@@ -1,0 +1,134 @@
+"""Decomposition: hulls of known shapes, the cache, and its two failures."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from converters.bodies import decompose
+from converters.bodies.decompose import DecomposeConfig, content_key, decompose_all
+from converters.geometry.boxes import convex_hull
+from converters.records.errors import StageFailed
+from tests.converters import tiny_raw
+
+CONFIG = DecomposeConfig()
+
+
+def table() -> tuple[np.ndarray, np.ndarray]:
+    mesh = tiny_raw.table_cad()
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+
+
+def test_a_table_becomes_a_top_and_four_legs(hull_cache):
+    hulls = decompose_all({"table": table()}, CONFIG, 1, hull_cache).hulls["table"]
+    assert 5 <= len(hulls) <= CONFIG.max_convex_hull
+    low = np.min([h.vertices.min(axis=0) for h in hulls], axis=0)
+    high = np.max([h.vertices.max(axis=0) for h in hulls], axis=0)
+    np.testing.assert_allclose([low, high], [(-0.5, -0.35, -0.3), (0.5, 0.35, 0.3)], atol=0.03)
+    # 0.06 m3 of top and 4 * 0.00384 m3 of legs; voxels of the preprocessing thicken it somewhat.
+    volume = sum(trimesh.Trimesh(h.vertices, h.faces).volume for h in hulls)
+    assert 0.06 < volume < 0.11
+    assert all(trimesh.Trimesh(h.vertices, h.faces).is_convex for h in hulls)
+
+
+def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cache, monkeypatch):
+    vertices, faces = table()
+    first = decompose_all({"a": (vertices, faces)}, CONFIG, 1, hull_cache).hulls["a"]
+    entry = hull_cache / f"{content_key(vertices, faces, CONFIG)}.npz"
+    own = tmp_path / entry.name
+    own.write_bytes(entry.read_bytes()[:100])  # cut short
+    again = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path).hulls["a"]
+    assert own.read_bytes() == entry.read_bytes()
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+
+    def no_process(*args, **kwargs):
+        raise AssertionError("a cached mesh must not be decomposed")
+
+    monkeypatch.setattr(decompose, "_start", no_process)
+    cached = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path).hulls
+    assert len(cached["a"]) == len(cached["b"]) == len(first)
+
+
+def test_hulls_that_are_used_are_not_the_oldest(tmp_path):
+    vertices, faces = table()
+    path = tmp_path / f"{content_key(vertices, faces, CONFIG)}.npz"
+    decompose._store(path, (convex_hull(vertices),))
+    os.utime(path, (0, 0))
+    assert decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path).fallbacks == {}
+    assert path.stat().st_mtime > 0
+    os.utime(path, (0, 0))
+    decompose._store(tmp_path / "other.npz", (convex_hull(vertices),), limit_bytes=0)
+    assert [p.name for p in tmp_path.iterdir()] == ["other.npz"]  # hulls alone are kept within the limit, too
+
+
+def test_the_key_follows_content_and_parameters_only():
+    vertices, faces = table()
+    key = content_key(vertices, faces, CONFIG)
+    assert key == content_key(vertices.copy(), faces.astype(np.int32), dataclasses.replace(CONFIG, timeout_s=1.0))
+    assert key != content_key(vertices * 1.001, faces, CONFIG)
+    assert key != content_key(vertices, faces, dataclasses.replace(CONFIG, threshold=0.2))
+
+
+def test_a_failing_and_a_slow_model_get_their_convex_hull(tmp_path):
+    late = decompose_all({"table": table()}, dataclasses.replace(CONFIG, timeout_s=0.0), 1, tmp_path)
+    assert late.fallbacks == {"table": "coacd ran past 0 s on table"}
+    (hull,) = late.hulls["table"]
+    # The top, 1.0 x 0.6 x 0.1, and under it a prismatoid of 0.6 that narrows to the legs' 0.98 x 0.58.
+    want = 0.06 + 0.6 / 6 * (1.0 * 0.6 + 4 * 0.99 * 0.59 + 0.98 * 0.58)
+    assert trimesh.Trimesh(hull.vertices, hull.faces).volume == pytest.approx(want)
+    assert list(tmp_path.iterdir()) == []  # tried again the next time
+
+
+def test_a_crash_of_coacd_gets_the_convex_hull(tmp_path, monkeypatch):
+    start = decompose._start
+
+    def crash(key, name, vertices, faces, config, scratch):
+        return start(key, name, vertices, faces + 10**6 * (name == "broken"), config, scratch)
+
+    monkeypatch.setattr(decompose, "_start", crash)  # faces of vertices that are not there
+    done = decompose_all({"broken": table(), "copy": table()}, CONFIG, 1, tmp_path)
+    assert (
+        list(done.fallbacks) == ["broken", "copy"] and "coacd failed on broken (exit code" in done.fallbacks["broken"]
+    )
+    with pytest.raises(StageFailed, match="decompose: coacd failed on broken"):
+        decompose_all({"broken": table()}, CONFIG, 1, tmp_path, strict=True)
+
+
+def test_strictly_a_slow_model_is_an_error(tmp_path):
+    with pytest.raises(StageFailed, match="coacd ran past 0 s on table"):
+        decompose_all({"table": table()}, dataclasses.replace(CONFIG, timeout_s=0.0), 1, tmp_path, strict=True)
+
+
+def test_a_full_disk_is_no_fault_of_the_model(tmp_path, monkeypatch):
+    start = decompose._start
+
+    def elsewhere(*arguments):
+        job = start(*arguments)
+        job.process.kill()
+        job.process.wait()
+        job.process.returncode = decompose.CANNOT_WRITE
+        return job
+
+    monkeypatch.setattr(decompose, "_start", elsewhere)
+    with pytest.raises(OSError, match="cannot be written"):
+        decompose_all({"table": table()}, CONFIG, 1, tmp_path)
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, hull_cache):
+    (tmp_path / "file").write_text("")
+    made = decompose_all({"table": table()}, CONFIG, 1, tmp_path / "file" / "cache")
+    known = decompose_all({"table": table()}, CONFIG, 1, hull_cache)
+    assert made.fallbacks == {} and len(made.hulls["table"]) == len(known.hulls["table"])
+
+
+def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path))
+    assert decompose.cache_folder() == tmp_path / "converters"
+    monkeypatch.delenv("INTERACTIVE_NAV_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "x"))
+    assert decompose.cache_folder() == tmp_path / "x" / "interactive_nav" / "converters"

@@ -1,0 +1,81 @@
+"""Previews: the converted side alone, and beside the raw scan; a source of another scene is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from converters.__main__ import main
+from converters.check.preview import preview
+from converters.write.emit import CATEGORY_COLOURS
+from scenes_mjcf.schema import CATEGORIES, SceneError
+
+
+def colours(path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def test_a_source_adds_scan_and_cut(tiny_scene, pristine, tmp_path):
+    folder = tiny_scene[0]
+    preview(folder, tmp_path / "four.png")
+    assert main(["preview", str(folder), "-o", str(tmp_path / "six.png"), "--source", str(pristine / "gibson")]) == 0
+    four, six = colours(tmp_path / "four.png"), colours(tmp_path / "six.png")
+    assert six.shape[1] > 1.3 * four.shape[1]  # three columns, not two
+    for picture in (four, six):
+        # The traversable area is drawn in its own colour, 0.85 0.94 0.85.
+        near = np.abs(picture.astype(int) - [217, 240, 217]).max(axis=2) <= 6
+        assert 0.03 < near.mean() < 0.8
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["four.png", "six.png"]
+
+
+def test_the_source_of_another_scene_is_refused(tiny_scene, gibson_raw, tmp_path):
+    path = gibson_raw / "floors.txt"
+    path.write_text(path.read_text() + "\n")
+    with pytest.raises(SceneError, match=r"floors.txt differs.; give its own --source"):
+        preview(tiny_scene[0], tmp_path / "p.png", gibson_raw)
+    shutil.rmtree(gibson_raw)
+    assert main(["preview", str(tiny_scene[0]), "-o", str(tmp_path / "p.png"), "--source", str(gibson_raw)]) == 2
+    assert not (tmp_path / "p.png").exists()
+
+
+@pytest.fixture
+def scene(tiny_scene, tmp_path) -> Path:
+    """A copy that a test may change."""
+    return Path(shutil.copytree(tiny_scene[0], tmp_path / "scene"))
+
+
+def change(folder: Path, **values: str) -> None:
+    data = json.loads((folder / "scene.json").read_text())
+    data["objects"][1] |= values
+    (folder / "scene.json").write_text(json.dumps(data))
+
+
+def test_every_category_has_a_colour_of_its_own_and_is_drawn(scene):
+    assert sorted(CATEGORY_COLOURS) == sorted(CATEGORIES) and len(set(CATEGORY_COLOURS.values())) == len(CATEGORIES)
+    change(scene, category="shoe")
+    preview(scene, scene / "p.png")
+    shoe = np.rint(255 * np.array(CATEGORY_COLOURS["shoe"][:3]))
+    assert (np.abs(colours(scene / "p.png") - shoe).max(axis=2) <= 4).sum() > 50  # the legend's patch and the object
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda f: change(f, name="basket_7"), "no body named 'basket_7', which scene.json lists"),
+        (lambda f: (f / "maps.npz").write_bytes((f / "maps.npz").read_bytes()[:-30]), "maps.npz: not readable"),
+        (lambda f: (f / "assets" / "basket_0_visual.obj").unlink(), "does not compile (Error: Error opening file"),
+    ],
+)
+def test_a_damaged_scene_is_one_line_and_an_older_picture_stays(scene, capsys, damage, words):
+    (scene / "p.png").write_text("older")
+    damage(scene)
+    assert main(["preview", str(scene), "-o", str(scene / "p.png")]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert (scene / "p.png").read_text() == "older" and not list(scene.glob(".*"))

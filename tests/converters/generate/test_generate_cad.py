@@ -1,0 +1,129 @@
+"""The CAD library and the volume code: drawings in, properties of models and surfaces checked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from converters.generate.models.cad import CATID, LIBRARY, TEST_MODELS, TRAIN_MODELS, cad_model
+from converters.generate.models.parts import MATERIALS, bar, box
+from converters.generate.surface.texture import pack_rows
+from converters.generate.surface.volume import Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
+from converters.generate.surface.write import write_cad
+
+
+@pytest.mark.parametrize("name", sorted(LIBRARY))
+def test_model_is_normalised_and_made_of_closed_convex_parts(name):
+    model = cad_model(name)
+    assert np.linalg.norm(2 * model.half_extents) == pytest.approx(1.0, abs=1e-4)
+    assert np.abs(model.center).max() <= 0.031  # off the box centre, but not by much
+    assert len(model.id_cad) == 32 and model.catid == CATID[model.category]
+    for part in model.parts:
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+        assert part.material in MATERIALS
+        # Convex: no vertex lies outside any face's plane.
+        solid = solid_from_mesh(part.vertices, part.faces, 1, part.material, 0)
+        assert solid.distance(part.vertices).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("category", "height_m", "width_m"),
+    [
+        ("chair", (0.7, 1.1), (0.38, 0.70)),
+        ("table", (0.38, 0.80), (0.75, 1.4)),
+        ("desk", (0.7, 1.1), (1.0, 1.4)),
+        ("sofa", (0.7, 0.95), (1.2, 2.1)),
+        ("door", (1.9, 2.1), (0.8, 0.95)),
+    ],
+)
+def test_sizes_are_those_of_real_furniture(category, height_m, width_m):
+    models = [cad_model(n) for n, d in LIBRARY.items() if d.category == category]
+    assert len(models) >= 4
+    for model in models:
+        size_m = 2 * model.half_extents * model.unit_m
+        assert height_m[0] <= size_m[1] <= height_m[1], model.name
+        assert width_m[0] <= size_m[0] <= width_m[1], model.name
+
+
+def test_held_out_models_are_apart_and_cover_all_categories():
+    assert set(TRAIN_MODELS).isdisjoint(TEST_MODELS)
+    assert set(TRAIN_MODELS) | set(TEST_MODELS) == set(LIBRARY)
+    for names in (TRAIN_MODELS, TEST_MODELS):
+        assert {LIBRARY[n].category for n in names} == set(CATID)
+    assert len({cad_model(n).id_cad for n in LIBRARY}) == len(LIBRARY)
+
+
+def test_front_minus_z_turns_the_back_rest_to_plus_z():
+    # chair_panel is drawn with its back at -z and listed with front -1, so its back ends up at +z.
+    model = cad_model("chair_panel")
+    top = max(model.parts, key=lambda p: p.vertices[:, 1].max())
+    assert model.front == -1 and top.vertices[:, 2].mean() > model.center[2] + 0.1
+
+
+def test_written_obj_loads_with_the_same_bounds_and_open_parts_lack_a_face(tmp_path):
+    model = cad_model("chair_tub")
+    write_cad(tmp_path, model)
+    path = tmp_path / "03001627" / model.id_cad / "models" / "model_normalized.obj"
+    mesh = trimesh.load(path, force="mesh", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    np.testing.assert_allclose(mesh.bounds, model.bounds, atol=1e-5)
+    opened = sum(p.open for p in model.parts)
+    assert opened == 1
+    # A box's underside is two triangles.
+    assert len(mesh.faces) == sum(len(p.faces) for p in model.parts) - 2 * opened
+
+
+def test_bar_has_the_volume_of_a_prism():
+    # A square prism of circumradius r has the base area 2 r^2: here 2 * 0.1^2 * 0.5 = 0.01.
+    part = bar((0, 0, 0), (0, 0.5, 0), 0.1, "oak", sides=4)
+    assert trimesh.Trimesh(part.vertices, part.faces).volume == pytest.approx(0.01)
+
+
+def test_signed_distance_of_a_tilted_box_is_exact_beside_its_faces():
+    part = box((0, 1.0, 0), (0.4, 0.2, 0.6), "oak", tilt_rad=0.0)
+    solid = solid_from_mesh(part.vertices, part.faces, 5, "oak", 0)
+    assert len(solid.normals) == 6  # twelve triangles, six planes
+    points = np.array([[0.0, 1.0, 0.0], [0.3, 1.0, 0.0], [0.0, 1.0, 0.5]])
+    np.testing.assert_allclose(solid.distance(points), [-0.1, 0.1, 0.2], atol=1e-9)
+
+
+def test_surface_nets_of_a_box_is_closed_outward_and_about_the_right_size():
+    solid = solid_from_box((0, 0, 0), (1.0, 0.6, 0.4), 1, "paint")
+    volume = fuse([solid], np.full(3, -0.11), np.array([1.11, 0.71, 0.51]), 0.02)
+    vertices, faces = surface_nets(volume)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    # 1.0 * 0.6 * 0.4 = 0.24; rounded edges take a little.
+    assert 0.235 < mesh.volume < 0.2405
+    assert np.abs(solid.distance(vertices)).max() < 0.02
+
+
+def test_union_of_overlapping_solids_is_one_surface():
+    a = solid_from_box((0, 0, 0), (0.5, 0.5, 0.5), 1, "paint")
+    b = solid_from_box((0.3, 0, 0), (0.9, 0.5, 0.5), 1, "paint")
+    mesh = trimesh.Trimesh(*surface_nets(fuse([a, b], np.full(3, -0.11), np.full(3, 1.01), 0.025)))
+    assert mesh.body_count == 1
+    assert mesh.volume == pytest.approx(0.9 * 0.5 * 0.5, rel=0.02)
+
+
+def test_sample_reads_the_nearest_voxel():
+    sdf = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
+    volume = Volume(sdf, np.array([1.0, 0.0, 0.0]), 0.5)
+    # index (1, 0, 1) is 1 * 4 + 0 * 2 + 1 = 5
+    np.testing.assert_array_equal(volume.sample(np.array([[1.6, 0.1, 0.4], [1.0, 0.0, 0.0]])), [5, 0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 30), st.integers(1, 30)), min_size=1, max_size=40))
+def test_packed_rectangles_do_not_overlap(sizes):
+    table = np.array(sizes)
+    corner, used = pack_rows(table, 64)
+    sheet = np.zeros((used, 64), int)
+    for (x, y), (w, h) in zip(corner, table, strict=True):
+        assert x + w <= 64 and y + h <= used
+        sheet[y : y + h, x : x + w] += 1
+    assert sheet.max() == 1 and sheet.sum() == table.prod(axis=1).sum()

@@ -1,0 +1,155 @@
+"""OBJ and MTL: polygons, indices from the end, several materials in one image, names of another machine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from converters.read.files import SourceFolder, read_obj
+from converters.read.obj import TexturedMesh, join_meshes, join_textures, parse_mtl, read_scan_obj
+from converters.records.errors import SceneRejected
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def obj(tmp_path, text):
+    path = tmp_path / "mesh.obj"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("face", ["f 1 2 3 4", "f 1//1 2//1 3//1 4//1", "f -4 -3 -2 -1", "f 1 -3 3 -1"])
+def test_polygons_become_fans_whatever_the_index_style(tmp_path, face):
+    mesh = read_obj(obj(tmp_path, SQUARE + face + "\n"))
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3]])
+    assert mesh.corner_uv is None
+
+
+def test_texture_coordinates_belong_to_corners(tmp_path):
+    text = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\nf 1/4/1 2/3/1 3/2/1\nf 1/-4 2/-3 3/-2\n"
+    mesh = read_obj(obj(tmp_path, text))
+    assert mesh.corner_uv is not None
+    np.testing.assert_array_equal(mesh.corner_uv[1], [[0, 0], [1, 1], [0, 1]])
+    np.testing.assert_array_equal(mesh.corner_uv[2], [[0, 1], [1, 1], [1, 0]])
+    np.testing.assert_array_equal(mesh.corner_uv[3], [[0, 0], [1, 0], [1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (SQUARE + "f 1 2\n", "mesh.obj:5: a face has 2 corners"),
+        (SQUARE + "f 1 2 9\n", "names vertex 8 of 4"),
+        (SQUARE + "f 0 1 2\n", "names vertex"),
+        (SQUARE + "f 1 2 x\n", "not readable as OBJ"),
+        (SQUARE + "vt 0 0\nf 1/1 2/1 3/2\n", "texture coordinate 2 of 1"),
+        ("v 1 2\n", "fewer than 3 coordinates"),
+        ("v 1 2 inf\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "1 vertices are not finite"),
+        ("v 1 2 1e999999\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "not finite"),
+        (SQUARE + "f 1 2 99999999999999999999999\n", "not readable as OBJ"),
+    ],
+)
+def test_damage_is_named(tmp_path, text, words):
+    with pytest.raises(SceneRejected, match=words):
+        read_obj(obj(tmp_path, text))
+
+
+def test_mtl_options_and_colours():
+    text = "newmtl a\nKd 1 0.5 0\nmap_Kd -s 1 1 1 wood.png\nnewmtl b\nkd 0 nan 2\n newmtl c\nKd x\n"
+    assert parse_mtl(text) == {
+        "a": ((255, 128, 0), "-s 1 1 1 wood.png"),
+        "b": ((0, 0, 255), ""),
+        "c": ((170, 170, 170), ""),
+    }
+
+
+def sampled(mesh: TexturedMesh, face: int) -> np.ndarray:
+    """Colour at the middle of a face."""
+    assert mesh.corner_uv is not None and mesh.texture is not None
+    u, v = mesh.corner_uv[face].mean(axis=0)
+    height, width = mesh.texture.shape[:2]
+    return mesh.texture[int((1 - v) * height), int(u * width)]
+
+
+def two_materials(tmp_path, red: str = "red.png"):
+    Image.fromarray(np.full((8, 4, 3), (255, 0, 0), np.uint8)).save(tmp_path / "red.png")
+    (tmp_path / "m.mtl").write_text(f"newmtl red\nmap_Kd {red}\nnewmtl plain\nKd 0 0 1\n")
+    uv = "vt 5.2 -3.9\nvt 5.9 -3.9\nvt 5.9 -3.1\n"  # a repeat: [0.2, 0.9] x [0.1, 0.9] of the image
+    faces = "usemtl red\nf 1/1 2/2 3/3\nusemtl plain\nf 1/1 3/3 4/3\nusemtl none\nf 1/1 2/2 4/3\n"
+    obj(tmp_path, f"mtllib m.mtl\n{SQUARE}{uv}{faces}")
+    return SourceFolder(tmp_path)
+
+
+def test_several_materials_share_one_image(tmp_path):
+    source = two_materials(tmp_path)
+    mesh = read_scan_obj(source, "mesh.obj", "")
+    np.testing.assert_array_equal(sampled(mesh, 0), (255, 0, 0))
+    np.testing.assert_array_equal(sampled(mesh, 1), (0, 0, 255))
+    np.testing.assert_array_equal(sampled(mesh, 2), (170, 170, 170))
+    assert mesh.texture is not None and mesh.texture.shape == (8 + 4 + 4, 4, 3)
+    assert source.warnings == ["mesh.obj: material 'none' is in no material file; it stays grey"]
+    assert sorted(source.sha256) == ["m.mtl", "mesh.obj", "red.png"]
+
+
+@pytest.mark.parametrize("name", ["C:\\scans\\home\\red.png", "/home/someone/RED.png", "textures/red.png"])
+def test_a_texture_is_found_by_its_bare_name(tmp_path, name):
+    source = two_materials(tmp_path, name)
+    np.testing.assert_array_equal(sampled(read_scan_obj(source, "mesh.obj", ""), 0), (255, 0, 0))
+    assert any("which is not there; red.png is taken" in w for w in source.warnings)
+    strict = SourceFolder(tmp_path, strict=True)
+    with pytest.raises(SceneRejected, match="red.png is taken; --strict refuses"):
+        read_scan_obj(strict, "mesh.obj", "")
+
+
+def test_nothing_outside_the_folder_is_read(tmp_path):
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    Image.fromarray(np.full((2, 2, 3), 9, np.uint8)).save(tmp_path / "secret.png")
+    source = two_materials(inner, "../secret.png")
+    mesh = read_scan_obj(source, "mesh.obj", "")
+    np.testing.assert_array_equal(sampled(mesh, 0), (170, 170, 170))
+    assert (
+        "m.mtl: names the texture '../secret.png', which lies outside of the source folder; the material's plain "
+        "colour is taken"
+    ) in (source.warnings)
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", "m.mtl", "red.png"])
+def test_a_link_out_of_the_folder_is_refused(tmp_path, name):
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    source = two_materials(inner)
+    (inner / name).rename(tmp_path / name)
+    (inner / name).symlink_to(tmp_path / name)
+    with pytest.raises(SceneRejected, match=f"inner/{name}: leads out of the source folder, to .*/{name}; put a copy"):
+        read_scan_obj(source, "mesh.obj", "")
+    assert name not in source.sha256
+    (inner / name).unlink()
+    (inner / name).symlink_to(inner / name)
+    with pytest.raises(SceneRejected, match=f"inner/{name}: leads nowhere"):
+        read_scan_obj(SourceFolder(inner), "mesh.obj", "")
+
+
+def test_a_link_within_the_folder_is_followed(tmp_path):
+    source = two_materials(tmp_path)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "red.png").rename(tmp_path / "images" / "red.png")
+    (tmp_path / "red.png").symlink_to("images/red.png")
+    np.testing.assert_array_equal(sampled(read_scan_obj(source, "mesh.obj", ""), 0), (255, 0, 0))
+    assert "images/red.png" in source.sha256 and source.root == tmp_path
+
+
+def test_joining_keeps_each_mesh_its_colour():
+    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
+    uv = np.full((1, 3, 2), 0.5)
+    red = TexturedMesh(vertices, faces, uv, np.full((2, 6, 3), (250, 0, 0), np.uint8))
+    green = TexturedMesh(vertices, faces, uv, np.full((4, 2, 3), (0, 250, 0), np.uint8))
+    both = join_meshes(join_meshes(red, green), TexturedMesh(vertices, faces, None, None))
+    assert [tuple(sampled(both, k)) for k in range(3)] == [(250, 0, 0), (0, 250, 0), (170, 170, 170)]
+    np.testing.assert_array_equal(both.faces, [[0, 1, 2], [3, 4, 5], [6, 7, 8]])
+
+
+def test_one_image_stays_untouched():
+    uv, image = np.random.default_rng(0).random((2, 3, 2)) * 3, np.zeros((5, 5, 3), np.uint8)
+    same_uv, same = join_textures(uv, np.zeros(2, int), [image])
+    assert same is image and same_uv is uv

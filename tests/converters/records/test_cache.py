@@ -1,0 +1,159 @@
+"""The stage cache: equal content is found again, anything else is computed; damage and limits."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+
+from converters.geometry.boxes import Box, Hull
+from converters.records import cache
+from converters.records.cache import KEEP_S, LIMIT_BYTES, StageCache, fingerprint, prune
+from converters.records.raw import RawScene, ScanMesh
+
+CALLS: list[tuple] = []
+
+
+def stage(points: np.ndarray, scale: float, extra=None):
+    """Returns every kind of value that a stage may."""
+    CALLS.append((points, scale))
+    hull = Hull(points * scale, np.array([[0, 1, 2]]))
+    values = [1, 2.5, np.float64(0.1) + 0.2, None, "text", True]
+    return hull, values, (Box(points[0], np.eye(3), points[1]),), float("nan")
+
+
+@pytest.fixture(autouse=True)
+def no_calls():
+    CALLS.clear()
+
+
+POINTS = np.arange(9.0).reshape(3, 3)
+
+
+def test_the_second_call_is_read_and_is_the_same(tmp_path):
+    first = StageCache(tmp_path).call(stage, POINTS, 2.0)
+    second = StageCache(tmp_path).call(stage, POINTS.copy(), 2.0)
+    assert len(CALLS) == 1
+    assert isinstance(second[0], Hull) and isinstance(second[2][0], Box)
+    np.testing.assert_array_equal(second[0].vertices, first[0].vertices)
+    assert second[0].faces.dtype == first[0].faces.dtype and second[1] == first[1] and np.isnan(second[3])
+    assert all(type(a) is type(b) for a, b in zip(second[1], [*first[1][:2], 0.3, *first[1][3:]], strict=True))
+    assert [p.name[:6] for p in tmp_path.iterdir()] == ["stage-"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (POINTS + 1e-12, 2.0),
+        (POINTS.astype(np.float32), 2.0),
+        (POINTS.reshape(1, 9)[:, :9].reshape(3, 3).T.copy(), 2.0),
+        (POINTS, 2),
+        (POINTS, 2.0, "extra"),
+        (POINTS, 2.0, [1, 2]),
+        (POINTS, 2.0, {"a": POINTS}),
+        (POINTS, 2.0, Hull(POINTS, POINTS)),
+    ],
+)
+def test_any_difference_is_computed(tmp_path, arguments):
+    store = StageCache(tmp_path)
+    store.call(stage, POINTS, 2.0)
+    store.call(stage, *arguments)
+    assert len(CALLS) == 2
+
+
+def test_names_and_reports_do_not_count(tmp_path):
+    scan = ScanMesh(POINTS, np.array([[0, 1, 2]]), np.zeros(3, int), None)
+    raw = RawScene("a", "gibson", scan, {}, (), 0.0, None, "mine", {"x": "y"})
+    store = StageCache(tmp_path)
+    store.call(stage, POINTS, 1.0, raw)
+    store.call(stage, POINTS, 1.0, dataclasses.replace(raw, name="b", licence="", warnings=("w",), sources={}))
+    assert len(CALLS) == 1
+    store.call(stage, POINTS, 1.0, dataclasses.replace(raw, floor_height_m=0.1))
+    assert len(CALLS) == 2
+
+
+def test_another_version_of_the_code_computes_again(tmp_path, monkeypatch):
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+    monkeypatch.setattr(cache, "fingerprint", lambda: b"newer")
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+    assert len(CALLS) == 2
+
+
+@pytest.mark.parametrize("damage", [lambda b: b[:50], lambda b: b"", lambda b: b[:-40] + b"x" * 40])
+def test_a_damaged_entry_is_made_again(tmp_path, damage):
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+    (entry,) = tmp_path.iterdir()
+    good = entry.read_bytes()
+    entry.write_bytes(damage(good))
+    value = StageCache(tmp_path).call(stage, POINTS, 2.0)
+    np.testing.assert_array_equal(value[0].vertices, POINTS * 2)
+    assert entry.read_bytes() == good
+
+
+def test_an_entry_cannot_name_foreign_code():
+    with pytest.raises(ValueError, match="no module of the converter"):
+        cache._decode({"class": "subprocess:Popen", "fields": {}}, {})
+
+
+def test_without_a_folder_everything_is_computed():
+    for _ in range(2):
+        StageCache(None).call(stage, POINTS, 2.0)
+    assert len(CALLS) == 2
+
+
+def test_the_oldest_entries_go_first(tmp_path):
+    for k in range(5):
+        path = tmp_path / f"{k}.npz"
+        path.write_bytes(b"x" * 100)
+        os.utime(path, (k, k))
+    prune(tmp_path, 250, KEEP_S + 5.0)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["3.npz", "4.npz"]
+
+
+def test_what_was_used_within_the_hour_stays_whatever_its_size(tmp_path):
+    now = 10_000.0
+    for name, age_s in (("in_use", 5.0), ("unused", KEEP_S + 5.0), (".partial-01234567-new", 5.0)):
+        (tmp_path / f"{name}.npz").write_bytes(b"x" * 100)
+        os.utime(tmp_path / f"{name}.npz", (now - age_s, now - age_s))
+    prune(tmp_path, 0, now)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".partial-01234567-new.npz", "in_use.npz"]
+
+
+def test_what_a_killed_writer_left_goes_though_there_is_room(tmp_path):
+    for name in (".partial-01234567-stage.npz", "stage.npz"):
+        (tmp_path / name).write_bytes(b"x")
+        os.utime(tmp_path / name, (0, 0))
+    prune(tmp_path, LIMIT_BYTES, KEEP_S + 1.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["stage.npz"]
+
+
+def test_an_entry_that_vanishes_while_it_is_read_is_computed(tmp_path, monkeypatch):
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+
+    def gone(path, **_):
+        path.unlink()
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(cache.np, "load", gone)
+    StageCache(tmp_path).call(stage, POINTS, 2.0)
+    assert len(CALLS) == 2 and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_fingerprint_follows_every_source_file_by_its_place(tmp_path):
+    (tmp_path / "mesh").mkdir()
+    (tmp_path / "mesh" / "cut.py").write_text("a = 1")
+    digests = [fingerprint(tmp_path)]
+    (tmp_path / "mesh" / "cut.py").write_text("a = 2")
+    fingerprint.cache_clear()
+    digests.append(fingerprint(tmp_path))
+    (tmp_path / "mesh").rename(tmp_path / "scan")
+    fingerprint.cache_clear()
+    digests.append(fingerprint(tmp_path))
+    assert len(set(digests)) == 3
+
+
+def test_what_cannot_be_hashed_is_refused(tmp_path):
+    with pytest.raises(TypeError, match="a set cannot be hashed"):
+        StageCache(tmp_path).call(stage, POINTS, 2.0, {1, 2})

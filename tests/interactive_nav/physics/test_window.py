@@ -1,0 +1,148 @@
+"""The window's numbers are those of each scene's own model; it holds what is near, and leaves the rest at rest."""
+
+import importlib.util
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from interactive_nav.config import NavConfig
+from interactive_nav.physics import PhysicsState, make_physics, mjx_batch
+from interactive_nav.physics.window import FIELDS, Window
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import FEET, build_world
+from tests.toys import write_room
+
+# Chairs at x = 0.7 and 1.4 m in front of the robot, tables to the left and far behind.
+FURNITURE = (
+    ("chair", 0.7, 0.0, 2.0, 0.4),
+    ("chair", 1.4, 0.0, 2.0, 0.4),
+    ("table", 0.0, 1.5, 9.0, 0.5),
+    ("table", -3.0, 0.0, 9.0, 0.5),
+)
+ALL: dict[str, Any] = {"active_furniture": 0, "active_small": 0, "active_doors": 0, "active_walls": 0}
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    base = tmp_path_factory.mktemp("window")
+    full = write_room(base / "full", (8.0, 5.0), FURNITURE)
+    empty = write_room(base / "empty", (3.0, 3.0), (("basket", 0.7, 0.0, 1.0, 0.3),))
+    return build_world(get_robot("turtlebot"), (load_scene(full), load_scene(empty)), NavConfig(num_objects=2))
+
+
+def _state(world, scene, robot_xy=(0.0, 0.0)):
+    qpos = world.rest_qpos[scene].copy()
+    qpos[:7] = [*robot_xy, 0, 1, 0, 0, 0]
+    still = jnp.zeros(world.models[0].nv)
+    return PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
+
+
+@pytest.mark.parametrize("scene", [0, 1])
+def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
+    window = Window(world, NavConfig(num_objects=2, **ALL))
+    assert window.complete
+    chosen, walls, missed = window.select(jnp.asarray(scene), _state(world, scene))
+    fields, model, inner, outer = window.fields(jnp.asarray(scene), chosen, walls), world.models[scene], window, world
+    assert int(missed) == 0 and set(fields) == set(FIELDS)
+    for a, b in zip(inner.layout.slot_body, outer.layout.slot_body, strict=True):
+        for name in ("body_mass", "body_inertia", "body_ipos", "body_invweight0", "body_subtreemass"):
+            np.testing.assert_allclose(fields[name][a], getattr(model, name)[b], rtol=1e-5, atol=1e-6)
+        mine, own = int(inner.model.body_geomadr[a]), int(model.body_geomadr[b])
+        count = int(model.body_geomnum[b]) - FEET
+        for name in ("geom_size", "geom_pos", "geom_rbound", "geom_friction"):
+            np.testing.assert_allclose(
+                fields[name][mine : mine + count], getattr(model, name)[own : own + count], rtol=1e-5, atol=1e-6
+            )
+            feet = slice(mine + int(inner.model.body_geomnum[a]) - FEET, mine + int(inner.model.body_geomnum[a]))
+            np.testing.assert_allclose(
+                fields[name][feet], getattr(model, name)[own + count : own + count + FEET], rtol=1e-5, atol=1e-6
+            )
+    xpos, _ = window.static_poses(jnp.asarray(scene), walls)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(
+        xpos[inner.model.geom_bodyid == inner.layout.structure_body],
+        data.geom_xpos[model.geom_bodyid == outer.layout.structure_body],
+        atol=1e-5,
+    )
+
+
+def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world):
+    two = Window(world, NavConfig(num_objects=2, active_furniture=2))
+    kinds = {tuple(g.slots): i for i, g in enumerate(two.groups)}
+    free = next(i for slots, i in kinds.items() if len(slots) == 4)
+    group = two.groups[free]
+
+    def names(xy):
+        chosen, _, missed = two.select(jnp.asarray(0), _state(world, 0, xy))
+        return {world.names[0][s] for s in group.slots[np.asarray(chosen[free])]}, int(missed)
+
+    assert names((0.0, 0.0)) == ({"chair_0", "chair_1"}, 0)
+    assert names((-2.0, 0.0))[0] >= {"table_1"}
+    one = Window(world, NavConfig(num_objects=2, active_furniture=1))
+    # Between the chairs both are within 0.18 + 0.6 m; only one is simulated.
+    assert int(one.select(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
+
+
+def test_a_moving_object_outranks_one_at_rest(world):
+    one = Window(world, NavConfig(num_objects=2, active_furniture=1))
+    state = _state(world, 0)
+    slot = world.names[0].index("chair_1")
+    moving = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[slot]].set(0.5))
+    free = next(i for i, g in enumerate(one.groups) if slot in g.slots)
+    picked = [int(one.groups[free].slots[int(one.select(jnp.asarray(0), s)[0][free][0])]) for s in (state, moving)]
+    assert [world.names[0][p] for p in picked] == ["chair_0", "chair_1"]
+
+
+def test_enter_and_leave_are_inverse(world):
+    window = Window(world, NavConfig(num_objects=2, active_furniture=2))
+    state = _state(world, 0)
+    key = jax.random.PRNGKey(0)
+    state = state.replace(qpos=state.qpos + 0.01 * jax.random.normal(key, state.qpos.shape))
+    chosen, _, _ = window.select(jnp.asarray(0), state)
+    inner = window.enter(state, chosen)
+    back = window.leave(state, inner, chosen)
+    np.testing.assert_array_equal(back.qpos, state.qpos)
+    moved = window.leave(state, inner.replace(qpos=inner.qpos + 1.0), chosen)
+    changed = np.asarray(moved.qpos != state.qpos)
+    left_out = [s for i, g in enumerate(window.groups) for s in np.delete(g.slots, np.asarray(chosen[i]))]
+    assert len(left_out) == 2
+    for slot in left_out:
+        assert not changed[world.layout.slot_qpos[slot] : world.layout.slot_qpos[slot] + 7].any()
+
+
+@pytest.mark.heavy
+def test_a_push_in_a_window_is_that_of_the_whole_building(world):
+    """The robot pushes one chair into the next for 1.5 s: C MuJoCo with everything, MJX-JAX with two of four."""
+
+    def run(backend, **settings):
+        physics = make_physics(world, NavConfig(backend=backend, num_objects=2, sleep=False, **settings))
+        state = jax.tree.map(lambda x: x[None], _state(world, 0))
+        step = jax.jit(jax.vmap(physics.step))
+        for _ in range(15):
+            state, signals = step(jnp.zeros(1, jnp.int32), state, jnp.full((1, 2), 14.0))
+        return np.asarray(state.qpos[0]), np.asarray(signals.slot_force_n[0])
+
+    whole, force = run("native")
+    window, window_force = run("jax", active_furniture=2)
+    chair = world.layout.slot_qpos[world.names[0].index("chair_0")]
+    assert whole[chair] - world.rest_qpos[0][chair] > 0.05
+    np.testing.assert_allclose(window[chair : chair + 3], whole[chair : chair + 3], atol=0.02)
+    for name in ("table_0", "table_1"):
+        slot = world.names[0].index(name)
+        at = world.layout.slot_qpos[slot]
+        np.testing.assert_allclose(window[at : at + 7], np.float32(world.rest_qpos[0][at : at + 7]), atol=1e-4)
+        assert window_force[slot] == 0.0 == force[slot]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs the package warp-lang")
+def test_overflow_bits_are_the_engines():
+    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Bit
+
+    dropped = Bit.NEFC | Bit.NJMAX_NNZ | Bit.BROADPHASE | Bit.NARROWPHASE | Bit.CCD | Bit.CONTACT_MATCH
+    assert int(dropped) == mjx_batch._DROPPED and int(Bit.ITERATIONS) == mjx_batch._UNCONVERGED

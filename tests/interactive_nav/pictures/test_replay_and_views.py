@@ -1,0 +1,333 @@
+"""Replays against the environment's own bookkeeping; rays against geometry by hand; videos and maps read back."""
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+
+import imageio_ffmpeg
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import shapely
+from PIL import Image
+
+import interactive_nav
+from interactive_nav import record, topdown
+from interactive_nav.interop import gym_env
+from interactive_nav.pictures import replay
+from interactive_nav.pictures.replay import Player, ReplayError
+from interactive_nav.pictures.views import (
+    CLASSES,
+    GOAL_COLOUR,
+    INSIDE,
+    NOTHING,
+    OUTSIDE,
+    Camera,
+    FloorPaint,
+    SceneView,
+    depth_picture,
+    mask_picture,
+    robot_camera,
+    yaw_of,
+)
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.objects import pick
+from interactive_nav.scenes.scene import load_scene
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def env(room):
+    return interactive_nav.make("turtlebot", [room], backend="native", num_objects=3, episode_steps=STEPS, sleep=False)
+
+
+def straight(observation, key):
+    """Full speed ahead, with a little noise."""
+    return jnp.array([0.4, 0.4]) + 0.1 * jax.random.normal(key, (2,))
+
+
+@pytest.fixture(scope="module")
+def played(env):
+    return Player(env, straight, "straight", "by hand").play(jax.random.PRNGKey(3), episode=4)
+
+
+def test_a_replay_is_what_the_environment_kept_account_of(env, played):
+    key = jax.random.PRNGKey(3)
+    state = jax.jit(env.reset)(key)
+    step, policy_key = jax.jit(env.step), jax.random.fold_in(key, 0)
+    robot, objects = [state.info["nav"].robot_pos_w], state.info["nav"].object_pos_w
+    for t in range(played.num_steps):
+        state = step(state, straight(state.obs, jax.random.fold_in(policy_key, t)))
+        robot.append(state.info["nav"].robot_pos_w)
+    nav = state.info["nav"]
+    assert state.done and (played.policy, played.episode, played.label) == ("straight", 4, "by hand")
+    np.testing.assert_allclose(played.body_pos_w[:, 0], robot, atol=2e-3)
+    assert played.force_n.sum() == pytest.approx(float(nav.force_sum_n), rel=0.02)
+    assert played.touches_movable.sum() == nav.interaction_steps
+    assert played.touches_structure.sum() == nav.structure_steps
+    assert played.metrics["ins_0.5"] == pytest.approx(float(state.metrics["ins_0.5"]), abs=0.01)
+    assert np.linalg.norm(np.diff(played.body_pos_w[:, 0], axis=0), axis=1).sum() == pytest.approx(
+        played.metrics["robot_path_m"], abs=1e-3
+    )
+    np.testing.assert_allclose(played.start_xy_w, played.robot_xy_w[0])
+    # Small objects have their centre of mass above their origin: the same place in the plane.
+    small = [played.bodies.index(name) for name in played.bodies if "_small_" in name]
+    assert len(small) == 3
+    np.testing.assert_allclose(played.body_pos_w[0, small, :2], objects[:3, :2], atol=0.03)
+    np.testing.assert_allclose(np.linalg.norm(played.body_quat_w, axis=-1), 1, atol=1e-5)
+
+
+def test_a_planner_on_the_host_sees_the_state_and_the_step(env):
+    asked = []
+
+    def ahead(state, episode, step):
+        asked.append((episode, step, state.info["nav"].step_count.tolist()))
+        return np.full((1, 2), 0.4)
+
+    run = Player(env, planner=ahead).play(jax.random.PRNGKey(3), episode=2)
+    assert asked == [(2, t, [t]) for t in range(run.num_steps)]
+    np.testing.assert_allclose(run.action, 0.4)
+    assert np.linalg.norm(run.robot_xy_w[10] - run.robot_xy_w[0]) > 0.1
+    with pytest.raises(ValueError, match="expected exactly one of them"):
+        Player(env)
+
+
+def test_a_replay_survives_its_file(played, tmp_path):
+    path = tmp_path / "deep" / "a.npz"
+    replay.save(played, path)
+    back = replay.load(path)
+    for field in dataclasses.fields(played):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(played, field.name))
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_files_that_are_no_replays_are_refused(played, tmp_path):
+    with pytest.raises(ReplayError, match="no such file"):
+        replay.load(tmp_path / "absent.npz")
+    np.savez(tmp_path / "other.npz", x=1)
+    (tmp_path / "text.npz").write_text("hello")
+    replay.save(played, tmp_path / "cut.npz")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:-3000])
+    for name in ("other", "text", "cut"):
+        with pytest.raises(ReplayError, match=rf"{name}\.npz: is no replay or damaged .*; record the episode again"):
+            replay.load(tmp_path / f"{name}.npz")
+
+
+@pytest.fixture(scope="module")
+def view(room):
+    return SceneView(get_robot("turtlebot"), load_scene(room), pick(1))
+
+
+IDENTITY = [1.0, 0.0, 0.0, 0.0]
+
+
+def test_rays_of_a_camera_by_hand():
+    camera = Camera(np.zeros(3), np.array([1.0, 0, 0]), math.radians(90), 2, 4)
+    # Half the field of view is 45 degrees: rows at +-0.5 of its reach, columns at +-0.5 and +-1.5.
+    np.testing.assert_allclose(camera.rays()[0], [1, 1.5, 0.5], atol=1e-12)
+    np.testing.assert_allclose(camera.rays()[-1], [1, -1.5, -0.5], atol=1e-12)
+
+
+def test_depth_and_classes_by_hand(view):
+    """A room of 4 x 3 m with a cube of 0.4 m on the floor at (0.7, 0); the eye is at 0.3 m."""
+    view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([IDENTITY]))
+    eye = Camera(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0]), math.radians(90), 101, 101)
+    seen = view.look(eye, INSIDE)
+    assert CLASSES[seen.classes[50, 50]] == "chair" and seen.depth_m[50, 50] == pytest.approx(1.5, abs=1e-5)
+    # Beside the cube the wall, 3 m ahead of the eye: depth is along the axis, so equal over the wall.
+    wall = seen.depth_m[50, 75], seen.depth_m[40, 30]
+    assert wall == pytest.approx((3.0, 3.0), abs=1e-5)
+    assert CLASSES[seen.classes[50, 75]] == "structure"
+    # The floor k rows below the middle is at depth 0.3 / (k / 50.5).
+    assert seen.depth_m[80, 50] == pytest.approx(0.3 * 50.5 / 30, rel=1e-5)
+    # Away with the cube: the wall behind it, 0.3 m above the floor.
+    view.place(("chair_0",), np.array([[0.7, 9.0, 0.2]]), np.array([IDENTITY]))
+    assert view.look(eye, INSIDE).depth_m[50, 50] == pytest.approx(3.0, abs=1e-5)
+    # Turned by 45 degrees it shows an edge: half a diagonal in front of its middle.
+    turned = [math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
+    view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([turned]))
+    assert view.look(eye, INSIDE).depth_m[50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
+
+
+def test_the_robot_is_seen_from_outside_only(view):
+    robot = get_robot("turtlebot")
+    bodies = [b for b in range(view.model.nbody) if view.model.body(b).name == robot.base_body]
+    assert len(bodies) == 1
+    view.place((robot.base_body,), np.array([[-0.5, 0.3, 0.0]]), np.array([IDENTITY]))
+    camera = robot_camera(view, 33, 33)
+    np.testing.assert_allclose(camera.pos_w, np.array([-0.5, 0.3, 0.0]) + robot.camera.pos_m, atol=1e-9)
+    np.testing.assert_allclose(camera.forward_w, [1, 0, 0], atol=1e-9)
+    index = CLASSES.index("robot")
+    assert not (view.look(camera, INSIDE).classes == index).any()
+    above = Camera(np.array([-1.5, 0.3, 2.0]), np.array([math.sqrt(0.5), 0, -math.sqrt(0.5)]), 1.0, 60, 60)
+    assert (view.look(above, OUTSIDE).classes == index).sum() > 20
+
+
+def test_goal_and_path_are_painted_on_the_floor(view):
+    down = Camera(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0]), 0.3, 41, 41)
+    paint = FloorPaint(np.array([-1.2, 0.0]), 0.2, np.array([[-1.2, 0.3]]))
+    plain, painted = view.look(down, OUTSIDE).colour, view.look(down, OUTSIDE, paint).colour
+    changed = (plain != painted).any(-1)
+    # A disc of 0.2 m and a dot of 0.04 m, in a view of 2 * 3 m * tan(0.15).
+    share = (math.pi * 0.2**2 + math.pi * 0.04**2) / (2 * 3.0 * math.tan(0.15)) ** 2
+    assert changed.mean() == pytest.approx(share, rel=0.1)
+    ring = painted[20, 20 + round(0.18 / (2 * 3.0 * math.tan(0.15)) * 41)] / 255
+    assert np.argmax(ring) == np.argmax(GOAL_COLOUR)
+
+
+def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, monkeypatch):
+    told = dataclasses.replace(played, small_objects="test", segmentation_classes=5, success_distance_m=0.7)
+    replay.save(told, tmp_path / "a.npz")
+    told = replay.load(tmp_path / "a.npz")
+    assert (told.small_objects, told.segmentation_classes, told.success_distance_m) == ("test", 5, 0.7)
+    names = [f"{o.category}_small_{i}" for i, o in enumerate(pick(3, "test"))]
+    shown = {name: rows for name, (_, rows) in topdown.outlines(told, load_scene(room)).items()}
+    view = record.Compositor(told, load_scene(room), height=120)._view
+    for name, obj in zip(names, pick(3, "test"), strict=True):
+        halves = [box.half_m for box in obj.boxes]
+        np.testing.assert_allclose(shown[name][:, 7:], halves)
+        body = view.model.body(name)
+        np.testing.assert_allclose(view.model.geom_size[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]], halves)
+    painted = []
+    monkeypatch.setattr(record, "FloorPaint", lambda goal, radius, trail: painted.append(radius))
+    for each, radius in ((told, 0.7), (dataclasses.replace(told, success_distance_m=None), 0.333)):
+        record.Compositor(each, load_scene(room), height=120).frame(0)
+        axis = topdown.panels([each], {str(room): load_scene(room)}).axes[0]
+        assert painted.pop() == pytest.approx(radius, abs=1e-3)
+        assert any(getattr(patch, "radius", 0) == pytest.approx(radius, abs=1e-3) for patch in axis.patches)
+
+
+def test_a_replay_of_before_can_be_read(played, tmp_path):
+    fields = {f.name: getattr(played, f.name) for f in dataclasses.fields(played)}
+    later = ("small_objects", "segmentation_classes", "success_distance_m")
+    header = {n: v for n, v in fields.items() if n not in (*replay._ARRAYS, *later)} | {"format": 1}
+    arrays = {name: fields[name] for name in replay._ARRAYS}
+    np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
+    old = replay.load(tmp_path / "old.npz")
+    assert (old.small_objects, old.segmentation_classes, old.success_distance_m) == ("train", 4, None)
+
+
+def test_importing_and_drawing_leave_matplotlibs_backend_alone():
+    code = """
+import matplotlib
+matplotlib.use("svg")
+from matplotlib import pyplot
+import interactive_nav.topdown
+from interactive_nav.robots import get_robot, picture
+picture._with_matplotlib(*picture.stage(get_robot("turtlebot")))
+print(matplotlib.get_backend(), pyplot.get_fignums())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().splitlines()[-1].lower() == "svg []"
+
+
+def test_a_body_that_is_not_there_is_refused(view):
+    with pytest.raises(ValueError, match="no body 'lamp_0' in this scene with robot 'turtlebot'"):
+        view.place(("lamp_0",), np.zeros((1, 3)), np.array([IDENTITY]))
+
+
+def test_pictures_of_depth_and_classes():
+    depth = depth_picture(np.array([[0.0, 2.5, 5.0, np.inf]]))
+    assert depth[0, :, 0].tolist() == [255, 63, 0, 0]  # (1 - d / 5)^2
+    mask = mask_picture(np.array([[NOTHING, CLASSES.index("shoe")]], np.uint8))
+    assert mask[0, 0].tolist() == [0, 0, 0] and mask[0, 1].tolist() == [204, 71, 76]
+
+
+@pytest.fixture(scope="module")
+def compositor(played, room):
+    return record.Compositor(played, load_scene(room), height=120)
+
+
+def test_a_video_holds_the_frames_that_were_composed(compositor, played, tmp_path):
+    out = tmp_path / "out.mp4"
+    count = record.write_video(compositor, out, every=20)
+    assert count == -(-played.num_steps // 20) + 1
+    reader = imageio_ffmpeg.read_frames(str(out))
+    meta = next(reader)
+    assert meta["size"] == compositor.size == (200, 140) and meta["fps"] == pytest.approx(0.5)
+    frames = [np.frombuffer(x, np.uint8).reshape(140, 200, 3) for x in reader]
+    assert len(frames) == count + round(1.5 * 0.5)
+    for got, step in ((frames[0], 0), (frames[-1], played.num_steps)):
+        want = compositor.frame(step)
+        assert np.abs(got.astype(int) - want).mean() < 6  # lossy
+    assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 6  # something happened
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_parts_of_a_frame(compositor, played):
+    """Behind: the robot in the middle column; beside it 68 x 68 depth and mask, enlarged."""
+    frame = compositor.frame(0)
+    assert frame.shape == (140, 200, 3) and frame.dtype == np.uint8
+    depth = frame[40:80, 160:]
+    assert (depth == depth[..., :1]).all()  # grey
+    np.testing.assert_array_equal(frame[120:, -1], np.broadcast_to([24, 28, 36], (20, 3)))
+    assert (frame[:120, :160].std((0, 1)) > 5).all()
+
+
+def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    replay.save(played, path)
+    arguments = [str(path), "--height", "120", "--every", "30"]
+    assert record.main([*arguments, "-o", str(tmp_path / "a.gif")]) == 0
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.n_frames == -(-played.num_steps // 30) + 1 and gif.size == (200, 140)
+    capsys.readouterr()
+    assert record.main([*arguments, "-o", str(tmp_path / "a.avi")]) == 2
+    assert "ends in '.avi', expected one of .mp4, .gif" in capsys.readouterr().err
+    assert record.main([str(path), "--height", "125"]) == 2
+    assert "height is 125, expected a multiple of 12" in capsys.readouterr().err
+    other = dataclasses.replace(played, scene=str(two_rooms))
+    replay.save(other, tmp_path / "b.npz")
+    for program in (record, topdown):
+        assert program.main([str(tmp_path / "b.npz"), "-o", str(tmp_path / "b.gif")]) == 2
+        assert "has changed since the replay was recorded" in capsys.readouterr().err
+    assert not (tmp_path / "b.gif").exists()
+
+
+def test_shadows_of_boxes_by_hand():
+    box = np.array([[0.5, 0.0, 1.0, 1, 0, 0, 0, 0.5, 0.25, 1.0]])
+    flat = topdown.shadow(box, np.array([1.0, 2.0, 0.0]), np.array(IDENTITY))
+    assert flat.equals(shapely.box(1.0, 1.75, 2.0, 2.25))
+    quarter = np.array([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])  # x becomes y
+    np.testing.assert_allclose(topdown.shadow(box, np.zeros(3), quarter).bounds, (-0.25, 0, 0.25, 1.0), atol=1e-9)
+    # Fallen over forward, its height of 2 m lies along x.
+    forward = np.array([math.sqrt(0.5), 0, math.sqrt(0.5), 0])
+    np.testing.assert_allclose(topdown.shadow(box, np.zeros(3), forward).bounds, (0, -0.25, 2.0, 0.25), atol=1e-9)
+
+
+def test_a_map_shows_what_was_moved(played, room, tmp_path):
+    """The chair is put 0.5 m further along x at the end: outline before, arrow, filled shape after."""
+    scene, b = load_scene(room), played.bodies.index("chair_0")
+    pos = played.body_pos_w.copy()
+    pos[:, b], pos[-1, b] = [0.2, 0.0, 0.2], [0.7, 0.0, 0.2]
+    for colour_by in topdown.COLOUR_BY:
+        figure = topdown.panels([dataclasses.replace(played, body_pos_w=pos)], {str(room): scene}, colour_by)
+        axis = figure.axes[0]
+        [arrow] = [text for text in axis.texts if text.arrow_patch is not None]
+        np.testing.assert_allclose([*arrow.xyann, *arrow.xy], [0.2, 0, 0.7, 0], atol=1e-6)
+        [path] = axis.collections
+        assert len(path.get_segments()) == played.num_steps
+    replay.save(played, tmp_path / "replays" / "x-episode4.npz")
+    assert topdown.main([str(tmp_path), "-o", str(tmp_path / "map.png")]) == 0
+    with Image.open(tmp_path / "map.png") as picture:
+        assert picture.size[0] > 500
+    with pytest.raises(ValueError, match="colour_by is 'speed', expected one of time, contact"):
+        topdown.draw(axis, played, scene, "speed")
+
+
+def test_gymnasium_renders_the_view_from_behind(room):
+    settings = {"backend": "native", "num_objects": 1, "render_mode": "rgb_array"}
+    env = gym_env.InteractiveNavEnv("turtlebot", [str(room)], **settings)
+    assert env.metadata["render_fps"] == 10 and env.render() is None
+    env.reset(seed=0)
+    frame = env.render()
+    assert frame is not None and frame.shape == (360, 480, 3) and frame.dtype == np.uint8
+    # The robot stands before the camera: its dark body is in the middle column.
+    assert frame[150:260, 200:280].min() < 60
+    assert yaw_of(np.array([math.cos(0.4), 0, 0, math.sin(0.4)])) == pytest.approx(0.8)
+    with pytest.raises(ValueError, match="render_mode is 'human', expected one of rgb_array"):
+        gym_env.InteractiveNavEnv("turtlebot", [str(room)], **{**settings, "render_mode": "human"})

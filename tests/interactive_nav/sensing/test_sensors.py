@@ -1,0 +1,209 @@
+"""Observations beside the task's own: hand-made poses in a room of known size, noise, and the batched loop."""
+
+import dataclasses
+import math
+import zlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import interactive_nav
+from interactive_nav.config import NavConfig
+from interactive_nav.physics import PhysicsState
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import build_world
+from interactive_nav.sensing.observation import advance_odometry
+from interactive_nav.sensing.sensors import Sensors, stream
+from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav.types import NavInfo
+
+YAW = 0.3
+ALL = ("goal", "velocity", "waypoints", "localisation", "odometry", "collision", "joints", "lidar")
+
+
+@pytest.fixture(scope="module")
+def world(room):
+    return build_world(get_robot("turtlebot"), (load_scene(room),), NavConfig(num_objects=0))
+
+
+@pytest.fixture(scope="module")
+def moment(world):
+    """Physics and task memory of a robot at (-1, 0.2), yaw 0.3, that has just met the cube."""
+    layout = world.layout
+    qpos = world.rest_qpos[0].astype(np.float32)
+    at = layout.robot_qpos
+    qpos[at : at + 7] = [-1.0, 0.2, 0.0, math.cos(YAW / 2), 0, 0, math.sin(YAW / 2)]
+    qpos[at + 7 : at + 9] = [7.0, -0.5]
+    qvel = np.zeros(world.models[0].nv, np.float32)
+    qvel[layout.robot_qvel + 6 : layout.robot_qvel + 8] = [3.0, -2.0]
+    zeros: dict[str, Any] = {field.name: jnp.zeros((), jnp.int32) for field in dataclasses.fields(NavInfo)}
+    told = {
+        "goal_xy_w": jnp.zeros(2),
+        "robot_pos_w": jnp.asarray([-1.0, 0.2, 0.0]),
+        "yaw_rad": jnp.asarray(YAW),
+        "waypoints_b": jnp.zeros((10, 2)),
+        "step_count": jnp.asarray(7, jnp.int32),
+        "odometry": jnp.asarray([0.5, -0.1, 4.0]),
+        "touching": jnp.asarray([True, False]),
+    }
+    fields: dict[str, Any] = zeros | told
+    nav = NavInfo(**fields)
+    return PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(qvel)), nav, jax.random.PRNGKey(5)
+
+
+def sense(world, moment, **settings):
+    sensors = Sensors(world, NavConfig(num_objects=0, **settings), "native")
+    return sensors, jax.jit(sensors.observe)(*moment)
+
+
+def test_signals_stand_behind_the_tasks_29_numbers(world, moment):
+    sensors, obs = sense(world, moment, observations=ALL, lidar_rays=4, lidar_fov_deg=360.0, lidar_range_m=4.0)
+    assert sensors.observation_size == obs.shape[0] == 29 + 3 + 3 + 2 + 4 + 4
+    names = ["waypoints", "goal", "velocity", "localisation", "odometry", "collision", "joints", "lidar"]
+    assert list(sensors.sizes) == names
+    part = dict(zip(names, np.split(np.asarray(obs), np.cumsum(list(sensors.sizes.values()))[:-1]), strict=True))
+    np.testing.assert_allclose(part["localisation"], [-1.0, 0.2, YAW], atol=1e-6)
+    np.testing.assert_allclose(part["odometry"], [0.5, -0.1, 4.0 - 2 * np.pi], atol=1e-6)
+    np.testing.assert_array_equal(part["collision"], [1.0, 0.0])
+    # Wheels turn without limit: angles are wrapped.
+    np.testing.assert_allclose(part["joints"], [7.0 - 2 * np.pi, -0.5, 3.0, -2.0], atol=1e-5)
+    # The room's walls are x = +/- 2, y = +/- 1.5; beams go backwards, to the right, ahead and to the left of yaw 0.3,
+    # 0.37 m above the floor, where the cube (x = 0.7, height 0.4) is: ahead, its face x = 0.5 is missed to the left.
+    s, c = math.sin(YAW), math.cos(YAW)
+    back, right, left = 1.0 / c, 1.7 / c, 1.3 / c
+    ahead = min(3.0 / c, 1.3 / s)
+    np.testing.assert_allclose(part["lidar"] * 4.0, [back, right, ahead, left], atol=2e-3)
+
+
+def test_images_have_the_keys_and_numbers_that_learners_expect(world, moment):
+    sensors, obs = sense(world, moment, observations=("goal", "depth", "segmentation"))
+    assert sensors.observation_size == {k: v.shape for k, v in obs.items()}
+    assert sensors.observation_size == {
+        "state": (3,),
+        "pixels/depth": (68, 68, 1),
+        "pixels/segmentation": (68, 68, 1),
+    }
+    depth, ids = (np.asarray(obs[f"pixels/{k}"])[..., 0] for k in ("depth", "segmentation"))
+    assert depth.dtype == np.float32 and depth.min() >= 0 and depth.max() <= 1
+    # The only object is a chair, id 2 of 11.
+    assert set(np.unique(np.round(ids * 11, 5))) == {0.0, 2.0}
+    # Bottom row, middle: the floor, 0.272 m below the camera, at depth 0.272 / tan(59.55 degrees) of 5 m.
+    assert depth[-1, 33] == pytest.approx(0.272 / (math.tan(math.radians(60)) * 67 / 68) / 5, rel=0.01)
+    for dtype, unit in (("uint8", 255), ("float16", 1)):
+        _, coarse = sense(world, moment, observations=("depth", "segmentation"), image_dtype=dtype)
+        assert set(coarse) == {"pixels/depth", "pixels/segmentation"}
+        assert coarse["pixels/depth"].dtype == jnp.dtype(dtype)
+        got = np.asarray(coarse["pixels/depth"], np.float32)[..., 0] / unit
+        np.testing.assert_allclose(got, depth, atol=0.5 / 255 + 1e-6 if unit == 255 else 1e-3)
+
+
+def test_noise_is_off_by_default_and_drawn_by_key_and_step(world, moment):
+    clean = np.asarray(sense(world, moment, observations=("depth",))[1]["pixels/depth"])
+    noisy = {"observations": ("depth",), "depth_dropout": 0.2, "depth_noise": 0.05}
+    sensors, first = sense(world, moment, **noisy)
+    first = np.asarray(first["pixels/depth"])
+    seen = clean > 0
+    lost = seen & (first == 0)
+    assert lost.sum() / seen.sum() == pytest.approx(0.2, abs=0.03)
+    error = first[seen & ~lost & (clean < 0.8)] / clean[seen & ~lost & (clean < 0.8)] - 1
+    assert error.std() == pytest.approx(0.05, rel=0.1) and abs(error.mean()) < 0.005
+    physics, nav, rng = moment
+    again = np.asarray(jax.jit(sensors.observe)(physics, nav, rng)["pixels/depth"])
+    later = np.asarray(
+        jax.jit(sensors.observe)(physics, nav.replace(step_count=nav.step_count + 1), rng)["pixels/depth"]
+    )
+    np.testing.assert_array_equal(again, first)
+    assert ((later == 0) != (first == 0)).mean() > 0.1
+    beams = {"observations": ("lidar",), "lidar_rays": 400}
+    scan, bad = sense(world, moment, **beams)[1], sense(world, moment, **beams, lidar_dropout=0.1)[1]
+    assert (np.asarray(bad) == 1).mean() - (np.asarray(scan) == 1).mean() == pytest.approx(0.1, abs=0.05)
+
+
+def test_odometry_adds_up_to_the_pose_in_the_starts_frame():
+    rng = np.random.default_rng(0)
+    yaw = 2.0 + np.cumsum(np.append(0.0, rng.normal(0, 0.3, 30)))
+    path = np.vstack([[1.0, -2.0], [1.0, -2.0] + np.cumsum(rng.normal(0, 0.1, (30, 2)), 0)])
+    step, pose, off = jax.jit(advance_odometry), jnp.zeros(3), jnp.zeros(3)
+    for t in range(30):
+        moved = path[t + 1] - path[t]
+        pose = step(pose, moved, yaw[t], yaw[t + 1] - yaw[t], np.zeros(2))
+        off = step(off, moved, yaw[t], yaw[t + 1] - yaw[t], np.array([0.1, 0.1]))
+    c, s = math.cos(yaw[0]), math.sin(yaw[0])
+    want = np.array([[c, s], [-s, c]]) @ (path[-1] - path[0])
+    np.testing.assert_allclose(pose, [*want, yaw[-1] - yaw[0]], atol=1e-4)
+    assert float(off[2]) == pytest.approx(1.1 * (yaw[-1] - yaw[0]), rel=1e-4)
+
+
+def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
+    env = interactive_nav.make(
+        "turtlebot",
+        [room],
+        backend="native",
+        num_objects=1,
+        episode_steps=3,
+        image_size=20,
+        observations=("goal", "odometry", "collision", "depth", "segmentation"),
+    )
+    auto, drawn = AutoResetEnv(env), []
+    assert env.sensors.renderer is not None
+    draw = env.sensors.renderer.render_batch
+
+    def counted(scene, *rest):
+        jax.debug.callback(lambda: drawn.append(scene.shape[0]))
+        return draw(scene, *rest)
+
+    env.sensors.renderer.render_batch = counted  # type: ignore[method-assign]
+    state = jax.jit(auto.reset)(jax.random.split(jax.random.PRNGKey(0), 4))
+    step, observe = jax.jit(auto.step), jax.jit(jax.vmap(env.observe))
+    shapes = jax.tree.map(lambda x: x.shape[1:], state.obs)
+    assert shapes == env.observation_size == auto.observation_size
+    first = state
+    for t in range(3):
+        drawn.clear()
+        state = step(state, jnp.full((4, 2), 0.3))
+        jax.block_until_ready(state)
+        jax.effects_barrier()
+        assert drawn == [4]
+        if t == 0:
+            assert (np.asarray(state.obs["state"])[:, 3] > 0.005).all()  # odometry: has driven ahead
+    assert (np.asarray(state.done) == 1).all() and (np.asarray(state.info["nav"].step_count) == 0).all()
+    assert (np.asarray(state.obs["state"])[:, 3:] == 0).all()
+    fresh = observe(state).obs
+    for key in state.obs:
+        np.testing.assert_allclose(state.obs[key], fresh[key], atol=1e-6)
+        assert np.abs(np.asarray(state.obs[key]) - np.asarray(first.obs[key])).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"observations": ("dept",)}, "observations is .*dept.*, expected a choice from .*depth"),
+        ({"image_dtype": "int8"}, "image_dtype is 'int8', expected one of float32, float16, uint8"),
+        ({"segmentation_classes": 6}, "segmentation_classes is 6, expected one of 4, 5"),
+        ({"depth_dropout": 1.5}, "depth_dropout is 1.5, expected between 0 and 1"),
+        ({"lidar_pos_m": (0.0, 0.1)}, "lidar_pos_m is .*, expected three numbers"),
+        ({"image_fov_deg": 180.0}, "image_fov_deg is 180.0"),
+        ({"renderer": "opengl"}, "renderer is 'opengl', expected one of auto, warp, rays"),
+    ],
+)
+def test_bad_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        NavConfig(**settings)
+
+
+def test_no_sensor_uses_the_key_that_the_next_episode_is_drawn_from():
+    key, step = jax.random.PRNGKey(7), jnp.asarray(0)
+    names = ("depth", "lidar", "odometry")
+    bases = [jax.random.fold_in(key, zlib.crc32(name.encode())) for name in names]
+    used = [*bases, *(stream(key, name, step) for name in names)]
+    drawn = [*jax.random.split(key), key, *jax.random.split(jax.random.split(key)[1], 6)]
+    rows = np.stack([np.asarray(k) for k in (*used, *drawn)])
+    assert len(np.unique(rows, axis=0)) == len(rows)
+    for name, base in zip(names, bases, strict=True):
+        np.testing.assert_array_equal(stream(key, name, step), jax.random.fold_in(base, 0))
+    # What a small number does: the base of the depth's stream was the next episode's key.
+    np.testing.assert_array_equal(jax.random.fold_in(key, 1), jax.random.split(key)[1])

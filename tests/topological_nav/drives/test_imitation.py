@@ -1,0 +1,165 @@
+"""A policy learns a toy scene's drives; runs repeat, go on and refuse; what is loaded does what was learned."""
+
+import dataclasses
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from interactive_nav_common.metrics_file import read_metrics
+from topological_nav.__main__ import main
+from topological_nav.config import PolicyConfig
+from topological_nav.drives import imitation
+from topological_nav.drives.dataset import drive_images
+from topological_nav.drives.driving import load_policy
+from topological_nav.drives.policy import Forward, Policy
+from topological_nav.errors import RunError
+from topological_nav.learn.learning import Learner
+from topological_nav.settings import overridden
+
+WORDS = (
+    *("hidden=24", "projection=8", "forward_hidden=16", "steps=20", "overlap_s=1.5", "batch=8", "epochs=10"),
+    *("learning_rate=1e-2", "straight_kept=1"),
+)
+CONFIG = overridden(PolicyConfig(), WORDS)
+
+
+@pytest.fixture(scope="module")
+def frames(made, driven):
+    return imitation.embed_drives(driven, made.rooms, made.passages, True)
+
+
+@pytest.fixture(scope="module")
+def run(frames, tmp_path_factory):
+    out = tmp_path_factory.mktemp("policy") / "run"
+    told = []
+    assert imitation.train_policy(frames, out, CONFIG, told.append) is not None
+    assert len(told) == 10
+    return out
+
+
+def test_all_images_and_their_mirrors_are_embedded(frames, driven):
+    width = sum(network.embed(np.zeros((1, 32, 32, 3), np.uint8)).shape[1] for network in frames.networks)
+    count = len(frames.drives.command)
+    assert frames.features.shape == (2 * count, width)
+    rows, images = next(iter(drive_images(driven)))
+    at = frames.drives.rows(rows)[:3]
+    for side, shown in ((0, images[:3]), (1, images[:3, :, ::-1])):
+        expected = np.concatenate([network.embed(shown) for network in frames.networks], 1)
+        assert frames.features[at + side * count].astype(float) == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_forward_model_learns_alone_first_and_then_everything(run):
+    lines = read_metrics(run / "metrics.jsonl")
+    assert [line["epoch"] for line in lines] == list(range(1, 11))
+    first, second, last = lines[0], lines[1], lines[-1]
+    # alpha (CE + CE) joins in the second epoch of ten: alone = 0.1.
+    assert first["loss"] == pytest.approx(first["forward"], rel=1e-3)
+    whole = second["forward"] + 10 * (second["ce_linear"] + second["ce_angular"]) + 0.5 * second["consistency"]
+    assert second["loss"] == pytest.approx(whole, rel=1e-3)
+    assert last["ce_linear"] < 0.8 * second["ce_linear"] and last["ce_angular"] < 0.8 * second["ce_angular"]
+    results = json.loads((run / "results.json").read_text())
+    assert set(results["test"]) == {"steps", "linear", "angular", "forward", "no_change"}
+    assert np.sum(results["test"]["angular"]["confusion"]) == results["test"]["steps"]
+
+
+def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames):
+    policy, forward, tx = Policy(6, 4), Forward(5), optax.adam(1e-2)
+    params = imitation.fresh_params(policy, forward, 3, 0)
+    learner = Learner(params, {"mean": jnp.zeros(3), "deviation": jnp.ones(3)}, tx.init(params))
+    before = jax.tree.map(np.asarray, params)
+    epoch = imitation.policy_epoch(policy, forward, 1e-2, 2, 4)  # type: ignore[arg-type]
+    rng = np.random.default_rng(0)
+    labels = {
+        "rows": jnp.asarray(rng.integers(0, 9, (4, 21))),
+        "valid": jnp.ones((4, 20), bool),
+        "followed": jnp.ones((4, 20), bool),
+        "linear": jnp.zeros((4, 20), jnp.int32),
+        "angular": jnp.zeros((4, 20), jnp.int32),
+        **{"alpha": jnp.float32(10.0), "lam": jnp.float32(0.5), "jointly": jnp.float32(0.0)},
+    }
+    after, _ = epoch(learner, jnp.asarray(rng.normal(size=(9, 3)), jnp.float32), labels, jax.random.PRNGKey(0))
+    same = jax.tree.map(lambda a, b: bool((np.asarray(a) == b).all()), after.params, before)
+    assert all(jax.tree.leaves(same["policy"])) and not all(jax.tree.leaves(same["forward"]))
+
+
+def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_path):
+    told = []
+    out = tmp_path / "run"
+    assert imitation.train_policy(frames, out, CONFIG, told.append, lambda: len(told) >= 4) is None
+    with pytest.raises(RunError, match="holds no trained policy; finish it"):
+        load_policy(out)
+    assert imitation.train_policy(frames, out, CONFIG, told.append) is not None
+    assert len(told) == 10
+    assert (out / "weights.msgpack").read_bytes() == (run / "weights.msgpack").read_bytes()
+    lines = [read_metrics(path / "metrics.jsonl") for path in (out, run)]
+    strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in one] for one in lines]
+    assert strip[0] == strip[1]
+    with pytest.raises(RunError, match="the run there has lam = 0.5, this one 1.0"):
+        imitation.train_policy(frames, out, dataclasses.replace(CONFIG, lam=1.0))
+
+
+def test_what_is_loaded_acts_as_the_cells_do_step_by_step(frames, run, made, driven):
+    policy = load_policy(run, made.rooms, made.passages)
+    rows, images = next(iter(drive_images(driven)))
+    steps = int(min(frames.drives.steps[rows[:2]]))
+    ends = np.cumsum(frames.drives.steps[rows])
+    both = np.stack([images[:steps], images[ends[0] : ends[0] + steps]])
+    state, found = policy.start(2), []
+    for t in range(min(steps, 8)):
+        state, linear, angular = policy.act(state, both[:, t])
+        assert linear.shape == angular.shape == (2,)
+        assert set(linear) <= {0.0, 0.25, 0.5} and set(angular) <= {-0.5, -0.25, 0.0, 0.25, 0.5}
+        found.append((linear, angular))
+    # One at a time, with a memory of its own, each does the same.
+    alone = policy.start(1)
+    for t in range(min(steps, 8)):
+        alone, linear, angular = policy.act(alone, both[1:, t])
+        assert (linear[0], angular[0]) == (found[t][0][1], found[t][1][1])
+    with pytest.raises(RunError, match=r"images are \(16, 16, 3\), expected \(32, 32, 3\)"):
+        policy.act(policy.start(1), np.zeros((1, 16, 16, 3), np.uint8))
+
+
+def test_networks_are_found_from_the_run_and_must_be_the_same(frames, run, made, tmp_path):
+    assert load_policy(run).about["parameters"] > 0
+    other = tmp_path / "rooms"
+    shutil.copytree(made.rooms, other)
+    about = json.loads((other / "network.json").read_text())
+    (other / "network.json").write_text(json.dumps({**about, "digest": "0" * 64}))
+    with pytest.raises(RunError, match="is not the network that .* learned with; train the policy again"):
+        load_policy(run, localiser=other)
+    with pytest.raises(RunError, match="was trained for 'rooms', expected a run of 'train policy'"):
+        load_policy(made.rooms)
+    with pytest.raises(RunError, match="was trained for 'passages', expected a run of 'train rooms'"):
+        load_policy(run, localiser=made.passages)
+
+
+@pytest.mark.heavy
+def test_the_command_draws_and_its_grid_is_a_table(made, driven, tmp_path, capsys):
+    out = tmp_path / "grid"
+    runs = ["--data", str(driven), "--localiser", str(made.rooms), "--detector", str(made.passages)]
+    words = ["train", "policy", *runs, "--grid", "-o", str(out), *WORDS, "epochs=2", "mirror=false"]
+    assert main(words) == 0
+    rows = json.loads((out / "grid.json").read_text())
+    assert [(r["alpha"], r["lambda"]) for r in rows] == imitation.GRID and len(rows) == 9
+    table = (out / "grid.md").read_text()
+    assert table.count("\n") == 11 and table in capsys.readouterr().out
+    assert len(list(out.glob("alpha-*-lambda-*/curves.png"))) == 9
+    assert main([*words]) == 0  # all there: nothing is learned again
+    assert "policy: epoch" not in capsys.readouterr().out
+
+
+def test_drives_seen_through_another_camera_are_refused(made, driven, tmp_path):
+    copy = tmp_path / "drives"
+    shutil.copytree(driven, copy)
+    header = json.loads((copy / "drives.json").read_text())
+    header["settings"]["width"] = 48
+    (copy / "drives.json").write_text(json.dumps(header))
+    with pytest.raises(
+        RunError, match="images have width = 48, the networks learned from 32; drive again with width=32"
+    ):
+        imitation.embed_drives(copy, made.rooms, made.passages, False)

@@ -1,0 +1,359 @@
+"""Bookkeeping of episodes by hand, then the whole machinery in simulation with the truth in the place of networks."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+import interactive_nav
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.rows import read_rows
+from tests.topological_nav.maps.test_sight import two_rooms_space
+from tests.toys import write_room
+from topological_nav.__main__ import main
+from topological_nav.config import EvaluationConfig
+from topological_nav.errors import RunError, SpaceError
+from topological_nav.evaluate import contest as contests
+from topological_nav.evaluate.contest import Contest, Venue, hold, venues_of
+from topological_nav.evaluate.evaluation import Journeys, Marks, count_of, draw_journeys, learned, play
+from topological_nav.scenes.plans import RECORDED
+from topological_nav.scenes.rooms import find_rooms
+from topological_nav.scenes.simulation import Seen, Simulator
+from topological_nav.weights import packaged
+from train.scoring.policies import make_follower
+
+APARTMENT = "scenes_mjcf/apartment_0"
+
+
+class Rails:
+    """A simulator of robots on a line: each drives 0.2 m a step and touches where it is told to."""
+
+    dt_s = 0.1
+    env = type("Env", (), {"backend": "warp"})
+
+    def __init__(self, touches):
+        self._touches = touches
+
+    def start(self, start_xy_w, yaw_rad, goal_xy_w, number, seed):
+        return np.array(start_xy_w)[:, 0], 0, number
+
+    def seen(self, state):
+        x, step, number = state
+        movable = np.array([step in self._touches.get(int(n), ()) for n in number])
+        none = np.zeros(len(x), bool)
+        return Seen(np.stack([x, 0 * x], -1), 0 * x, 0.2 * step + 0 * x, movable, none, none)
+
+
+class Line:
+    """Runs of 1 s (ten steps) with a pause of 0.5 s between them, in which it turns on the spot."""
+
+    def __init__(self, arrives=None):
+        self._arrives = arrives or {}
+
+    def begin(self, journeys):
+        self._number = journeys.number
+
+    def keep(self, rows):
+        self._number = self._number[rows]
+
+    def step(self, state, time_s, over):
+        x, step, number = state
+        at, none = step % 15, np.zeros(len(x), bool)
+        arrived = np.array([self._arrives.get(int(n)) == step for n in number])
+        marks = Marks(none | (at == 0), none | (at == 10), arrived, none | (step >= 60), arrived, none, none)
+        return (x + 0.2 * (at < 10) * ~over, step + 1, number), marks
+
+
+def line_journeys(goals) -> Journeys:
+    n = len(goals)
+    goal = np.stack([np.array(goals, float), np.zeros(n)], -1)
+    zero = np.zeros(n)
+    return Journeys(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float))
+
+
+def test_an_episode_is_won_where_a_run_ends_near_the_goal():
+    # Runs end at steps 10, 25, 40, 55, at x = 2, 4, 6, 8.
+    config = EvaluationConfig(run_s=1.0, success_m=1.5)
+    found = play(Line(), Rails({}), line_journeys([2.0, 3.0, 5.49, 5.51, 30.0]), config)  # type: ignore[arg-type]
+    assert found.success.tolist() == [True, True, True, True, False]
+    # 3 m: 1 m away at the end of the first run. 5.49: 1.49 m away after the second; 5.51: only after the third.
+    assert found.duration_s.tolist() == pytest.approx([1.0, 1.0, 2.5, 4.0, 6.0])
+    assert found.runs.tolist() == [1, 1, 2, 3, 4]
+    assert found.goal_m.tolist() == pytest.approx([0.0, 1.0, 1.49, 0.49, 22.0])
+    assert not found.arrived.any() and found.path_m[:2].tolist() == pytest.approx([2.0, 2.0])
+    assert [len(t) for t in found.track_w[:2]] == [4, 4]
+    assert found.track_w[0][-1].tolist() == pytest.approx([2.0, 0.0])
+
+
+def test_contacts_count_by_runs_and_by_seconds():
+    # State k is seen after k steps. Run 1: steps 1 to 10, run 2: 16 to 25; 11 to 15 turn on the spot.
+    touches = {0: {3, 4, 9}, 1: {12, 13}, 2: {10, 16}, 3: {11}}
+    found = play(Line(), Rails(touches), line_journeys([4.9] * 4), EvaluationConfig(run_s=1.0))  # type: ignore[arg-type]
+    assert found.duration_s.tolist() == pytest.approx([2.5] * 4) and found.runs.tolist() == [2] * 4
+    assert found.contact_runs.tolist() == [1, 0, 2, 0]
+    assert found.contact_s.tolist() == pytest.approx([0.3, 0.2, 0.2, 0.1])
+
+
+def test_a_run_that_its_episode_cuts_short_counts():
+    found = play(Line({0: 4, 1: 12}), Rails({0: {2}}), line_journeys([9.0, 9.0]), EvaluationConfig(run_s=1.0))  # type: ignore[arg-type]
+    assert found.success.tolist() == [True, True] and found.arrived.tolist() == [True, True]
+    assert found.runs.tolist() == [1, 1] and found.contact_runs.tolist() == [1, 0]
+    assert found.localisations.tolist() == [1, 1] and found.duration_s.tolist() == pytest.approx([0.4, 1.2])
+
+
+def test_scenes_have_episodes_by_their_area():
+    def of(area):
+        scene = type("S", (), {"manifest": type("M", (), {"floor_area_m2": area})})
+        return count_of(scene, EvaluationConfig())  # type: ignore[arg-type]
+
+    assert [of(33.2), of(79.9), of(145.3)] == [25, 40, 60]
+    assert count_of(None, EvaluationConfig(episodes=7)) == 7  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    space = two_rooms_space()
+    return space, find_rooms(space, "kmeans", 2, None, 0, 0.2)
+
+
+def test_episodes_lead_from_room_to_room_and_are_fixed(rooms):
+    space, labels = rooms
+    config = EvaluationConfig(seed=3)
+    found = draw_journeys("ab" * 32, space, labels, 20, config)
+    assert (found.start_room != found.goal_room).all() and found.number.tolist() == list(range(20))
+    assert (np.linalg.norm(found.start_xy_w - found.goal_xy_w, axis=1) > 2.5).all()
+    assert (space.at(found.start_xy_w) >= 0.35).all() and (space.at(found.goal_xy_w) >= 0.35).all()
+    fewer = draw_journeys("ab" * 32, space, labels, 5, config)
+    assert (fewer.start_xy_w == found.start_xy_w[:5]).all() and (fewer.yaw_rad == found.yaw_rad[:5]).all()
+    assert (draw_journeys("ab" * 32, space, labels, 5, EvaluationConfig(seed=4)).yaw_rad != fewer.yaw_rad).any()
+    assert (draw_journeys("cd" * 32, space, labels, 5, config).yaw_rad != fewer.yaw_rad).any()
+
+
+def test_the_shortest_way_is_as_long_as_over_eight_neighbours_or_shorter(rooms):
+    space, labels = rooms
+    found = draw_journeys("ab" * 32, space, labels, 6, EvaluationConfig())
+    free = space.clearance_m >= 0.25
+    index = np.arange(free.size).reshape(free.shape)
+    a, b, w = [], [], []
+    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        one = np.argwhere(free)
+        two = one + [dr, dc]
+        ok = ((two >= 0) & (two < free.shape)).all(1)
+        one, two = one[ok], two[ok]
+        ok = free[two[:, 0], two[:, 1]]
+        a.append(index[tuple(one[ok].T)])
+        b.append(index[tuple(two[ok].T)])
+        w.append(np.full(ok.sum(), np.hypot(dr, dc) * space.resolution_m))
+    graph = csr_array((np.concatenate(w), (np.concatenate(a), np.concatenate(b))), shape=(free.size,) * 2)
+
+    def cell(xy):
+        column, row = np.floor((xy - space.origin_w) / space.resolution_m).astype(int)
+        return index[row, column]
+
+    for start, goal, shortest in zip(found.start_xy_w, found.goal_xy_w, found.shortest_m, strict=True):
+        eight = dijkstra(graph, directed=False, indices=cell(start))[cell(goal)]
+        straight = np.linalg.norm(start - goal)
+        # Of 16 directions, but round no corner that a diagonal would cut.
+        assert straight <= shortest <= eight * 1.01 and eight <= shortest * 1.0824
+
+
+def test_a_scene_without_such_episodes_is_refused(rooms):
+    space, labels = rooms
+    with pytest.raises(SpaceError, match="0 of 3 episodes .* more than 50.0 m apart"):
+        draw_journeys("ab" * 32, space, labels, 3, EvaluationConfig(min_goal_m=50.0))
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory):
+    """Two rooms of 3 x 4 m joined by a gap of 1 m, nothing in them; their plan is recorded."""
+    folder = write_room(tmp_path_factory.mktemp("evaluated") / "toy", (6.0, 4.0), (), partition=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(RECORDED, load_scene(folder).digest, ((-3.0, -2.0, -0.05, 2.0), (0.05, -2.0, 3.0, 2.0)))
+        yield folder
+
+
+def held(toy, out, **settings):
+    config = EvaluationConfig(**{"backend": "native", "episodes": 4, "limit_s": 300.0, "batch": 4, **settings})
+    return Contest((toy,), ("dense", "expert"), out, config, truth=True)
+
+
+def numbers(rows: pa.Table) -> dict[str, np.ndarray]:
+    """What must be the same when the same is played again."""
+    return {field.name: rows[field.name].to_numpy() for field in rows.schema if pa.types.is_floating(field.type)}
+
+
+@pytest.fixture(scope="module")
+def first(toy, tmp_path_factory):
+    """The toy's contest, played in one go."""
+    contest = held(toy, tmp_path_factory.mktemp("first"))
+    venues = venues_of(contest)
+    return contest, venues, hold(contest, venues)
+
+
+def test_with_true_sight_the_navigator_finds_the_other_room(first):
+    *_, rows = first
+    by = {name: [r for r in rows.to_pylist() if r["contender"] == name] for name in ("dense", "expert")}
+    assert [r["success"] for r in by["dense"]] == [1.0] * 4 and [r["success"] for r in by["expert"]] == [1.0] * 4
+    assert [r["start_x_w"] for r in by["dense"]] == [r["start_x_w"] for r in by["expert"]]
+    assert np.mean([r["spl"] for r in by["expert"]]) > 0.9
+    assert all(r["sight"] == "truth" and r["localisations"] >= 1 and r["runs"] >= 1 for r in by["dense"])
+    assert all(r["within"] for r in by["expert"]) and not any(r["broken"] for r in rows.to_pylist())
+
+
+@pytest.mark.heavy
+def test_who_else_is_in_the_batch_does_not_matter_and_a_stopped_contest_goes_on(first, toy, tmp_path):
+    contest, venues, expected = first
+    other = dataclasses.replace(contest, out=tmp_path, config=dataclasses.replace(contest.config, batch=2))
+
+    class Enough(Exception):
+        pass
+
+    def stop(what, done, total):
+        if done >= 3:
+            raise Enough
+
+    with pytest.raises(Enough):
+        hold(other, venues, stop)
+    kept = sorted((tmp_path / "rows").glob("*.parquet"))
+    assert 2 <= len(read_rows(kept)) < 8  # whole batches only
+    times = {path: path.stat().st_mtime_ns for path in kept}
+    told = []
+    rows = hold(other, venues, lambda what, done, total: told.append((done, total)))
+    assert told[0][0] >= len(read_rows(kept)) and told[-1] == (8, 8)
+    assert {path: path.stat().st_mtime_ns for path in kept} == times
+    ours, theirs = numbers(rows), numbers(expected)
+    for name in set(ours) - {"wall_s"}:
+        # What is compiled for another size of batch rounds differently.
+        assert ours[name] == pytest.approx(theirs[name], abs=1e-3), name
+    assert rows.select(["runs", "localisations", "episode", "contender"]).equals(
+        expected.select(["runs", "localisations", "episode", "contender"])
+    )
+    assert hold(other, venues, lambda *_: pytest.fail("played again")).equals(rows)
+
+
+def test_another_question_is_played_anew(first, toy, tmp_path):
+    contest, (venue,), _ = first
+    names = {contests._stem(venue, "dense")}
+    for change in ({"seed": 1}, {"passable": 0.6}, {"thinned": 0.9}):
+        changed = dataclasses.replace(contest, config=dataclasses.replace(contest.config, **change))
+        names.add(contests._stem(Venue(toy, changed, None), "dense"))
+    names.add(contests._stem(venue, "sparse"))
+    assert len(names) == 5
+    bigger = dataclasses.replace(contest, config=dataclasses.replace(contest.config, batch=1, episodes=9))
+    assert contests._stem(Venue(toy, bigger, None), "dense") in names
+
+
+def test_the_commands_draw_and_tell(first, toy, capsys, tmp_path):
+    contest, _, rows = first
+    words = ["episodes=4", "limit_s=300", "backend=native", "batch=4", "--truth"]
+    assert main(["evaluate", str(toy), "--contenders", "dense,expert", "-o", str(contest.out), *words]) == 0
+    told = capsys.readouterr().out
+    assert "8 episodes; tables in summary.md" in told and "dense" in told
+    assert "| expert | toy | 4 | 1.00 [0.51, 1.00] |" in (contest.out / "summary.md").read_text()
+    assert (contest.out / "toy.png").stat().st_size > 20_000
+    out, film = tmp_path / "one.png", tmp_path / "one.mp4"
+    words.remove("batch=4")
+    assert main(["navigate", str(toy), "--episode", "2", "-o", str(out), "--video", str(film), *words]) == 0
+    told = capsys.readouterr().out
+    row = next(r for r in rows.to_pylist() if r["contender"] == "dense" and r["episode"] == 2)
+    assert f"reached the goal after {row['duration_s']:.0f} s and {row['path_m']:.1f} m" in told
+    assert "looked about: at node" in told and "drives" in told
+    assert out.stat().st_size > 20_000 and film.stat().st_size > 5_000
+    assert film.read_bytes()[4:8] == b"ftyp"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["evaluate", "nowhere", "--contenders", "dens"], "contender is 'dens', expected a choice from dense, sparse"),
+        (["evaluate", "nowhere", "--contenders", "ppo"], "contender ppo needs the run folder of a trained policy"),
+        (["evaluate", "nowhere", "a/nowhere"], "scenes are nowhere, nowhere, expected different names"),
+        (["evaluate", "nowhere", "--truth"], "nowhere/scene.json: no such file"),
+        (["evaluate", "nowhere", "--localiser", "gone"], "no trained networks of passages"),
+        (["evaluate", APARTMENT, "--localiser", "gone", "--detector", "gone"], "gone: holds no trained network"),
+        (["evaluate", "nowhere", "--domain", "fog"], "domain is 'fog', expected one of clean, lens"),
+        (["navigate", "nowhere", "--video", "a.avi"], "expected a name that ends in .mp4"),
+        (["navigate", APARTMENT, "--truth", "--episode", "25"], "episode is 25, expected 0 to 24"),
+    ],
+)
+def test_mistakes_are_one_line(words, told, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(packaged, "packaged_weights", lambda: tmp_path / "none")
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("topological_nav: ") and told in error and error.count("\n") == 1
+
+
+def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
+    contest = dataclasses.replace(held(toy, tmp_path), policy=str(tmp_path / "gone"))
+    with pytest.raises(RunError, match="gone: holds no trained policy"):
+        hold(contest, venues_of(contest))
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "policy.json").write_text("{}")
+    with pytest.raises(ConfigError, match="looks at images, --truth has none"):
+        contest = dataclasses.replace(contest, policy=str(tmp_path / "there"))
+        hold(contest, venues_of(contest))
+
+
+@pytest.mark.heavy
+def test_in_a_real_home_true_sight_finds_most_goals(tmp_path):
+    config = EvaluationConfig(backend="native", episodes=8, limit_s=600.0, batch=8)
+    contest = Contest((Path(APARTMENT),), ("dense",), tmp_path, config, truth=True)
+    rows = hold(contest, venues_of(contest))
+    assert np.mean(rows["success"].to_numpy()) >= 0.85
+    assert np.mean(rows["spl"].to_numpy()) >= 0.6
+    assert np.mean(rows["within"].to_numpy()) >= 0.85
+    assert load_scene(APARTMENT).split == rows["split"].to_pylist()[0]
+
+
+def test_a_policy_told_the_goal_plays_the_same_episodes(first, toy):
+    """By the yardstick that follows waypoints, in an environment with small objects, which stay away."""
+    contest, (venue,), _ = first
+    env = interactive_nav.make("ttbot", [toy], control_mode="twist", backend="native", num_objects=1)
+    simulator = Simulator(env)
+    journeys = venue.journeys
+    found = play(learned(simulator, make_follower(env), contest.config), simulator, journeys, contest.config)
+    assert found.success.all() and (found.goal_m < 1.5).all() and not found.localisations.any()
+    # Runs follow each other: an episode lasts whole runs.
+    assert found.duration_s == pytest.approx(5.0 * found.runs)
+    start = simulator.start(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, journeys.number, 0)
+    assert np.abs(np.asarray(start.info["nav"].object_pos_w)[:, 0, 0]).min() > 100.0  # parked
+
+
+def test_one_array_tells_what_the_state_holds():
+    rng = np.random.default_rng(0)
+    nav = {
+        "robot_pos_w": rng.normal(size=(3, 3)),
+        "yaw_rad": rng.normal(size=3),
+        "robot_path_m": rng.uniform(0, 90, 3),
+        "touching": np.array([[True, False, True], [False, True, False], [False, False, True]]),
+        "overflow_steps": np.array([0, 2, 0], np.int32),
+    }
+    nav = {
+        name: jnp.asarray(value, value.dtype if value.dtype != float else jnp.float32) for name, value in nav.items()
+    }
+    state = SimpleNamespace(info={"nav": SimpleNamespace(**nav)}, metrics={"nonfinite": jnp.asarray([0.0, 0.0, 1.0])})
+    simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step"), abs)))
+    seen = simulator.seen(state)
+    assert (seen.xy_w == np.asarray(nav["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float
+    assert (seen.yaw_rad == np.asarray(nav["yaw_rad"])).all()
+    assert (seen.path_m == np.asarray(nav["robot_path_m"])).all()
+    assert seen.movable.tolist() == [True, False, False]
+    assert seen.wall.tolist() == [False, True, False]
+    assert seen.broken.tolist() == [False, True, True]
+    assert simulator.seen(state) is seen  # the same state is not asked twice
+
+
+@pytest.mark.heavy
+def test_the_expert_passes_where_furniture_leaves_a_quarter_of_a_metre(tmp_path):
+    """A table closes a room of maple to the expert's grid: it stood still in 18 of 60 episodes."""
+    config = EvaluationConfig(backend="native", episodes=8, batch=8, limit_s=90.0)
+    contest = Contest((Path("scenes_mjcf/maple"),), ("expert",), tmp_path, config)
+    rows = hold(contest, venues_of(contest)).to_pylist()
+    assert [r["success"] for r in rows] == [1.0] * 8 and min(r["path_m"] for r in rows) > 2.5

@@ -1,0 +1,158 @@
+"""The small file of a policy: holds all that acting reads, nothing else, and acts nearly as the original."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from typing import Any
+
+import flax.serialization
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from tests.train.toy_pixels import SMALL, ToyPixels
+from tests.train.toy_run import build_toy, toy_config
+from train.runs import checkpoint, policy_file
+from train.learners.algorithms import ALGORITHMS
+from train.config import EnvConfig, TrainConfig, resolve
+from train.errors import CheckpointError
+from train.learners.learner import Snapshot
+from train.runs.run import train_run
+
+TOY = EnvConfig(scenes=("toy",), backend="native")
+
+
+def learner_of(env, algorithm, share):
+    network = dataclasses.replace(SMALL, share_encoder=share)
+    config = resolve(TrainConfig(env=TOY, algorithm=algorithm, network=network), "native")
+    template = ALGORITHMS[algorithm].template(env, config)
+    leaves, structure = jax.tree.flatten(template)
+    rng = np.random.default_rng(3)  # what begins as zeros shall not agree by chance
+
+    def drawn(leaf):
+        shape, dtype = np.shape(leaf), jnp.asarray(leaf).dtype
+        if not jnp.issubdtype(dtype, jnp.floating) or not shape:
+            return leaf
+        if len(shape) == 1:
+            return jnp.asarray(rng.uniform(0.05, 0.3, shape), dtype)
+        return jnp.asarray(rng.normal(size=shape) / np.sqrt(np.prod(shape[:-1])), dtype)
+
+    return config, jax.tree.unflatten(structure, [drawn(leaf) for leaf in leaves])
+
+
+def actions(env, config, learner):
+    size, rng = env.observation_size, np.random.default_rng(0)
+    shapes = size if isinstance(size, dict) else {"": (size,)}
+    seen = {
+        name: rng.integers(0, 256, (40, *shape)).astype(np.uint8)
+        if name.startswith("pixels/")
+        else rng.normal(size=(40, *shape)).astype(np.float32)
+        for name, shape in shapes.items()
+    }
+    act: Any = ALGORITHMS[config.algorithm].policy(env, config, learner, True)
+    return np.asarray(act(seen if isinstance(size, dict) else seen[""], jax.random.PRNGKey(0))[0])
+
+
+def saved(root, algorithm, learner):
+    meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, algorithm, "turtlebot", ("goal",), 3, 2)
+    return checkpoint.save(root, Snapshot(5, learner, None), meta, 1, 1.0)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "ddpg"])
+@pytest.mark.parametrize(("env", "share"), [(ToyPixels(), False), (ToyPixels(), True)])
+def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algorithm):
+    monkeypatch.setattr(policy_file, "LARGE", 1024)  # these networks are small
+    config, learner = learner_of(env, algorithm, share)
+    before = actions(env, config, learner)
+    path = saved(tmp_path / "whole", algorithm, learner)
+    checkpoint.keep_policy(path, tmp_path / "kept" / path.name, step=0.03)
+    kept, _ = checkpoint.find(tmp_path / "kept", "best")
+    assert not checkpoint.is_whole(kept) and checkpoint.is_whole(path)
+    assert sum(p.stat().st_size for p in kept.iterdir()) < 0.5 * sum(p.stat().st_size for p in path.iterdir())
+    template = ALGORITHMS[algorithm].template(env, config)
+    after = actions(env, config, checkpoint.load_learner(kept, template))
+    assert np.abs(actions(env, config, template) - before).max() > 0.1
+    assert 0 < np.abs(after - before).mean() < 0.02 and np.abs(after - before).max() < 0.3
+    # Everything else may be anything; none of what is kept may.
+    state = flax.serialization.to_state_dict(learner)
+    acting = policy_file.acting_part(state, algorithm)
+    flat: dict[str, Any] = flax.traverse_util.flatten_dict(state, sep="/", keep_empty_nodes=True)
+    broken = {k: v if k in acting or not hasattr(v, "dtype") else jnp.full_like(v, 7) for k, v in flat.items()}
+    other = flax.serialization.from_state_dict(template, flax.traverse_util.unflatten_dict(broken, sep="/"))
+    np.testing.assert_array_equal(actions(env, config, other), before)
+    idle = ("count", "summed_variance", "std_eps")  # of the normaliser: it acts by mean and deviation
+    for name in acting:
+        if name.rpartition("/")[2].startswith(idle) or any(f"/{word}" in name for word in idle):
+            continue
+        moved = {**flat, name: jnp.asarray(flat[name]) * 1.5 + 0.3}
+        other = flax.serialization.from_state_dict(template, flax.traverse_util.unflatten_dict(moved, sep="/"))
+        assert np.abs(actions(env, config, other) - before).max() > 1e-6, name
+
+
+@given(st.integers(1, 100), st.integers(1, 100), st.floats(1e-3, 1e3), st.floats(0.01, 2.0))
+def test_within_half_a_step(outputs, inputs, size, step):
+    weights = (np.random.default_rng(inputs).normal(size=(inputs, outputs)) * size).astype(np.float32)
+    stored = policy_file.packed({"a/kernel": weights, "a/bias": weights[0]}, step)
+    assert set(policy_file.coded(stored)) == set(stored) | ({"a/kernel:shape"} if "a/kernel:scale" in stored else set())
+    again = policy_file.decoded(policy_file.coded(stored))
+    assert again.keys() == stored.keys()
+    assert all(again[name].dtype == array.dtype and (again[name] == array).all() for name, array in stored.items())
+    back = policy_file.unpacked(stored)
+    np.testing.assert_array_equal(back["a/bias"], weights[0])
+    if weights.size < policy_file.LARGE:
+        np.testing.assert_array_equal(back["a/kernel"], weights.astype(np.float16))
+    else:
+        assert stored["a/kernel"].dtype == np.int8
+        half = np.maximum(step * weights.std(0), np.abs(weights).max(0) / 127) / 2
+        assert (np.abs(back["a/kernel"] - weights) <= half * (1 + 1e-5) + 1e-30).all()
+
+
+def test_an_output_without_weights_stays_zero():
+    weights = np.zeros((4_000, 2), np.float32)
+    weights[:, 1] = np.tile([2.0, -2.0, 1.0, -1.0], 1_000)  # a deviation of the root of 2.5
+    back = policy_file.unpacked(policy_file.packed({"w": weights}, 1.0))["w"]
+    assert not back[:, 0].any()
+    np.testing.assert_allclose(back[:4, 1], np.array([1, -1, 1, -1]) * 2.5**0.5, rtol=1e-6)
+
+
+def test_a_weight_beyond_the_range_of_eight_bits_widens_the_steps():
+    weights = np.zeros((5_000, 1), np.float32)
+    weights[7] = 5.0  # 70 deviations
+    stored = policy_file.packed({"w": weights}, 0.1)
+    assert stored["w"].max() == 127 and policy_file.unpacked(stored)["w"][7] == pytest.approx(5.0)
+
+
+def test_foreign_and_damaged_files_are_told(tmp_path):
+    config, learner = learner_of(ToyPixels(), "sac", True)
+    path = saved(tmp_path / "whole", "sac", learner)
+    checkpoint.keep_policy(path, tmp_path / "kept" / path.name)
+    kept, _ = checkpoint.find(tmp_path / "kept", "best")
+    other = resolve(TrainConfig(env=TOY, network=config.network), "native")
+    with pytest.raises(CheckpointError, match="policy_params/.*which this learner has not"):
+        checkpoint.load_learner(kept, ALGORITHMS["ppo"].template(ToyPixels(), other))
+    files = (path, checkpoint.LEARNER), (kept, policy_file.POLICY)
+    digests = [hashlib.sha256((home / name).read_bytes()).hexdigest() for home, name in files]
+    assert [checkpoint.weights_digest(home) for home in (path, kept)] == digests
+    (kept / policy_file.POLICY).write_bytes(b"PK garbage")
+    with pytest.raises(CheckpointError, match="policy.npz: not readable"):
+        checkpoint.load_learner(kept, ALGORITHMS["sac"].template(ToyPixels(), config))
+
+
+def test_training_does_not_go_on_from_it(tmp_path):
+    config = toy_config(tmp_path, updates=2)
+    _, folder, _ = train_run(config, Console(quiet=True), build_env=build_toy)
+    path, _ = checkpoint.find(folder.checkpoints, "last")
+    checkpoint.keep_policy(path, tmp_path / "kept")
+    path.joinpath(checkpoint.LEARNER).unlink()
+    (tmp_path / "kept" / policy_file.POLICY).rename(path / policy_file.POLICY)
+    assert json.loads((path / checkpoint.META).read_text())["env_steps"] == 512
+    longer = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=2048))
+    with pytest.raises(CheckpointError, match="holds the policy alone"):
+        train_run(longer, Console(quiet=True), build_env=build_toy)

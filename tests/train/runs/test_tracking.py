@@ -1,0 +1,120 @@
+"""Weights & Biases: offline the numbers of metrics.jsonl arrive, a continued run stays one, without it a clear line."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import flax.struct
+import numpy as np
+import pytest
+from rich.console import Console
+
+from interactive_nav_common.errors import ConfigError
+from tests.train.toy_run import build_toy, toy_config
+from train.runs import tracking
+from train.learners.algorithms import ALGORITHMS
+from train.learners.learner import Snapshot, TrainResult
+from train.runs.run import train_run
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO())
+
+
+def records(data: bytes) -> Iterator[bytes]:
+    """The records of a W&B file: LevelDB's log format in blocks of 32 KiB, after a header of seven bytes."""
+    at, parts = 7, []
+    while at + 7 <= len(data):
+        room = 32768 - at % 32768
+        if room < 7:
+            at += room
+            continue
+        _, length, kind = struct.unpack_from("<IHB", data, at)
+        parts.append(data[at + 7 : at + 7 + length])
+        at += 7 + length
+        if kind in (1, 4):  # a whole record, or the last part of one
+            yield b"".join(parts)
+            parts = []
+
+
+def logged(path: Path) -> list[dict[str, float]]:
+    """The history in an offline run's file, once its last record is there: W&B's own process writes it."""
+    from wandb.proto import wandb_internal_pb2  # pyright: ignore[reportMissingImports]
+
+    for _ in range(200):
+        read = []
+        for data in records(path.read_bytes()):
+            read.append(wandb_internal_pb2.Record())
+            read[-1].ParseFromString(data)
+        if read and read[-1].WhichOneof("record_type") == "exit":
+            break
+        time.sleep(0.1)
+    else:
+        raise AssertionError(f"{path} was never finished")
+    histories = [record.history for record in read if record.WhichOneof("record_type") == "history"]
+    return [{i.key or ".".join(i.nested_key): json.loads(i.value_json) for i in h.item} for h in histories]
+
+
+@flax.struct.dataclass
+class Envs:
+    """As much of an environment's state as callbacks look at."""
+
+    info: dict
+
+
+class Logging:
+    """A learner that learns nothing and logs what it is given."""
+
+    def __init__(self, *lines: tuple[int, dict[str, float]]):
+        self.lines = lines
+
+    def train(self, env, config, callbacks) -> TrainResult:
+        state = Envs({"episode_metrics": {config.run.best_metric: np.zeros(1)}})
+        callbacks.on_start(Snapshot(0, {}, state), 1000)
+        for env_steps, metrics in self.lines:
+            callbacks.on_log(env_steps, {"env_steps_per_s": 10.0, **metrics})
+        return TrainResult(Snapshot(self.lines[-1][0], {}, None), {"env_steps_per_s": 10.0}, True)
+
+
+def test_offline_runs_hold_every_logged_number_and_go_on_as_one(tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    steps = []
+    for sitting in ((256, {"episode/success": 0.25}), (512, {"episode/success": 0.5})), ((768, {"loss/v": -1.5}),):
+        monkeypatch.setitem(ALGORITHMS, "ppo", Logging(*sitting))
+        _, folder, _ = train_run(toy_config(tmp_path, wandb=True), quiet(), build_env=build_toy)
+        files = list(folder.path.glob("wandb/offline-run-*/*.wandb"))
+        assert {path.stem for path in files} == {f"run-{(folder.path / tracking.ID_FILE).read_text().strip()}"}
+        there = {line["env_steps"]: line for path in files for line in logged(path)}
+        for env_steps, metrics in sitting:
+            expected = {"env_steps": env_steps, "env_steps_per_s": 10.0, **metrics}
+            assert {name: there[env_steps][name] for name in expected} == expected
+        steps = sorted(there)
+    assert steps[-1] == 768
+
+
+def test_without_the_package_nothing_is_begun(tmp_path, monkeypatch):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(ConfigError, match=r"Weights & Biases is not installed; pip install 'interactive-nav\[wandb\]'"):
+        train_run(toy_config(tmp_path, wandb=True), quiet(), build_env=build_toy)
+    assert not list(tmp_path.iterdir())
+
+
+def test_not_logged_in_is_one_line(tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb")
+
+    def refuse(**_):
+        raise wandb.errors.UsageError("api_key not configured (no-tty).\n call wandb.login")
+
+    monkeypatch.setattr(wandb, "init", refuse)
+    with pytest.raises(ConfigError, match=r"run.wandb: api_key not configured.*; run `wandb login`, set WANDB_MODE"):
+        tracking.Tracker(tmp_path, toy_config(tmp_path), {})

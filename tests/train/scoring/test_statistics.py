@@ -1,0 +1,134 @@
+"""Means of runs, intervals and tests against arithmetic by hand, and the claims on rows where each is known to hold."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+import pytest
+
+from interactive_nav_common.statistics import estimate, p_text, welch
+from tests.train.synthetic import K_INTS, paper_like, run_rows, yardstick_rows
+from train.scoring.statistics import claims, contrast, correlation, run_means, seen_unseen
+
+
+def test_a_run_counts_once_whatever_its_episodes():
+    rows = pa.concat_tables([run_rows("fetch", "sac", 0.1, 2, 0.6, (0.8, 0.5)), yardstick_rows("fetch")])
+    (train,) = run_means(rows, "train")
+    assert (train.cell, train.seed, train.episodes) == (("fetch", "sac", 0.1), 2, 20)
+    assert train.scores["path_efficiency"] == pytest.approx(0.6) and train.scores["success"] == pytest.approx(0.95)
+    assert train.scores["effort_efficiency"] == pytest.approx(0.65)
+    assert train.ins(0.25) == pytest.approx(0.25 * 0.6 + 0.75 * 0.65)
+    (both,) = run_means(rows)
+    assert both.episodes == 40
+
+
+def test_t_interval_by_hand():
+    """1, 2, 3: mean 2, deviation 1, t(0.975, 2) = 4.302653: half width 4.302653 / sqrt(3)."""
+    e = estimate([1.0, 2.0, 3.0])
+    assert (e.mean, e.half, e.runs) == pytest.approx((2.0, 4.302653 / math.sqrt(3), 3), abs=1e-5)
+    assert str(e) == "2.000 ± 2.484" and str(estimate([0.5])) == "0.500" and math.isnan(estimate([0.5]).low)
+
+
+def test_welch_by_hand():
+    """Means 2 and 5 with variances 1 and 4, three each: t = -3 / sqrt(5 / 3), 2.941 degrees of freedom."""
+    c = welch(np.array([1.0, 2.0, 3.0]), np.array([3.0, 5.0, 7.0]))
+    error = math.sqrt(1 / 3 + 4 / 3)
+    freedom = (5 / 3) ** 2 / ((1 / 3) ** 2 / 2 + (4 / 3) ** 2 / 2)
+    assert freedom == pytest.approx(2.941, abs=1e-3)
+    # Half the interval is t(0.975, 2.941) = 3.2187 times the standard error (from tables, between 4.303 and 3.182).
+    assert c.difference == pytest.approx(-3.0)
+    assert 3.182 < (c.high - c.low) / 2 / error < 4.303
+    assert c.low == pytest.approx(-3.0 - (c.high + 3.0))
+    assert 0.1 < c.p_value < 0.2 and c.verdict == "undecided"  # t = -2.32: p is 0.10 at 3 and 0.15 at 2 degrees
+    constant = welch(np.array([1.0, 1.0]), np.array([0.5, 0.5]))
+    assert math.isnan(constant.p_value) and constant.verdict == "undecided" and "no test" in str(constant)
+
+
+def test_seeds_are_the_sample_and_only_common_settings_are_compared():
+    means = run_means(paper_like(noise=0.02), "test")
+    # SAC minus PPO: P_eff + 0.08, both terms + 0.024: INS_0.5 + 0.052, whatever k_int.
+    c = contrast(means, "algorithm", "sac", "ppo", lambda run: run.ins(0.5), robot="turtlebot")
+    assert c is not None and (c.left, c.right) == (3, 3) and c.difference == pytest.approx(0.052)
+    # Without PPO at k_int = 1, k_int = 1 of SAC is left out as well: their difference stays.
+    partial = [run for run in means if not (run.algorithm == "ppo" and run.k_int == 1.0)]
+    c = contrast(partial, "algorithm", "sac", "ppo", lambda run: run.ins(0.5), robot="turtlebot")
+    assert c is not None and c.difference == pytest.approx(0.052)
+    # A seed that one setting lacks is left out of that side.
+    partial = [run for run in means if (run.algorithm, run.k_int, run.seed) != ("sac", 0.1, 2)]
+    c = contrast(partial, "algorithm", "sac", "ppo", lambda run: run.ins(0.5), robot="turtlebot")
+    assert c is not None and (c.left, c.right) == (2, 3)
+    assert contrast(means, "algorithm", "td3", "ppo", lambda run: run.ins(0.5)) is None
+
+
+def test_seen_against_unseen():
+    """Differences of INS_0.5 of -0.01, -0.02 and -0.06: mean -0.03, deviation sqrt(0.0007), t = -1.964 at 2 degrees."""
+    shifts = (-0.02, -0.04, -0.12)  # of P_eff, which is half of INS_0.5
+    tables = [run_rows("turtlebot", "sac", 0.1, s, 0.7, (0.8, 0.8), unseen=shift) for s, shift in enumerate(shifts)]
+    pairs, test = seen_unseen(pa.concat_tables(tables))
+    assert test is not None and len(pairs) == 3 and test.difference == pytest.approx(-0.03)
+    half = 4.302653 * math.sqrt(0.0007) / math.sqrt(3)
+    assert (test.low, test.high) == pytest.approx((-0.03 - half, -0.03 + half), abs=1e-6)
+    t = 0.03 / (math.sqrt(0.0007) / math.sqrt(3))
+    # Student's distribution at two degrees of freedom in closed form: p = 1 - t / sqrt(t^2 + 2).
+    assert test.p_value == pytest.approx(1.0 - t / math.sqrt(t * t + 2.0), abs=1e-6)
+    only_train = [table.filter(pa.compute.equal(table["split"], "train")) for table in tables]
+    assert seen_unseen(pa.concat_tables(only_train)) == ([], None)
+
+
+def test_correlation_by_hand():
+    """x = 1..4, y = 2, 1, 4, 3: covariance sum 3, square sums 5 and 5: r = 0.6; z = atanh(0.6) +- 1.96."""
+    r = correlation([1, 2, 3, 4], [2, 1, 4, 3])
+    z = math.atanh(0.6)
+    assert r.r == pytest.approx(0.6)
+    assert (r.low, r.high) == pytest.approx((math.tanh(z - 1.959964), math.tanh(z + 1.959964)), abs=1e-5)
+    assert r.verdict == "undecided" and str(r).startswith("0.60 [") and r.count == 4
+    assert correlation([1, 2, 3, 4], [5, 5, 5, 5]).verdict == correlation([1], [1]).verdict == "too few runs to test"
+
+
+def test_every_claim_holds_where_it_was_put_in():
+    found = claims(paper_like(), "test")
+    verdicts = {(f.claim, f.compared): f.verdict for f in found}
+    assert len(verdicts) == len(found) == 2 * 2 + 2 * 5 + 2 + 2 + 1
+    expected = {"holds", "no significant difference"}
+    by_claim = {}
+    for (claim, _), verdict in verdicts.items():
+        by_claim.setdefault(claim, set()).add(verdict)
+    assert by_claim == {
+        "SAC is best overall": {"holds"},
+        "k_int = 1 is best at alpha = 0": {"holds"},
+        "k_int = 1 gains effort efficiency and loses path efficiency": {"holds"},
+        "k_int = 0.1 keeps path efficiency at higher effort efficiency": expected,
+        "Fetch is more effort-efficient than TurtleBot at the same path efficiency": expected,
+        "The two terms of E_eff are correlated": {"holds"},
+        "Seen and unseen scenes do not differ": {"too few runs to test"},  # the rows of both are the same
+    }
+    sac = next(f for f in found if "turtlebot: INS_0.5, SAC minus PPO" in f.compared)
+    assert sac.result.startswith("+0.052 [")
+
+
+def test_claims_that_fail_say_so_and_missing_runs_too():
+    """SAC is worse here, k_int changes nothing, and unseen scenes are harder in every run."""
+    tables = []
+    for algorithm, p in (("ppo", 0.8), ("sac", 0.6)):
+        for k_int in K_INTS:
+            for seed in range(3):
+                wobble = 0.01 * (seed - 1)
+                rows = run_rows("turtlebot", algorithm, k_int, seed, p + wobble, (0.7, 0.7), unseen=-0.1 + wobble)
+                tables.append(rows)
+    found = {f.compared: f for f in claims(pa.concat_tables(tables), "train")}
+    assert found["turtlebot: INS_0.5, SAC minus PPO, mean over k_int"].verdict == "does not hold: lower"
+    assert found["turtlebot: E_eff, k_int = 1 minus 0, mean over algorithms"].verdict == "too few runs to test"
+    assert found["turtlebot: P_eff, k_int = 1 minus 0, mean over algorithms"].verdict == "undecided"
+    assert found["turtlebot: cell of the highest mean INS_0"].verdict == "does not hold"
+    seen = next(f for f in found.values() if f.claim == "Seen and unseen scenes do not differ")
+    assert seen.verdict == "does not hold: lower" and "18 runs" in seen.compared
+    only_ppo = [table for table in tables if table["algorithm"][0].as_py() == "ppo"]
+    first = claims(pa.concat_tables(only_ppo), "train")[0]
+    assert first.verdict == "no runs of sac and ppo to compare"
+
+
+def test_p_values_are_written_as_papers_do():
+    assert (p_text(0.0004), p_text(0.0312)) == ("< 0.001", "= 0.031")

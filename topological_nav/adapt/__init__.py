@@ -1,0 +1,1 @@
+"""Networks and maps carried to another domain."""

@@ -1,0 +1,333 @@
+"""A network and images of another domain in, a network for that domain out: adversarial adaptation of the embedding.
+
+Tzeng et al. 2017 (ADDA): a critic learns to tell the embeddings of source images from those of target images, which an
+extractor of its own makes that starts as the source's; in turn the extractor learns to be taken for the source's. The
+source's extractor stays as it is. No label and no position of a target image is used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import flax.serialization
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from interactive_nav_common.config import to_dict
+from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.versions import versions
+from topological_nav.adapt.config import AdaptConfig
+from topological_nav.config import PITCHES
+from topological_nav.data.dataset import RoomImages, load_rooms, read_header
+from topological_nav.data.domains import as_seen, preset
+from topological_nav.errors import RunError
+from topological_nav.learn.learning import compiled_epoch, initial
+from topological_nav.learn.localise import localisation_scores
+from topological_nav.learn.networks import Network, joined, normalised
+from topological_nav.learn.runs import METRICS, RESULTS, claimed, read_checkpoint, restored
+from topological_nav.learn.training import Trained, load_trained, save_trained
+
+ROOMS_STREAM, PASSAGES_STREAM = 1, 2
+"""Of chance in target images."""
+Tell = Callable[[str], None]
+Asked = Callable[[], bool]
+
+
+class Critic(nn.Module):
+    """Two layers with leaky ReLU; one output, positive for the source."""
+
+    hidden: int
+
+    @nn.compact
+    def __call__(self, embeddings: jax.Array) -> jax.Array:
+        """[N, D] to [N] logits."""
+        x = embeddings
+        for _ in range(2):
+            x = nn.leaky_relu(nn.Dense(self.hidden)(x))
+        return nn.Dense(1)(x)[:, 0]
+
+
+@flax.struct.dataclass
+class Adapting:
+    """What an epoch changes."""
+
+    params: Any
+    """Of the target's network; its heads stay the source's."""
+    batch_stats: Any
+    opt_state: Any
+    critic: Any
+    critic_opt_state: Any
+
+
+def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple[jax.Array, Any]:
+    """Embeddings [N, D] by the batch's own statistics, and the running ones updated."""
+    found, new = network.apply(
+        variables, images, method=lambda module, x: joined(module.body(normalised(x), True)), mutable=["batch_stats"]
+    )
+    return found, new.get("batch_stats", variables["batch_stats"])  # type: ignore[union-attr,return-value]
+
+
+def make_adapting(
+    network: Network, variables: dict[str, Any], size: int, config: AdaptConfig
+) -> tuple[Adapting, Critic]:
+    """The target's extractor as the source's, and a fresh critic.
+
+    Args:
+        network: of the source.
+        variables: its own.
+        size: numbers of an embedding.
+        config: settings.
+    """
+    critic = Critic(config.hidden)
+    shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
+    weights = initial(shapes, config.seed)["params"]
+    # Copies: an epoch gives its argument's memory away, and the source's network is still needed.
+    params, stats = jax.tree.map(jnp.array, (variables["params"], variables["batch_stats"]))
+    tx, critic_tx = _optimisers(config)
+    return Adapting(params, stats, tx.init(params), weights, critic_tx.init(weights)), critic
+
+
+def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
+    """An epoch: for each batch of target images one update of the critic, then one of the extractor.
+
+    Called with the source's embeddings [S, D] in place of labels. Means told: `loss` of the extractor, `critic_loss`,
+    and `critic_accuracy`, before its update, where 0.5 means that the domains look alike.
+    """
+    tx, critic_tx = _optimisers(config)
+
+    def steps(images, key):
+        size = min(config.batch, len(images))
+        key_order, key_source = jax.random.split(key)
+        order = jax.random.permutation(key_order, len(images))[: len(images) // size * size].reshape(-1, size)
+        return order, jax.random.split(key_source, len(order))
+
+    def critic_loss(weights, source, target):
+        logits: Any = [critic.apply({"params": weights}, x) for x in (source, target)]
+        # log(1 + e^-x) for the source, log(1 + e^x) for the target.
+        loss = (nn.softplus(-logits[0]).mean() + nn.softplus(logits[1]).mean()) / 2
+        return loss, ((logits[0] > 0).mean() + (logits[1] <= 0).mean()) / 2
+
+    def extractor_loss(params, stats, weights, x):
+        target, new = embed_training(network, {"params": params, "batch_stats": stats}, x)
+        logits: Any = critic.apply({"params": weights}, target)
+        return nn.softplus(-logits).mean(), new
+
+    def update(state: Adapting, images, source, step):
+        rows, key = step
+        x = images[rows]
+        drawn = source[jax.random.randint(key, (len(rows),), 0, len(source))]
+        target, _ = embed_training(network, {"params": state.params, "batch_stats": state.batch_stats}, x)
+        (told, right), slope = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, drawn, target)
+        change, critic_opt = critic_tx.update(slope, state.critic_opt_state, state.critic)
+        weights: Any = optax.apply_updates(state.critic, change)
+        grad = jax.value_and_grad(extractor_loss, has_aux=True)
+        (loss, stats), slope = grad(state.params, state.batch_stats, weights, x)
+        change, opt = tx.update(slope, state.opt_state, state.params)
+        new = Adapting(optax.apply_updates(state.params, change), stats, opt, weights, critic_opt)
+        return new, {"loss": loss, "critic_loss": told, "critic_accuracy": right}
+
+    return compiled_epoch(steps, update)
+
+
+def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: int = 3) -> Trained:
+    """The network with batch normalisation's running statistics of other images, its weights as they were.
+
+    Li et al. 2016 (AdaBN): the least that can be done, and a yardstick for more. Images [N, H, W, 3] u8.
+    """
+    step = jax.jit(lambda stats, x: embed_training(trained.network, {**trained.variables, "batch_stats": stats}, x)[1])
+    stats, size = trained.variables["batch_stats"], min(batch, len(images))
+    order = np.random.default_rng(0).permutation(len(images))
+    for _ in range(passes):
+        for first in range(0, len(images) - size + 1, size):
+            stats = step(stats, jnp.asarray(images[order[first : first + size]]))
+    return dataclasses.replace(trained, variables={**trained.variables, "batch_stats": stats})
+
+
+def adapt_features(
+    run: Path,
+    source: Path,
+    target: Path,
+    out: Path,
+    config: AdaptConfig,
+    tell: Tell = lambda _: None,
+    should_stop: Asked = lambda: False,
+) -> dict[str, Any] | None:
+    """Adapts a run's embedding to another domain, or goes on with it.
+
+    Args:
+        run: folder of a finished run.
+        source: dataset that it learned from.
+        target: dataset of the other domain; the same one, where only the camera differs.
+        out: the run folder, in the end one of the adapted network.
+        config: settings.
+        tell: told one line an epoch.
+        should_stop: asked after every epoch.
+
+    Returns:
+        The content of results.json: localisation before, with the target's statistics alone, and after; None where it
+        was stopped before the end.
+
+    Raises:
+        DatasetError, RunError: something cannot be used.
+    """
+    trained = load_trained(run)
+    near, far = load_rooms(source), target_rooms(target, config)
+    headers = [read_header(folder)[0] for folder in (source, target)]
+    data = {name: digest_of(header) for name, header in zip(("source", "target"), headers, strict=True)}
+    with claimed(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        size = near.images.shape[3:]
+        learned = near.images[~near.test].reshape(-1, *size)
+        unlabelled = far.images[~far.test].reshape(-1, *far.images.shape[3:])
+        embedded = trained.embed(learned)
+        state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
+        epoch = adversarial_epoch(trained.network, critic, config)
+        on_device = jnp.asarray(unlabelled), jnp.asarray(embedded)
+        state, done = resumable_epochs(
+            out, "features", state, lambda learner, key: epoch(learner, *on_device, key), config.epochs,
+            config.seed, tell, should_stop,
+        )  # fmt: skip
+        if not done:
+            return None
+        variables = {"params": state.params, "batch_stats": state.batch_stats}
+        about = {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
+        adapted = save_trained(out, Trained(trained.network, variables, about))
+        fitted = target_statistics(trained, unlabelled, config.batch)
+        same = headers[0]["scenes"] == headers[1]["scenes"]
+        results = {
+            "target_images": len(unlabelled),
+            "nodes": "of the source" if same else "of the target",
+            "source": localisation_between(trained, near, trained, near),
+        }
+        for name, network in (("before", trained), ("statistics", fitted), ("after", adapted)):
+            nodes = (trained, near) if same else (network, far)
+            results[name] = localisation_between(*nodes, network, far)
+        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+        return results
+
+
+def digest_of(header: dict[str, Any]) -> str:
+    """Twelve digits that tell datasets apart, of their dataset.json."""
+    return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
+    """The room images of a dataset as the target's camera sees them."""
+    rooms = load_rooms(folder)
+    return dataclasses.replace(rooms, images=as_seen(rooms.images, preset(config.domain), ROOMS_STREAM))
+
+
+def localisation_between(
+    node_network: Trained, node_rooms: RoomImages, query_network: Trained, query_rooms: RoomImages
+) -> dict[str, Any]:
+    """Scores of queries of one domain on nodes of another, as `training.localisation` has them within one.
+
+    Training positions of `node_rooms` are nodes with all their level images; every third level image of the test
+    positions of `query_rooms` is a query. Scenes are those of both, by name; `mean` weighs them by queries.
+    """
+    level, rows, weights = PITCHES.index("level"), {}, []
+    scenes = [_scenes(rooms) for rooms in (node_rooms, query_rooms)]
+    for name in scenes[0]:
+        if name not in scenes[1]:
+            continue
+        nodes = scenes[0][name] & ~node_rooms.test
+        queries = scenes[1][name] & query_rooms.test
+        if not nodes.any() or not queries.any():
+            continue
+        shown, asked = node_rooms.images[nodes][:, level], query_rooms.images[queries][:, level, ::3]
+        embedded = node_network.embed(shown.reshape(-1, *shown.shape[2:])).reshape(*shown.shape[:2], -1)
+        each = asked.shape[1]
+        rows[name] = localisation_scores(
+            query_network.embed(asked.reshape(-1, *asked.shape[2:])),
+            np.repeat(query_rooms.xy_w[queries], each, 0),
+            np.repeat(query_rooms.label[queries], each),
+            embedded,
+            node_rooms.xy_w[nodes],
+            node_rooms.label[nodes],
+        )
+        weights.append(int(queries.sum()) * each)
+    if not rows:
+        raise RunError("source and target have no scene in common with positions for training and for testing")
+    keys = next(iter(rows.values()))
+    rows["mean"] = {k: float(np.average([r[k] for r in rows.values()], weights=weights)) for k in keys}
+    return {**rows, "queries": sum(weights)}
+
+
+def resumable_epochs(
+    out: Path,
+    name: str,
+    learner: Any,
+    epoch: Callable[[Any, jax.Array], tuple[Any, dict[str, jax.Array]]],
+    epochs: int,
+    seed: int,
+    tell: Tell,
+    should_stop: Asked,
+) -> tuple[Any, bool]:
+    """Epochs of one learner of a run folder; those that a checkpoint holds are not run again.
+
+    Args:
+        out: the run folder; `metrics.jsonl` there gets a line an epoch.
+        name: of the learner, of its checkpoint, and `phase` of its lines.
+        learner: as it starts.
+        epoch: learner and key to learner and means, `loss` among them.
+        epochs: in all.
+        seed: of the epochs' keys.
+        tell: told a line an epoch.
+        should_stop: asked after every epoch.
+
+    Returns:
+        The learner, and whether it is done.
+
+    Raises:
+        RunError: a damaged checkpoint, or a loss that is not finite.
+    """
+    path, metrics = out / f"checkpoint-{name}.msgpack", out / METRICS
+    saved = read_checkpoint(path)
+    first = 0
+    if saved is not None:
+        first, learner = saved["epoch"], restored(learner, saved["learner"], path)
+    if metrics.is_file():
+        lines = read_metrics(metrics)
+        kept = [line for line in lines if line["phase"] != name or line["epoch"] <= first]
+        write_text(metrics, "".join(json.dumps(line) + "\n" for line in kept))
+    keys, began = jax.random.fold_in(jax.random.PRNGKey(seed), 3), time.perf_counter()
+    for number in range(first, epochs):
+        started = time.perf_counter()
+        learner, means = epoch(learner, jax.random.fold_in(keys, number))
+        line = {"phase": name, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
+        now = time.perf_counter()
+        if not np.isfinite(line["loss"]):
+            raise RunError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning rate")
+        with open(metrics, "a") as file:
+            file.write(json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
+        state = {"epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}
+        with whole_file(path) as partial:
+            partial.write_bytes(flax.serialization.msgpack_serialize(jax.device_get(state)))
+        left = (now - began) / (number + 1 - first) * (epochs - number - 1)
+        scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
+        tell(f"{name}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
+        if should_stop():
+            return learner, False
+    return learner, True
+
+
+def _scenes(rooms: RoomImages) -> dict[str, np.ndarray]:
+    """Scene name -> rows."""
+    names = [rooms.names[label].rpartition("/")[0] for label in rooms.label]
+    return {name: np.array([n == name for n in names]) for name in dict.fromkeys(names)}
+
+
+def _optimisers(config: AdaptConfig):
+    # Less momentum than usual: both sides of the game change.
+    return optax.adam(config.learning_rate, b1=0.5), optax.adam(config.critic_learning_rate, b1=0.5)

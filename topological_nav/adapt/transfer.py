@@ -1,0 +1,236 @@
+"""A passage detector's four configurations in another domain, and a map of images collected there.
+
+| | not fine-tuned | fine-tuned on target images |
+|---|---|---|
+| fresh weights | A | B |
+| learned from the source | C | D |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from sklearn.metrics import confusion_matrix, f1_score
+
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import to_dict
+from interactive_nav_common.files import write_text
+from interactive_nav_common.versions import versions
+from topological_nav.adapt.adaptation import PASSAGES_STREAM, Asked, Tell, digest_of, resumable_epochs, target_rooms
+from topological_nav.adapt.config import AdaptConfig
+from topological_nav.config import PITCHES, DataConfig
+from topological_nav.data.dataset import headings, load_passages, read_header
+from topological_nav.data.domains import as_seen, preset
+from topological_nav.data.passages import balanced
+from topological_nav.errors import DatasetError, MapError, RunError
+from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
+from topological_nav.learn.localise import localisation_scores
+from topological_nav.learn.runs import RESULTS, claimed
+from topological_nav.learn.training import Trained, length_scores, load_trained, save_trained
+from topological_nav.maps.build import Built
+from topological_nav.maps.graph import assemble, lengths, near_pairs
+from topological_nav.scenes.space import free_space
+
+CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "D": (True, True)}
+"""Name -> whether the weights are the source's, and whether they are fine-tuned."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Labelled:
+    images: np.ndarray
+    free: np.ndarray
+    """[N, L] i32."""
+    scored: int
+
+
+def passage_configurations(
+    run: Path,
+    target: Path,
+    out: Path,
+    config: AdaptConfig,
+    tell: Tell = lambda _: None,
+    should_stop: Asked = lambda: False,
+) -> dict[str, Any] | None:
+    """Scores a passage detector in another domain, learned from the source or not, fine-tuned or not.
+
+    Args:
+        run: folder of a finished run of passages.
+        target: dataset; its training passages fine-tune, its test passages test, half of each free.
+        out: the run folder, in the end one of configuration D.
+        config: settings.
+        tell: told one line an epoch.
+        should_stop: asked after every epoch.
+
+    Returns:
+        The content of results.json; None where it was stopped before the end.
+
+    Raises:
+        DatasetError, RunError: something cannot be used.
+    """
+    trained = load_trained(run)
+    if trained.about["task"] != "passages":
+        raise RunError(f"{run}: was trained for '{trained.about['task']}', expected a run of 'train passages'")
+    learned, tested = _labelled(target, trained.about["lengths_m"], config)
+    header, _ = read_header(target)
+    about = {"run": trained.about["digest"][:12], "target": digest_of(header)}
+    with claimed(out, {"task": "transfer", **to_dict(config), **about}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
+        shape = (trained.about["data"]["height"], trained.about["data"]["width"])
+        fresh = make_learner(network, shape, tx, config.seed)
+        epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
+        images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free)
+        results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
+        for name, (from_source, tunes) in CONFIGURATIONS.items():
+            # A copy: an epoch gives its argument's memory away.
+            learner = jax.tree.map(jnp.array, _of(trained, tx) if from_source else fresh)
+            if tunes:
+                learner, done = resumable_epochs(
+                    out, name, learner, lambda state, key: epoch(state, images, labels, key), config.fine_tune_epochs,
+                    config.seed, tell, should_stop,
+                )  # fmt: skip
+                if not done:
+                    return None
+            variables = {"params": learner.params, "batch_stats": learner.batch_stats}
+            tuned = Trained(network, variables, trained.about)
+            results[name] = _scores(tuned, tested)
+            if name == "D":
+                about = {"adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
+                save_trained(out, dataclasses.replace(tuned, about={**trained.about, **about}))
+        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+        return results
+
+
+def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):
+    """A map of images collected in the target domain: its dataset's training positions, no image drawn for the map.
+
+    An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings.
+
+    Args:
+        scene_folder: the scene: for the plan that the map is compared with and drawn on.
+        target: dataset of it.
+        localiser_run: run folder of a network whose embedding localises.
+        detector_run: run folder of a passage detector.
+        config: settings.
+
+    Returns:
+        `build.Built`; its scores tell how held-out images of the target are localised on it.
+
+    Raises:
+        DatasetError, MapError, RunError: something cannot be used, or does not fit.
+    """
+    localiser, detector = load_trained(localiser_run), load_trained(detector_run)
+    if detector.about["task"] != "passages":
+        raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
+    scene = load_scene(scene_folder)
+    header, data = read_header(target)
+    index = next((i for i, s in enumerate(header["scenes"]) if s["digest"] == scene.digest), None)
+    if index is None:
+        names = ", ".join(s["name"] for s in header["scenes"])
+        raise DatasetError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
+    rooms = target_rooms(target, config)
+    mine = rooms.scene == index
+    nodes, held = mine & ~rooms.test, mine & rooms.test
+    level = rooms.images[:, PITCHES.index("level")]
+    shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
+    room = label - rooms.label[mine].min()
+    around = headings(data)
+
+    def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        if not len(edges):
+            return np.zeros(0)
+        turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
+        return detector.passage(shown[edges[:, 0], turn], lengths(xy, edges))
+
+    if not len(near_pairs(xy, config.edge_m)):
+        raise MapError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
+    embedded = localiser.embed(shown.reshape(-1, *shown.shape[2:])).reshape(*shown.shape[:2], -1)
+    judged = DataConfig(**{k: detector.about["data"][k] for k in ("passage_margin_m", "passage_points")})
+    about = {
+        "settings": to_dict(config),
+        "data": header["settings"],
+        "localiser": localiser.about["digest"],
+        "detector": detector.about["digest"],
+        "margin_m": judged.passage_margin_m,
+        "points": judged.passage_points,
+        "domain": to_dict(preset(config.domain)),
+    }
+    made = assemble(scene.name, scene.digest, xy, room, embedded, config.edge_m, probability, about)
+    space = free_space(scene, get_robot(data.robot).height_m)
+    free = space.segment_free(
+        xy[made.edges[:, 0]], xy[made.edges[:, 1]], judged.passage_points, judged.passage_margin_m
+    )
+    return Built(made, space, free, _map_scores(localiser, made, free, level[held][:, ::3], rooms, held, label, config))
+
+
+def _map_scores(localiser, made, free, asked, rooms, held, label, config: AdaptConfig) -> dict[str, Any]:
+    open_ = made.p >= config.passable
+    parts = made.open_parts(config.passable)
+    scores: dict[str, Any] = {
+        "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
+        "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
+        "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
+    }
+    if len(asked):
+        each = asked.shape[1]
+        found = localisation_scores(
+            localiser.embed(asked.reshape(-1, *asked.shape[2:])),
+            np.repeat(rooms.xy_w[held], each, 0),
+            np.repeat(rooms.label[held], each),
+            made.embeddings,
+            made.xy_w,
+            label,
+        )
+        scores["held-out images localised"] = (
+            f"nearest node {found['node']:.3f}, right room {found['room']:.3f}, "
+            f"median error {found['error_m']:.2f} m (least possible {found['least_error_m']:.2f} m)"
+        )
+    return scores
+
+
+def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[_Labelled, _Labelled]:
+    """Target images to learn from and to test, as many free as blocked, no source in both."""
+    passages = load_passages(target)
+    if list(passages.lengths_m) != list(lengths_m):
+        told = ",".join(f"{length:g}" for length in lengths_m)
+        raise DatasetError(
+            f"{target}: passages are labelled for {list(passages.lengths_m)} m, the detector judges {list(lengths_m)}; "
+            f"make it again with passage_lengths_m=[{told}]"
+        )
+    scored = passages.free[:, passages.scored]
+    images = as_seen(passages.images, preset(config.domain), PASSAGES_STREAM)
+    rng, parts = np.random.default_rng([config.seed, 4]), []
+    for held, most in ((False, config.fine_tune), (True, config.test)):
+        rows = balanced(np.flatnonzero(passages.test == held), scored, rng)
+        yes, no = (rng.permutation(rows[scored[rows] == label])[: most // 2] for label in (True, False))
+        rows = np.sort(np.concatenate([yes, no]))
+        if not len(rows):
+            what = "for testing" if held else "to learn from"
+            raise DatasetError(f"{target}: has no passages {what}; make it with more passage_sources or test_share")
+        parts.append(_Labelled(images[rows], passages.free[rows].astype(np.int32), passages.scored))
+    return parts[0], parts[1]
+
+
+def _of(trained: Trained, tx: optax.GradientTransformation) -> Learner:
+    params = trained.variables["params"]
+    return Learner(params, trained.variables["batch_stats"], tx.init(params))
+
+
+def _scores(trained: Trained, tested: _Labelled) -> dict[str, Any]:
+    logits = trained.logits(tested.images)
+    found, truth = (logits[:, tested.scored] > 0).astype(np.int32), tested.free[:, tested.scored]
+    return {
+        "accuracy": float((found == truth).mean()),
+        "macro_f1": float(f1_score(truth, found, average="macro")),
+        "confusion": confusion_matrix(truth, found, labels=[0, 1]).tolist(),
+        "lengths": length_scores(logits, tested.free, trained.about["lengths_m"]),
+    }

@@ -1,0 +1,1 @@
+"""Words in, files and pictures out: what `python -m topological_nav` runs."""

@@ -1,0 +1,1 @@
+"""Rooms and passages as datasets of images."""

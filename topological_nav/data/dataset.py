@@ -1,0 +1,372 @@
+"""Scene folders in, a dataset folder out, and back: room images around positions, and passage images.
+
+    DATASET/dataset.json           settings, scenes with digests and counts, versions
+            <scene>/plan.npz       rooms, positions and passages with labels: all that is decided before drawing
+            <scene>/rooms-000.npz  images of some positions: pitch by pitch, heading by heading
+            <scene>/passages-000.npz
+            preview.png            where the images were taken, and some of them
+
+What is decided depends on scene and settings only. Drawing goes file by file and skips those that exist.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.sensing.base import CameraPose, Lens
+from interactive_nav_common.config import to_dict
+from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.locks import alone_in
+from topological_nav.config import CameraConfig, DataConfig
+from topological_nav.data.passages import Passages, draw_passages, held_out
+from topological_nav.data.shards import ShardWriter, read_shards
+from topological_nav.errors import DatasetError, SpaceError, readable
+from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
+from topological_nav.scenes.rooms import Rooms, agreement, find_rooms, recorded_rooms
+from topological_nav.scenes.space import FreeSpace, free_space, spread
+from topological_nav.settings import overlaid
+
+FORMAT = 2
+"""Of the folder; raised whenever older datasets would be read wrongly."""
+Progress = Callable[[str, int, int], None]
+"""Called with what is drawn, images done and images in all."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ScenePlan:
+    """Where a scene's images are taken, with labels."""
+
+    rooms: Rooms
+    xy_w: np.ndarray
+    """[p, 2] m, positions of room images."""
+    room: np.ndarray
+    """[p] i32."""
+    test: np.ndarray
+    """[p] bool: for testing only."""
+    passages: Passages
+
+
+@dataclasses.dataclass(frozen=True)
+class RoomImages:
+    """Room images of a dataset: P positions, three pitches, K headings."""
+
+    images: np.ndarray
+    """[P, 3, K, H, W, 3] u8."""
+    label: np.ndarray
+    """[P] i32 room among all scenes' rooms."""
+    names: tuple[str, ...]
+    """Of the labels: scene/room."""
+    scene: np.ndarray
+    """[P] i32."""
+    xy_w: np.ndarray
+    """[P, 2] m."""
+    test: np.ndarray
+    """[P] bool."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PassageImages:
+    """Passage images of a dataset."""
+
+    images: np.ndarray
+    """[N, H, W, 3] u8."""
+    free: np.ndarray
+    """[N, L] bool, for each of `lengths_m`; never true after false."""
+    scene: np.ndarray
+    """[N] i32."""
+    test: np.ndarray
+    """[N] bool."""
+    lengths_m: tuple[float, ...]
+    """[L] ascending."""
+    scored: int
+    """Which of them passages are balanced on and detectors scored by."""
+
+
+def headings(config: DataConfig) -> np.ndarray:
+    """[K] rad: evenly about a position, from the world's x axis on."""
+    return 2 * np.pi * np.arange(config.headings) / config.headings
+
+
+def lens_of(config: CameraConfig, robot: RobotSpec) -> Lens:
+    """The lens of stored images."""
+    return Lens(config.width, config.height, config.fov_deg or robot.camera.fov_deg)
+
+
+def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
+    """Decides where a scene's images are taken.
+
+    Positions are drawn uniformly; of a room that has more than its share, those farthest from each other stay.
+
+    Raises:
+        SpaceError: too little free space.
+    """
+    rng = np.random.default_rng([config.seed, 2, int(scene.digest[:8], 16)])
+    known = recorded_rooms(scene.digest)
+    rooms = find_rooms(space, config.room_method, config.num_rooms, known, config.seed, config.clearance_m)
+    try:
+        drawn = space.sample(rng, config.positions, config.clearance_m)
+    except SpaceError as error:
+        raise SpaceError(f"{scene.path}: {error}") from None
+    label = rooms.of(drawn)
+    kept, test = [], []
+    for k in range(rooms.count):
+        mine = np.flatnonzero(label == k)
+        mine = mine[np.sort(spread(drawn[mine], config.max_per_room, rng))]
+        kept.append(mine)
+        test.append(held_out(len(mine), config.test_share, rng))
+    rows = np.concatenate(kept)
+    passages = draw_passages(space, rooms, config, rng)
+    return ScenePlan(rooms, drawn[rows], label[rows], np.concatenate(test), passages)
+
+
+def make_dataset(
+    scene_folders: Sequence[Path], out: Path, config: DataConfig, progress: Progress = lambda *_: None
+) -> dict[str, Any]:
+    """Makes a dataset, or what is missing of it.
+
+    Args:
+        scene_folders: scenes with different names.
+        out: the dataset's folder.
+        config: what is drawn.
+        progress: told after every file.
+
+    Returns:
+        The content of dataset.json.
+
+    Raises:
+        DatasetError: `out` holds a dataset of other scenes or settings.
+        SceneError, SpaceError: a scene cannot be used.
+        UserError: the engine is not installed.
+    """
+    scenes = [load_scene(folder) for folder in scene_folders]
+    need_engine(config.engine)
+    names = [scene.name for scene in scenes]
+    if len(set(names)) != len(names) or not names:
+        raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
+    robot = get_robot(config.robot)
+    spaces = [free_space(scene, robot.height_m) for scene in scenes]
+    plans = [plan_scene(scene, space, config) for scene, space in zip(scenes, spaces, strict=True)]
+    header = {
+        "format": FORMAT,
+        "settings": to_dict(config),
+        "fov_deg": lens_of(config, robot).fov_deg,
+        "camera_m": list(robot.camera.pos_m),
+        "scenes": [_about(scene, plan) for scene, plan in zip(scenes, plans, strict=True)],
+    }
+    with _claimed(out, header):
+        for scene, plan in zip(scenes, plans, strict=True):
+            (out / scene.name).mkdir(exist_ok=True)
+            with whole_file(out / scene.name / "plan.npz") as partial, open(partial, "wb") as file:
+                np.savez_compressed(file, **_plan_arrays(plan))  # type: ignore[arg-type]
+        total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
+        done = 0
+        with ShardWriter(config.quality) as writer:
+            for scene, plan in zip(scenes, plans, strict=True):
+                renderer: SceneRenderer | None = None
+                for path, poses in _shards(out / scene.name, plan, robot, config):
+                    done += sum(len(pose.pos_w) for pose in poses)
+                    told = functools.partial(progress, scene.name, done, total)
+                    if path.is_file():
+                        writer.skip(told)
+                        continue
+                    renderer = renderer or SceneRenderer(
+                        scene, lens_of(config, robot), config.supersample, config.engine
+                    )
+                    writer.put(path, draw_sheets(renderer, poses), told)
+        return header
+
+
+def draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
+    """Images [n_i, H, W, 3] of groups of cameras, drawn together: full batches."""
+    joined: Any = [np.concatenate(column) for column in zip(*map(_leaves, poses), strict=True)]
+    images = renderer.draw(CameraPose(*joined))
+    return np.split(images, np.cumsum([len(pose.pos_w) for pose in poses])[:-1])
+
+
+def _leaves(pose: CameraPose) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(pose.pos_w), np.asarray(pose.axes_w)
+
+
+def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
+    """Yields each file of a scene and the camera poses of its sheets."""
+    around, pitches = headings(config), np.asarray(config.pitches_rad)
+    for first in range(0, len(plan.xy_w), config.shard):
+        poses = []
+        for xy in plan.xy_w[first : first + config.shard]:
+            pitch, heading = np.meshgrid(pitches, around, indexing="ij")
+            poses.append(camera_pose(robot, xy, heading.ravel(), pitch.ravel()))
+        yield folder / f"rooms-{first // config.shard:03d}.npz", poses
+    each = 3 * config.headings
+    rows = np.arange(len(plan.passages))
+    for i, first in enumerate(range(0, len(rows), each * config.shard)):
+        poses = []
+        for begin in range(first, min(first + each * config.shard, len(rows)), each):
+            at = rows[begin : begin + each]
+            poses.append(camera_pose(robot, plan.passages.xy_w[at], plan.passages.heading_rad[at], np.zeros(len(at))))
+        yield folder / f"passages-{i:03d}.npz", poses
+
+
+def dataset_bytes(folder: Path) -> int:
+    """Bytes of a dataset's plans and images."""
+    return sum(path.stat().st_size for path in Path(folder).glob("*/*.npz"))
+
+
+def read_versioned(path: Path, version: int, none: str, again: str) -> dict[str, Any]:
+    """A folder's description, of this format.
+
+    Args:
+        path: its JSON file.
+        version: of the format.
+        none: what to say where there is no file.
+        again: what to do about one that cannot be used.
+
+    Raises:
+        DatasetError: missing, not readable, or of another format.
+    """
+    if not path.is_file():
+        raise DatasetError(none)
+    with readable(path, DatasetError, f"delete the folder and {again}"):
+        header = json.loads(path.read_text(encoding="utf-8"))
+        found = header["format"]
+    if found != version:
+        raise DatasetError(f"{path}: format {found}, expected {version}; {again}")
+    return header
+
+
+def read_header(folder: Path) -> tuple[dict[str, Any], DataConfig]:
+    """dataset.json and the settings in it.
+
+    Raises:
+        DatasetError: the folder is no dataset, or of another format.
+    """
+    path = Path(folder) / "dataset.json"
+    none = f"{folder}: is no dataset (no dataset.json); make one: python -m topological_nav data ..."
+    header = read_versioned(path, FORMAT, none, "make the dataset again")
+    return header, overlaid(DataConfig(), header["settings"], str(path))
+
+
+def load_rooms(folder: Path) -> RoomImages:
+    """The room images of a dataset.
+
+    Raises:
+        DatasetError: the dataset is missing, incomplete or damaged.
+    """
+    header, config = read_header(folder)
+    parts, first = [], 0
+    for index, scene in enumerate(header["scenes"]):
+        plan = load_plan(folder, scene["name"])
+        images = _read_all(Path(folder) / scene["name"], "rooms", len(plan.xy_w) * 3 * config.headings, config)
+        images = images.reshape(-1, 3, config.headings, config.height, config.width, 3)
+        parts.append((images, plan.room + first, np.full(len(plan.xy_w), index, np.int32), plan.xy_w, plan.test))
+        first += plan.rooms.count
+    images, label, scene_index, xy, test = (np.concatenate(column) for column in zip(*parts, strict=True))
+    names = tuple(f"{s['name']}/{k}" for s in header["scenes"] for k in range(s["rooms"]))
+    return RoomImages(images, label, names, scene_index, xy, test)
+
+
+def load_passages(folder: Path) -> PassageImages:
+    """The passage images of a dataset.
+
+    Raises:
+        DatasetError: the dataset is missing, incomplete or damaged.
+    """
+    header, config = read_header(folder)
+    parts = []
+    for index, scene in enumerate(header["scenes"]):
+        plan = load_plan(folder, scene["name"]).passages
+        images = _read_all(Path(folder) / scene["name"], "passages", len(plan), config)
+        parts.append((images, plan.free, np.full(len(plan), index, np.int32), plan.test))
+    images, free, scene, test = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return PassageImages(images, free, scene, test, config.passage_lengths_m, config.passage_column)
+
+
+def load_plan(folder: Path, scene: str) -> ScenePlan:
+    """Where a scene's images were taken.
+
+    Raises:
+        DatasetError: missing or damaged.
+    """
+    path = Path(folder) / scene / "plan.npz"
+    with readable(path, DatasetError, "run 'data' again"), np.load(path, allow_pickle=False) as arrays:
+        rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
+        passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
+        return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
+
+
+def _plan_arrays(plan: ScenePlan) -> dict[str, np.ndarray]:
+    passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
+    return {
+        "xy_w": plan.xy_w,
+        "room": plan.room,
+        "test": plan.test,
+        "cluster_xy_w": plan.rooms.points_w,
+        "cluster_label": plan.rooms.labels,
+        "how": np.asarray([plan.rooms.method, plan.rooms.chosen_by]),
+        **passages,
+    }
+
+
+def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
+    known = recorded_rooms(scene.digest)
+    return {
+        "name": scene.name,
+        "digest": scene.digest,
+        "split": scene.split,
+        "rooms": plan.rooms.count,
+        "rooms_chosen_by": plan.rooms.chosen_by,
+        "rooms_agreement": None if known is None else round(agreement(plan.rooms, known), 4),
+        "positions": len(plan.xy_w),
+        "test_positions": int(plan.test.sum()),
+        "passages": len(plan.passages),
+        "test_passages": int(plan.passages.test.sum()),
+    }
+
+
+@contextlib.contextmanager
+def _claimed(out: Path, header: dict[str, Any]) -> Iterator[None]:
+    """Writes dataset.json of a new dataset, or checks that the one there is the same; nobody else works there."""
+    with alone_in(out):
+        path = out / "dataset.json"
+        if path.is_file():
+            there, _ = read_header(out)
+            for name, value in header["settings"].items():
+                if name in there["settings"] and there["settings"][name] != value:
+                    raise DatasetError(
+                        f"{out}: the dataset there has {name} = {there['settings'][name]!r}, this one {value!r}; "
+                        "choose another folder or delete it"
+                    )
+            if there["scenes"] != header["scenes"]:
+                raise DatasetError(
+                    f"{out}: the dataset there is of {', '.join(s['name'] for s in there['scenes'])} as they were; "
+                    "the scenes differ: choose another folder or delete it"
+                )
+        else:
+            write_text(path, json.dumps(header, indent=1) + "\n")
+        yield
+
+
+def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.ndarray:
+    sheets = math.ceil(count / (3 * config.headings))
+    files = [folder / f"{kind}-{i:03d}.npz" for i in range(math.ceil(sheets / config.shard))]
+    missing = [path.name for path in files if not path.is_file()]
+    if missing:
+        raise DatasetError(f"{folder}: {missing[0]} is missing; the same 'data' command goes on where it stopped")
+    images = list(read_shards(files))
+    shape = (config.height, config.width, 3)
+    joined = np.concatenate(images) if images else np.zeros((0, *shape), np.uint8)
+    if joined.shape != (count, *shape):
+        raise DatasetError(
+            f"{folder}: {kind} are {joined.shape}, expected {(count, *shape)}; delete them and make again"
+        )
+    return joined

@@ -1,0 +1,1 @@
+"""The expert's drives, and the local policy that learns from them."""

@@ -1,0 +1,394 @@
+"""Scene folders in, a folder of the expert's drives out, and back: poses, commands, contacts, and what the robot saw.
+
+    DRIVES/drives.json             settings, scenes with digests, counts, versions of the format
+           plan.npz                all drives that were decided on: routes, starts, split
+           batch-000.npz           what became of some of them, in the order of the plan
+           <scene>/images-000.npz  images of some of a scene's kept drives, one for each control step
+           preview.png             the drives on the floor plans, and images of some
+
+Kept are drives that reached their last node and touched nothing: then the furniture still stands at rest, as it is
+drawn. What is decided depends on scenes and settings only. Simulating and drawing skip files that exist.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.config import to_dict
+from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.locks import alone_in
+from topological_nav.config import DataConfig, DriveConfig, MapConfig
+from topological_nav.data.dataset import draw_sheets, lens_of, read_versioned
+from topological_nav.data.shards import ShardWriter, read_shards
+from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
+from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
+from topological_nav.drives.routes import draw_routes, drivable
+from topological_nav.errors import DatasetError, SpaceError, readable
+from topological_nav.maps.graph import place_nodes
+from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
+from topological_nav.scenes.rooms import find_rooms, recorded_rooms
+from topological_nav.scenes.space import FreeSpace, free_space
+from topological_nav.settings import overlaid
+
+FORMAT = 1
+"""Of the folder; raised whenever older ones would be read wrongly."""
+LIMIT_M = 8.0
+"""Fields of the way left reach so far; beyond they rise with the distance."""
+Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class DrivePlan:
+    """All drives of a folder, scene by scene."""
+
+    tasks: Tasks
+    test: np.ndarray
+    """[n] bool."""
+    terrain: Terrain
+    spaces: tuple[FreeSpace, ...]
+    nodes_w: tuple[np.ndarray, ...]
+    """[N, 2] m, a scene."""
+    edges: tuple[np.ndarray, ...]
+    """[E, 2] i32 driven along, a scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Drives:
+    """What the expert did: n drives, F control steps in all, drive after drive."""
+
+    scene: np.ndarray
+    """[n] i32."""
+    test: np.ndarray
+    """[n] bool."""
+    first: np.ndarray
+    """[n + 1] where each drive's steps begin."""
+    pose_w: np.ndarray
+    """[F, 3] f32 x, y (m) and heading at the beginning of each step."""
+    command: np.ndarray
+    """[F, 2] f32 m/s and rad/s."""
+    touching: np.ndarray
+    """[F, 2] bool: furniture, a wall was touched in the step."""
+    gap_m: np.ndarray
+    """[F] f32 that the expert expected to keep."""
+    reached: np.ndarray
+    """[n] bool."""
+    broken: np.ndarray
+    """[n] bool: physics failed."""
+    goal_w: np.ndarray
+    """[n, 2] m, the last node."""
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    def rows(self, which: np.ndarray | int) -> np.ndarray:
+        """[f] indices of the control steps of a drive, or of several, drive after drive."""
+        return np.concatenate([np.arange(int(self.first[k]), int(self.first[k + 1])) for k in np.atleast_1d(which)])
+
+    @property
+    def steps(self) -> np.ndarray:
+        """[n] control steps."""
+        return np.diff(self.first)
+
+    @property
+    def touched(self) -> np.ndarray:
+        """[n] bool: anything was touched on the way."""
+        sums = np.concatenate([[0], np.cumsum(self.touching.any(1))])
+        return sums[self.first[1:]] > sums[self.first[:-1]]
+
+    @property
+    def kept(self) -> np.ndarray:
+        """[n] bool: reached its last node, touched nothing: drawn and learned from."""
+        return self.reached & ~self.broken & ~self.touched
+
+
+def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
+    """Decides on all drives.
+
+    Args:
+        scenes: with different names.
+        config: of the drives.
+
+    Raises:
+        SpaceError: a scene in which no two nodes are joined.
+    """
+    robot = get_robot(config.robot)
+    spaces, fields, nodes, edges, parts, tests = [], [], [], [], [], []
+    fields_before = 0
+    for index, scene in enumerate(scenes):
+        space = free_space(scene, robot.height_m)
+        rooms = find_rooms(space, "gmm", None, recorded_rooms(scene.digest), config.seed, DataConfig().clearance_m)
+        xy, _ = place_nodes(space, rooms, MapConfig(edge_m=config.edge_m), robot.body_width_m / 2, 50)
+        field = way_field(space, xy, config, LIMIT_M)
+        joined = drivable(space, xy, field, config)
+        rng = np.random.default_rng([config.seed, 6, int(scene.digest[:8], 16)])
+        try:
+            routes = draw_routes(space, xy, joined, config, rng)
+        except SpaceError as error:
+            raise SpaceError(f"{scene.path}: {error}") from None
+        ahead = routes.nodes[:, 1:]
+        parts.append(
+            Tasks(
+                np.full(config.drives, index, np.int32),
+                ahead + fields_before,
+                xy[ahead],
+                routes.legs,
+                routes.start_xy_w,
+                routes.start_yaw_rad,
+            )
+        )
+        tests.append(routes.test)
+        spaces.append(space)
+        fields.append(field)
+        nodes.append(xy)
+        edges.append(joined)
+        fields_before += len(xy)
+    tasks = Tasks(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Tasks)))
+    terrain = _terrain(spaces, fields)
+    return DrivePlan(tasks, np.concatenate(tests), terrain, tuple(spaces), tuple(nodes), tuple(edges))
+
+
+def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terrain:
+    rows = max(space.clearance_m.shape[0] for space in spaces)
+    columns = max(space.clearance_m.shape[1] for space in spaces)
+
+    def padded(grids: Sequence[np.ndarray], mode: str) -> list[np.ndarray]:
+        sizes = [[(0, rows - g.shape[-2]), (0, columns - g.shape[-1])] for g in grids]
+        return [np.pad(g, [(0, 0)] * (g.ndim - 2) + s, mode=mode) for g, s in zip(grids, sizes, strict=True)]  # type: ignore[call-overload]
+
+    return Terrain(
+        jnp.asarray(np.stack(padded([s.clearance_m for s in spaces], "constant")), jnp.float32),
+        jnp.asarray([s.origin_w for s in spaces], jnp.float32),
+        jnp.asarray([s.resolution_m for s in spaces], jnp.float32),
+        jnp.asarray(np.concatenate(padded(fields, "edge")), jnp.float32),
+    )
+
+
+def simulate_drives(
+    scene_folders: Sequence[Path], out: Path, config: DriveConfig, progress: Progress = lambda *_: None
+) -> Drives:
+    """Drives all drives, or those that are missing.
+
+    Args:
+        scene_folders: scenes with different names.
+        out: the folder.
+        config: of the drives.
+        progress: told the number of drives that have ended, and of all.
+
+    Raises:
+        DatasetError: `out` holds drives of other scenes or settings.
+        SceneError, SpaceError: a scene cannot be used.
+        UserError: the engine that will draw them is not installed.
+    """
+    scenes = [load_scene(folder) for folder in scene_folders]
+    need_engine(config.engine)
+    names = [scene.name for scene in scenes]
+    if len(set(names)) != len(names) or not names:
+        raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
+    robot = get_robot(config.robot)
+    header = {
+        "format": FORMAT,
+        "settings": to_dict(config),
+        "fov_deg": lens_of(config, robot).fov_deg,
+        "camera_m": list(robot.camera.pos_m),
+        "scenes": [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes],
+    }
+    with _claimed(out, header):
+        total = len(scenes) * config.drives
+        files = [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
+        if all(path.is_file() for path in (*files, out / "plan.npz")):
+            progress("drives", total, total)
+            return load_drives(out)
+        plan = plan_drives(scenes, config)
+        with whole_file(out / "plan.npz") as partial, open(partial, "wb") as file:
+            last = plan.tasks.goals_w[:, -1]
+            np.savez_compressed(file, scene=plan.tasks.scene, test=plan.test, goal_w=last)
+        fleet: Fleet | None = None
+        for i, path in enumerate(files):
+            mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
+            if not path.is_file():
+                fleet = fleet or Fleet(make_env(scene_folders, config), plan.terrain, config)
+                # Padded by its last drive: one size, one program.
+                rows = np.minimum(np.arange(i * config.batch, (i + 1) * config.batch), total - 1)
+                before, most = int(mine[0]), len(mine) - 1  # the padding's ends are no news
+
+                def told(ended: int, before: int = before, most: int = most) -> None:
+                    progress("drives", before + min(ended, most), total)
+
+                driven = fleet.drive(plan.tasks.take(rows), told)
+                _write_batch(path, driven, len(mine))
+            progress("drives", int(mine[-1]) + 1, total)
+        return load_drives(out)
+
+
+def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = lambda *_: None) -> None:
+    """Draws what the robot saw on the kept drives, or what is missing of it.
+
+    Args:
+        scene_folders: as they were driven in, in the same order.
+        out: a folder whose drives have been simulated.
+        progress: told what is drawn, images done and images in all.
+
+    Raises:
+        DatasetError: the folder cannot be used, or a scene has changed since.
+    """
+    header, config = read_drives_header(out)
+    drives, robot = load_drives(out), get_robot(config.robot)
+    total, done = int(drives.steps[drives.kept].sum()), 0
+    with ShardWriter(config.quality) as writer:
+        for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
+            (out / about["name"]).mkdir(exist_ok=True)
+            renderer: SceneRenderer | None = None
+            for path, rows in _image_files(out, about["name"], index, drives, config):
+                done += int(drives.steps[rows].sum())
+                told = functools.partial(progress, about["name"], done, total)
+                if path.is_file():
+                    writer.skip(told)
+                    continue
+                if renderer is None:
+                    scene = load_scene(scene_folder)
+                    if scene.digest != about["digest"]:
+                        raise DatasetError(f"{scene_folder}: is not the scene that was driven in; drive again")
+                    renderer = SceneRenderer(scene, lens_of(config, robot), config.supersample, config.engine)
+                poses = [drives.pose_w[drives.rows(k)] for k in rows]
+                cameras = [camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p))) for p in poses]
+                writer.put(path, draw_sheets(renderer, cameras), told)
+
+
+def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig):
+    """Yields each file of a scene's images and the drives [k] in it."""
+    mine = np.flatnonzero(drives.kept & (drives.scene == index))
+    for i, first in enumerate(range(0, len(mine), config.shard)):
+        yield out / name / f"images-{i:03d}.npz", mine[first : first + config.shard]
+
+
+def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields the kept drives of a folder, some at a time: indices [k] among all, images [F, H, W, 3] u8 of their steps.
+
+    Raises:
+        DatasetError: images are missing or damaged.
+    """
+    header, config = read_drives_header(folder)
+    drives = load_drives(folder)
+    files = [
+        part
+        for index, about in enumerate(header["scenes"])
+        for part in _image_files(Path(folder), about["name"], index, drives, config)
+    ]
+    for path, _ in files:
+        if not path.is_file():
+            raise DatasetError(f"{path} is missing; the same 'data --drives' command goes on where it stopped")
+    for (path, rows), images in zip(files, read_shards([path for path, _ in files]), strict=True):
+        shape = (int(drives.steps[rows].sum()), config.height, config.width, 3)
+        if images.shape != shape:
+            raise DatasetError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
+        yield rows, images
+
+
+def read_drives_header(folder: Path) -> tuple[dict[str, Any], DriveConfig]:
+    """drives.json and the settings in it.
+
+    Raises:
+        DatasetError: the folder holds no drives, or of another format.
+    """
+    path = Path(folder) / "drives.json"
+    none = f"{folder}: holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE..."
+    header = read_versioned(path, FORMAT, none, "drive again")
+    return header, overlaid(DriveConfig(), header["settings"], str(path))
+
+
+def load_drives(folder: Path) -> Drives:
+    """All drives of a folder, kept or not.
+
+    Raises:
+        DatasetError: missing, incomplete or damaged.
+    """
+    folder = Path(folder)
+    header, config = read_drives_header(folder)
+    total = len(header["scenes"]) * config.drives
+    parts = []
+    for i in range(-(-total // config.batch)):
+        path = folder / f"batch-{i:03d}.npz"
+        if not path.is_file():
+            raise DatasetError(f"{path} is missing; the same 'data --drives' command goes on where it stopped")
+        parts.append(_read(path))
+    plan = _read(folder / "plan.npz")
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    first = np.concatenate([[0], np.cumsum(joined.pop("steps"))])
+    return Drives(scene=plan["scene"], test=plan["test"], goal_w=plan["goal_w"], first=first, **joined)
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    remedy = "delete it and run 'data --drives' again"
+    with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def _write_batch(path: Path, driven: Driven, count: int) -> None:
+    """Writes the first drives of a batch, without what came after their ends."""
+    on = np.arange(driven.pose_w.shape[1]) < driven.steps[:count, None]
+    arrays = {name: getattr(driven, name)[:count][on] for name in ("pose_w", "command", "touching", "gap_m")}
+    arrays |= {name: getattr(driven, name)[:count] for name in ("steps", "reached", "broken")}
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def summary(drives: Drives) -> dict[str, float]:
+    """Counts, success and contacts.
+
+    Returns:
+        `drives`; `reached`, `touched` and `kept` as shares of them; `contact_s`: seconds in contact a drive;
+        `seconds`: mean duration of those that reached; `m_s`: mean speed; `turning`: share of their steps that turn by
+        an eighth of a radian a second or more.
+    """
+    going = np.repeat(drives.kept, drives.steps)
+    return {
+        "drives": len(drives),
+        "reached": float(drives.reached.mean()),
+        "touched": float(drives.touched.mean()),
+        "kept": float(drives.kept.mean()),
+        "contact_s": float(drives.touching.any(1).sum() * CONTROL_S / len(drives)),
+        "seconds": float(drives.steps[drives.reached].mean() * CONTROL_S) if drives.reached.any() else 0.0,
+        "m_s": float(drives.command[going, 0].mean()) if going.any() else 0.0,
+        "turning": float((np.abs(drives.command[going, 1]) >= 0.125).mean()) if going.any() else 0.0,
+    }
+
+
+def drives_bytes(folder: Path) -> int:
+    """Bytes of a folder's drives and images."""
+    return sum(path.stat().st_size for path in Path(folder).rglob("*.npz"))
+
+
+@contextlib.contextmanager
+def _claimed(out: Path, header: dict[str, Any]) -> Iterator[None]:
+    """Writes drives.json of a new folder, or checks that the one there is the same; nobody else works there."""
+    with alone_in(out):
+        path = out / "drives.json"
+        if path.is_file():
+            there, _ = read_drives_header(out)
+            for name, value in header["settings"].items():
+                if there["settings"].get(name) != value:
+                    raise DatasetError(
+                        f"{out}: the drives there have {name} = {there['settings'].get(name)!r}, these {value!r}; "
+                        "choose another folder or delete it"
+                    )
+            if [(s["name"], s["digest"]) for s in there["scenes"]] != [
+                (s["name"], s["digest"]) for s in header["scenes"]
+            ]:
+                raise DatasetError(
+                    f"{out}: the drives there are in {', '.join(s['name'] for s in there['scenes'])} as they were; "
+                    "the scenes differ: choose another folder or delete it"
+                )
+        else:
+            write_text(path, json.dumps(header, indent=1) + "\n")
+        yield

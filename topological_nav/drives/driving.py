@@ -1,0 +1,122 @@
+"""What drives along an edge of the map: images in, velocities out, ten times a second."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from topological_nav.drives.imitation import fresh_params, load_networks
+from topological_nav.drives.policy import Forward, Policy
+from topological_nav.errors import RunError
+from topological_nav.learn.runs import read_description, read_weights
+from topological_nav.learn.training import Trained
+
+
+class LocalPolicy(Protocol):
+    """Drives by images alone; what it remembers travels in a state that belongs to the caller."""
+
+    def start(self, batch: int) -> Any:
+        """Hidden state of `batch` fresh runs."""
+        ...
+
+    def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """images (B, H, W, 3) uint8 level, straight ahead -> new state, linear (B,) m/s, angular (B,) rad/s."""
+        ...
+
+
+class TrainedPolicy:
+    """A `LocalPolicy` that was learned: at each step the likeliest class of either velocity."""
+
+    def __init__(self, policy: Policy, variables: dict[str, Any], about: dict[str, Any], networks: Any):
+        """Takes what `load_policy` read; compiles at the first step of each batch size."""
+        self.about: dict[str, Any] = about
+        """Content of network.json."""
+        self._networks: tuple[Trained, Trained] = networks
+        self._policy = policy
+        data = self._networks[0].about["data"]
+        self._shape = (data["height"], data["width"], 3)
+        weights = {"policy": variables, "embedders": [n.variables for n in self._networks]}
+        self._weights = jax.tree.map(jnp.asarray, weights)
+        self._step = jax.jit(self._stepped)
+
+    def start(self, batch: int) -> Any:
+        """See `LocalPolicy`."""
+        fresh = np.zeros((batch, self._policy.hidden), np.float32)
+        return fresh, fresh.copy()
+
+    def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """See `LocalPolicy`.
+
+        Raises:
+            RunError: images of another size than it learned from.
+        """
+        if images.shape[1:] != self._shape:
+            raise RunError(f"images are {images.shape[1:]}, expected {self._shape}, the size that it learned from")
+        state, (linear, angular) = jax.device_get(self._step(self._weights, state, jnp.asarray(images)))
+        return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
+
+    def _stepped(self, weights, state, images):
+        parts = [
+            network.network.apply(variables, images, method="embed")
+            for network, variables in zip(self._networks, weights["embedders"], strict=True)
+        ]
+        scale = weights["policy"]["scale"]
+        x = (jnp.concatenate(parts, -1) - scale["mean"]) / scale["deviation"]  # type: ignore[arg-type]
+        state, logits = self._policy.apply({"params": weights["policy"]["params"]}, state, x)  # type: ignore[misc]
+        return state, tuple(one.argmax(-1) for one in logits)
+
+
+def load_policy(
+    run_folder: Path | str, localiser: Path | str | None = None, detector: Path | str | None = None
+) -> TrainedPolicy:
+    """The policy of a finished run.
+
+    Args:
+        run_folder: of `train policy`, or an export of it.
+        localiser: run folder of the room classifier that embeds its images; None: where it was when it learned, seen
+            from the run folder.
+        detector: the same, of the passage detector.
+
+    Raises:
+        RunError: the run is not finished or damaged, or the networks are neither those that it learned with nor
+            adapted from them.
+    """
+    run = Path(run_folder)
+    about = read_description(run, "policy", "policy")
+    if about["task"] != "policy":
+        raise RunError(f"{run}: was trained for '{about['task']}', expected a run of 'train policy'")
+    recorded = [run / network["run"] for network in about["networks"]]
+    paths = [Path(given or there) for given, there in zip((localiser, detector), recorded, strict=True)]
+    networks = load_networks(*paths)
+    for path, network, learned in zip(paths, networks, about["networks"], strict=True):
+        if learned["digest"] not in (network.about["digest"], network.about.get("adapted_from")):
+            raise RunError(f"{path}: is not the network that {run} learned with; train the policy again")
+    policy = Policy(about["hidden"], about["projection"], len(about["linear_m_s"]), len(about["angular_rad_s"]))
+    width = about["width"]
+    template = {
+        "params": fresh_params(policy, Forward(1), width, 0)["policy"],
+        "scale": {"mean": jnp.zeros(width), "deviation": jnp.ones(width)},
+    }
+    return TrainedPolicy(policy, read_weights(run, template, about), about, networks)
+
+
+def load_policy_beside(
+    run_folder: Path | str, localiser: tuple[Path, Trained], detector: tuple[Path, Trained]
+) -> TrainedPolicy:
+    """The policy of a finished run, which sees through a navigator's networks where these are adapted ones.
+
+    Args:
+        run_folder: of `train policy`.
+        localiser: the navigator's run folder and network.
+        detector: the same.
+
+    Raises:
+        RunError: see `load_policy`.
+    """
+    return load_policy(
+        run_folder, *(run if "adapted_from" in network.about else None for run, network in (localiser, detector))
+    )

@@ -1,0 +1,283 @@
+"""Maps, a scan and where to go in, velocities out: the expert that the local policy learns from.
+
+Pure functions of one robot, for `jax.vmap`. A global path and a local planner in one, after the global dynamic window
+approach (Brock and Khatib 1999): each node of the graph has a field of the way that is left to it round walls and
+furniture, and of the velocities that the robot can reach within a control period (dynamic window: Fox, Burgard and
+Thrun 1997) that one wins which leads it down the field, turns it along the field and keeps its footprint away from
+what the lidar sees and the map holds. The map adds what a planar scan misses, such as table tops; before what only the
+scan sees, in the middle of its way, the robot stops, because no way round is planned.
+"""
+
+from __future__ import annotations
+
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+from scipy.sparse.csgraph import dijkstra
+
+from interactive_nav.geodesic import STENCIL, crossed_cells
+from topological_nav.config import ExpertConfig
+from topological_nav.scenes.space import FreeSpace
+
+CONTROL_S = 0.1
+"""Control period."""
+REFUSED = 100.0
+"""Cost of a gap of 0 where `margin_m` is wanted; the least bad velocity wins where none keeps it."""
+_SLOPE_M = 0.1
+"""A field's direction is read from points this far apart on each side."""
+_SLOW = 0.02
+"""Weight of the forward velocity as such: decides between equals."""
+
+
+@flax.struct.dataclass
+class Terrain:
+    """What the expert knows of S scenes and G nodes, padded alike."""
+
+    clearance_m: jax.Array
+    """[S, rows, columns] f32 distance to the nearest obstacle; 0 where blocked."""
+    origin_w: jax.Array
+    """[S, 2] f32 m."""
+    resolution_m: jax.Array
+    """[S] f32."""
+    to_go_m: jax.Array
+    """[G, rows, columns] f32 way left to each node, finite everywhere."""
+
+
+def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit_m: float) -> np.ndarray:
+    """The way left to goals from everywhere, by Dijkstra's algorithm over the 32 moves of the environment's geodesic.
+
+    A metre along obstacles counts for up to 1 + `near_cost`. Cells that the robot's middle cannot be in take the value
+    of the nearest cell that it can be in and four times the distance there; so does what is farther than the limit.
+
+    Args:
+        space: of the scene.
+        goals_w: [G, 2] m; the nearest cell with room stands for each.
+        config: radius and costs.
+        limit_m: what is farther is not computed.
+
+    Returns:
+        [G, rows, columns] f32, m. Infinite nowhere: a goal without any room around it has a field of distances to it.
+    """
+    room = np.maximum(space.clearance_m - config.radius_m, 0.0)
+    free = space.clearance_m >= config.radius_m
+    rows, columns = free.shape
+    goals_w = np.asarray(goals_w, float)
+    if not free.any():
+        c, r = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+        xy = np.asarray(space.origin_w) + np.stack([c, r], -1) * space.resolution_m
+        return np.linalg.norm(xy - goals_w[:, None, None], axis=-1).astype(np.float32)
+    cost = 1.0 + config.near_cost * np.clip(1.0 - room / config.near_m, 0.0, 1.0)
+    graph = _lattice(free, cost, space.resolution_m)
+    _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
+    cell = np.floor((goals_w - space.origin_w) / space.resolution_m).astype(int)
+    column, row = np.clip(cell[:, 0], 0, columns - 1), np.clip(cell[:, 1], 0, rows - 1)
+    source = nearest[0][row, column] * columns + nearest[1][row, column]
+    far = dijkstra(graph, directed=False, indices=source, limit=limit_m).reshape(-1, rows, columns)
+    out = np.empty(far.shape, np.float32)
+    for i, field in enumerate(far):
+        known = np.isfinite(field)
+        away, at = scipy.ndimage.distance_transform_edt(~known, return_indices=True)  # type: ignore[misc]
+        out[i] = field[at[0], at[1]] + 4.0 * space.resolution_m * np.asarray(away)
+    return out
+
+
+def _lattice(free: np.ndarray, cost: np.ndarray, step_m: float) -> scipy.sparse.csr_matrix:
+    """Undirected graph of cells: a move is there where every cell that it crosses is free, and costs their mean."""
+    rows, columns = free.shape
+    index = np.arange(rows * columns).reshape(rows, columns)
+    pad = 3
+    open_, price = np.pad(free, pad), np.pad(cost, pad)
+    first, second, weight = [], [], []
+    for dr, dc in STENCIL:
+        if (dr, dc) < (0, 0):
+            continue  # the other way is the same edge
+        ok, mean = np.ones(free.shape, bool), np.zeros(free.shape)
+        cells = crossed_cells((dr, dc))
+        for r, c in cells:
+            part = (slice(pad + r, pad + r + rows), slice(pad + c, pad + c + columns))
+            ok &= open_[part]
+            mean += price[part] / len(cells)
+        at = np.nonzero(ok)
+        first.append(index[at])
+        second.append(index[at[0] + dr, at[1] + dc])
+        weight.append(step_m * math.hypot(dr, dc) * mean[at])
+    entries = (np.concatenate(weight), (np.concatenate(first), np.concatenate(second)))
+    return scipy.sparse.csr_matrix(entries, shape=(rows * columns,) * 2)
+
+
+def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: jax.Array) -> jax.Array:
+    """[...] bilinear values of a grid [rows, columns] of cell centres at points [..., 2]; outside, of its rim."""
+    rows, columns = grid.shape
+    u = (xy_w - origin_w) / resolution_m - 0.5
+    u = jnp.clip(u, 0.0, jnp.asarray([columns - 1.001, rows - 1.001]))
+    low = jnp.floor(u).astype(jnp.int32)
+    f, c, r = u - low, low[..., 0], low[..., 1]
+    below = grid[r, c] * (1 - f[..., 0]) + grid[r, c + 1] * f[..., 0]
+    above = grid[r + 1, c] * (1 - f[..., 0]) + grid[r + 1, c + 1] * f[..., 0]
+    return below * (1 - f[..., 1]) + above * f[..., 1]
+
+
+def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Array]:
+    """Velocities that can be reached within a control period: linear [C] and angular [C], every pair of a lattice.
+
+    What of the lattice is out of reach is brought as near as can be reached.
+
+    Args:
+        velocity: [2] commanded last, m/s and rad/s.
+        config: limits and counts.
+    """
+
+    def around(now, change, lattice):
+        return jnp.clip(lattice, now - change, now + change)
+
+    most = config.angular_rad_s
+    v = jnp.linspace(0.0, config.linear_m_s, config.linear_samples)
+    w = jnp.linspace(-most, most, config.angular_samples)
+    v = around(velocity[0], config.acceleration_m_s2 * CONTROL_S, v)
+    w = around(velocity[1], config.angular_acceleration_rad_s2 * CONTROL_S, w)
+    pairs = jnp.stack(jnp.meshgrid(v, w, indexing="ij"), -1).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array:
+    """[C, K, 3] poses x, y (m) and yaw in the frame where constant velocities [C] begin, after times [K]."""
+    turn = angular[:, None] * times_s
+    length = linear[:, None] * times_s
+    small = jnp.abs(turn) < 1e-4
+    safe = jnp.where(small, 1.0, turn)
+    along = jnp.where(small, 1.0, jnp.sin(safe) / safe)
+    aside = jnp.where(small, turn / 2, (1.0 - jnp.cos(safe)) / safe)
+    return jnp.stack([length * along, length * aside, turn], -1)
+
+
+def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.Array:
+    """[...] m from a rectangle at poses [..., 3] to the nearest of points [R, 2]; 0 inside, infinite without points.
+
+    Args:
+        poses_b: x, y, yaw of its middle.
+        points_b: infinite where a beam met nothing.
+        half_m: [2] half its length and width.
+    """
+    cos, sin = jnp.cos(poses_b[..., 2])[..., None], jnp.sin(poses_b[..., 2])[..., None]
+    met = jnp.isfinite(points_b).all(-1)
+    dx = jnp.where(met, points_b[:, 0], 0.0) - poses_b[..., :1]
+    dy = jnp.where(met, points_b[:, 1], 0.0) - poses_b[..., 1:2]
+    x = jnp.maximum(jnp.abs(cos * dx + sin * dy) - half_m[0], 0.0)
+    y = jnp.maximum(jnp.abs(cos * dy - sin * dx) - half_m[1], 0.0)
+    return jnp.sqrt(jnp.where(met, x * x + y * y, jnp.inf).min(-1))
+
+
+def outline(half_m: jax.Array) -> jax.Array:
+    """[8, 2] corners and middles of the sides of a rectangle about the origin."""
+    signs = jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y], jnp.float32)
+    return signs * half_m
+
+
+def moved(pose: jax.Array, by: jax.Array) -> jax.Array:
+    """[..., 3] poses given in the frame of a pose [3], in that pose's own frame of reference."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    x, y = by[..., 0], by[..., 1]
+    return jnp.stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, pose[2] + by[..., 2]], -1)
+
+
+def command(
+    terrain: Terrain,
+    scene: jax.Array,
+    goal: jax.Array,
+    pose_w: jax.Array,
+    velocity: jax.Array,
+    points_b: jax.Array,
+    half_m: jax.Array,
+    config: ExpertConfig,
+) -> tuple[jax.Array, jax.Array]:
+    """The velocities to command now.
+
+    Args:
+        terrain: of all scenes.
+        scene: [] i32.
+        goal: [] i32 node to drive to.
+        pose_w: [3] x, y (m), yaw.
+        velocity: [2] commanded last, m/s and rad/s.
+        points_b: [R, 2] where the beams end, robot frame; infinite where nothing is met.
+        half_m: [2] half the footprint's length and width.
+        config: of the expert.
+
+    Returns:
+        [2] linear (m/s) and angular (rad/s), and the gap [] (m) that they keep until the horizon.
+    """
+    linear, angular = window(velocity, config)
+    times = config.horizon_s * (jnp.arange(config.horizon_steps) + 1.0) / config.horizon_steps
+    ways_b = arcs(linear, angular, times)
+    ways_w = moved(pose_w, ways_b)
+    origin, resolution = terrain.origin_w[scene], terrain.resolution_m[scene]
+    seen = scan_gap(ways_b, points_b, half_m)
+    rim = outline(half_m)
+    cos, sin = jnp.cos(ways_w[..., 2])[..., None], jnp.sin(ways_w[..., 2])[..., None]
+    x = ways_w[..., :1] + cos * rim[:, 0] - sin * rim[:, 1]
+    y = ways_w[..., 1:2] + sin * rim[:, 0] + cos * rim[:, 1]
+    known = sample(terrain.clearance_m[scene], origin, resolution, jnp.stack([x, y], -1)).min(-1)
+    gap = jnp.minimum(seen, known).min(-1)
+    left, end = _left(terrain.to_go_m[goal], origin, resolution, ways_w, linear, config)
+    heading = _fall(terrain.to_go_m[goal], origin, resolution, end[:, :2])
+    turn = jnp.abs(wrapped(heading - end[:, 2])) / jnp.pi
+    cost = (
+        config.weigh_progress * left / (config.linear_m_s * config.horizon_s)
+        + config.weigh_heading * turn
+        + config.weigh_gap * jnp.clip(1.0 - gap / config.caution_m, 0.0, 1.0)
+        + REFUSED * jnp.clip(1.0 - gap / max(config.margin_m, 1e-6), 0.0, 1.0)
+        - _SLOW * linear / config.linear_m_s
+    )
+    best = jnp.argmin(cost)
+    return jnp.stack([linear[best], angular[best]]), gap[best]
+
+
+def _left(
+    field: jax.Array,
+    origin: jax.Array,
+    resolution: jax.Array,
+    ways_w: jax.Array,
+    linear: jax.Array,
+    config: ExpertConfig,
+) -> tuple[jax.Array, jax.Array]:
+    """Way left [C] at the ends of ways [C, K, 3], and the poses [C, 3] where it is read.
+
+    A way past the goal ends there, and what it drives on counts as if it led farther: nobody stops at a node.
+    """
+    values = sample(field, origin, resolution, ways_w[..., :2])
+    steps = values.shape[1]
+    near = values < config.reached_m
+    at = jnp.where(near.any(1), near.argmax(1), steps - 1)
+    rows = jnp.arange(len(values))
+    beyond = linear * config.horizon_s * (steps - 1 - at) / steps
+    return values[rows, at] - beyond, ways_w[rows, at]
+
+
+def _fall(field: jax.Array, origin: jax.Array, resolution: jax.Array, xy: jax.Array) -> jax.Array:
+    """Headings [C] in which a field falls at points [C, 2]."""
+    offsets = _SLOPE_M * jnp.asarray([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    values = sample(field, origin, resolution, xy[:, None] + offsets)
+    return jnp.arctan2(values[:, 3] - values[:, 2], values[:, 1] - values[:, 0])
+
+
+def wrapped(angle: jax.Array) -> jax.Array:
+    """Angles in [-pi, pi)."""
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[float, float]) -> jax.Array:
+    """[R, 2] ends of beams in the robot's frame, infinite for those that reach `lidar_range_m`.
+
+    Args:
+        ranges_m: [R], from the right to the left as `interactive_nav.sensing.sensors` orders them.
+        config: angle, count and range.
+        lidar_xy_b: where the scanner sits, m.
+    """
+    step = config.lidar_fov_deg / config.lidar_rays
+    angle = jnp.radians(-0.5 * config.lidar_fov_deg + jnp.arange(config.lidar_rays) * step)
+    ends = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1) * ranges_m[:, None] + jnp.asarray(lidar_xy_b)
+    return jnp.where((ranges_m < 0.999 * config.lidar_range_m)[:, None], ends, jnp.inf)

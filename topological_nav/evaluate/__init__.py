@@ -1,0 +1,1 @@
+"""Navigators in, rows of episodes out."""

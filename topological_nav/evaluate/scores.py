@@ -1,0 +1,181 @@
+"""Rows of episodes in; success rate, SPL, RC, AADC and duration with 95 % intervals, as tables, out.
+
+RC is the share of successes with a contact, AADC the seconds in contact of a success, where a run with a contact
+counts as a whole (5 s); both, and the duration, are over successes, as a failure's contacts grow with the time limit.
+A scene's intervals are over its episodes (Wilson's for shares, bootstrap for means); those over scenes are Student's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pyarrow as pa
+from rich.table import Table
+
+from interactive_nav_common.statistics import Contrast, Estimate, estimate, interval, welch
+
+SCORES = {
+    "success": "success",
+    "spl": "SPL",
+    "rc": "RC",
+    "aadc_s": "AADC (s)",
+    "duration_s": "duration (s)",
+    "within": "within 1.5 m",
+}
+"""Name -> heading; `within` is the share of episodes that ended near the goal, whatever the navigator believed."""
+OF_SUCCESSES = {"rc": "contact", "aadc_s": "aadc_s", "duration_s": "duration_s"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """A mean and its 95 % interval; NaN where there is nothing to average."""
+
+    mean: float
+    low: float
+    high: float
+    count: int
+
+    def __str__(self) -> str:
+        if not self.count:
+            return "-"
+        digits = 2 if abs(self.mean) < 10 else 0
+        if np.isnan(self.low):
+            return f"{self.mean:.{digits}f}"
+        return f"{self.mean:.{digits}f} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
+
+
+NOTHING = Score(np.nan, np.nan, np.nan, 0)
+
+
+def score(rows: pa.Table, name: str) -> Score:
+    """One of `SCORES` over the rows' episodes."""
+    values = rows[OF_SUCCESSES.get(name, name)].to_numpy().astype(float)
+    if name in OF_SUCCESSES:
+        values = values[rows["success"].to_numpy() > 0]
+    if not len(values):
+        return NOTHING
+    share = name in ("success", "rc", "within")
+    low, high = interval("success" if share else name, values)
+    return Score(float(values.mean()), low, high, len(values))
+
+
+def where(rows: pa.Table, **wanted: str) -> pa.Table:
+    """Rows whose columns have these values."""
+    kept = np.ones(len(rows), bool)
+    for name, value in wanted.items():
+        kept &= np.array([x == value for x in rows[name].to_pylist()], bool)
+    return rows.filter(pa.array(kept))
+
+
+def over_scenes(rows: pa.Table, name: str) -> Estimate:
+    """Mean over scenes of their scores; scenes without any (RC where nothing succeeded) are left out."""
+    means = (score(where(rows, scene=scene), name).mean for scene in _in_order(rows, "scene"))
+    return estimate(m for m in means if not np.isnan(m))
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """A line of the summary."""
+
+    contender: str
+    group: str
+    """A scene, or over scenes: seen, unseen, all."""
+    episodes: int
+    scores: dict[str, Score]
+
+
+def summary(rows: pa.Table) -> list[Line]:
+    """Per contender: each scene, then the means over seen (train), unseen (test) and all scenes."""
+    lines = []
+    for contender in _in_order(rows, "contender"):
+        mine = where(rows, contender=contender)
+        scenes = _in_order(mine, "scene")
+        for scene in scenes:
+            part = where(mine, scene=scene)
+            lines.append(Line(contender, scene, len(part), {name: score(part, name) for name in SCORES}))
+        parts = {"seen": where(mine, split="train"), "unseen": where(mine, split="test"), "all": mine}
+        if len(scenes) > 1:
+            for group, part in parts.items():
+                if len(part):
+                    lines.append(Line(contender, group, len(part), {name: _mean(part, name) for name in SCORES}))
+    return lines
+
+
+def _mean(rows: pa.Table, name: str) -> Score:
+    found = over_scenes(rows, name)
+    return Score(found.mean, found.low, found.high, found.runs)
+
+
+def _in_order(rows: pa.Table, name: str) -> list[str]:
+    return list(dict.fromkeys(rows[name].to_pylist()))
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Two means compared."""
+
+    compared: str
+    score: str
+    result: Estimate | Contrast
+
+    def __str__(self) -> str:
+        if isinstance(self.result, Contrast):
+            return str(self.result)
+        return str(Score(self.result.mean, self.result.low, self.result.high, self.result.runs))
+
+
+def differences(rows: pa.Table) -> list[Difference]:
+    """Dense minus sparse map on the same episodes, scene by scene; unseen minus seen scenes, Welch's test."""
+    found = []
+    scenes, contenders = _in_order(rows, "scene"), _in_order(rows, "contender")
+    for name in ("success", "spl"):
+        if {"dense", "sparse"} <= set(contenders):
+            gaps = []
+            for scene in scenes:
+                sides = [_by_episode(where(rows, scene=scene, contender=c), name) for c in ("dense", "sparse")]
+                both = sorted(set(sides[0]) & set(sides[1]))
+                if both:
+                    gaps.append(float(np.mean([sides[0][e] - sides[1][e] for e in both])))
+            found.append(Difference("dense minus sparse map", name, estimate(gaps)))
+        for contender in contenders:
+            mine = where(rows, contender=contender)
+            sides = [
+                np.array([score(where(part, scene=scene), name).mean for scene in _in_order(part, "scene")])
+                for part in (where(mine, split="test"), where(mine, split="train"))
+            ]
+            if all(map(len, sides)):
+                found.append(Difference(f"{contender}: unseen minus seen", name, welch(*sides)))
+    return found
+
+
+def _by_episode(rows: pa.Table, name: str) -> dict[int, float]:
+    return dict(zip(rows["episode"].to_pylist(), rows[name].to_pylist(), strict=True))
+
+
+def console_table(lines: Sequence[Line]) -> Table:
+    """For a terminal."""
+    made = Table(caption="mean [95 % interval]; RC, AADC and duration of successes")
+    for heading in ("contender", "scene", "episodes"):
+        made.add_column(heading)
+    for heading in SCORES.values():
+        made.add_column(heading, justify="right")
+    _fill(lines, made.add_row)
+    return made
+
+
+def markdown(lines: Sequence[Line], compared: Sequence[Difference]) -> str:
+    """For a file: the summary and the comparisons."""
+    heads = ["contender", "scene", "episodes", *SCORES.values()]
+    text = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    _fill(lines, lambda *cells: text.append("| " + " | ".join(cells) + " |"))
+    if compared:
+        text += ["", "| Compared | Score | Difference [95 % interval] |", "|---|---|---|"]
+        text += [f"| {d.compared} | {SCORES[d.score]} | {d} |" for d in compared]
+    return "\n".join(text) + "\n"
+
+
+def _fill(lines: Sequence[Line], add: Callable[..., object]) -> None:
+    for line in lines:
+        add(line.contender, line.group, str(line.episodes), *(str(line.scores[name]) for name in SCORES))

@@ -1,0 +1,1 @@
+"""Rows, maps and paths in, pictures out."""

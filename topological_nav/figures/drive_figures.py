@@ -1,0 +1,158 @@
+"""Drives and policies in, pictures out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
+from topological_nav.figures.maps import floor_plan
+from topological_nav.scenes.space import free_space
+
+SHOWN = 4
+"""Drives whose images are shown."""
+FRAMES = 9
+"""Images of each."""
+
+
+def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
+    """Every drive on the floor plans, kept ones coloured by turning, then images along some and the commands' shares.
+
+    Args:
+        scene_folders: as they were driven in, in order.
+        folder: of the drives.
+    """
+    header, config = read_drives_header(folder)
+    drives, robot = load_drives(folder), get_robot(config.robot)
+    columns = min(4, len(scene_folders))
+    lines = -(-len(scene_folders) // columns)
+    picked = _some(folder, SHOWN)
+    figure = plt.figure(figsize=(12, 3.8 * lines + 1.2 * len(picked) + 2.4), layout="constrained")
+    parts: Any = figure.subfigures(3, 1, height_ratios=[3.8 * lines, 1.2 * len(picked) + 0.01, 2.4])
+    above, middle, below = parts
+    axes = np.ravel(above.subplots(lines, columns, squeeze=False))
+    for axis in axes[len(scene_folders) :]:
+        axis.set_axis_off()
+    shade = None
+    for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
+        axis, mine = axes[index], np.flatnonzero(drives.scene == index)
+        floor_plan(axis, free_space(load_scene(scene_folder), robot.height_m))
+        for k in mine[~drives.kept[mine]]:
+            axis.plot(*drives.pose_w[drives.rows(k), :2].T, color="0.35", linewidth=0.8, ls=":")
+        pieces, turns = [], []
+        for k in mine[drives.kept[mine]]:
+            xy = drives.pose_w[drives.rows(k), :2]
+            pieces.append(np.stack([xy[:-1], xy[1:]], 1))
+            turns.append(drives.command[drives.rows(k)[:-1], 1])
+        if pieces:
+            shade = LineCollection(list(np.concatenate(pieces)), cmap="coolwarm", linewidths=0.7)
+            shade.set_array(np.concatenate(turns))
+            shade.set_clim(-config.angular_rad_s, config.angular_rad_s)
+            axis.add_collection(shade)
+        hits = drives.rows(mine)
+        hits = hits[drives.touching[hits].any(1)]
+        axis.scatter(*drives.pose_w[hits, :2].T, s=6, color="k", marker="x", zorder=4)
+        axis.set_title(
+            f"{about['name']}: {int(drives.kept[mine].sum())} of {len(mine)} drives kept\n"
+            f"(reached {drives.reached[mine].mean():.2f}, in contact {drives.touched[mine].mean():.2f})",
+            fontsize=7.5,
+        )
+    if shade is not None:
+        above.colorbar(shade, ax=list(axes), label="turning, rad/s (left +)", shrink=0.6, pad=0.01)
+    if picked:
+        grid = middle.subplots(len(picked), 1, squeeze=False)[:, 0]
+        for axis, (k, images) in zip(grid, picked, strict=True):
+            at = np.linspace(0, len(images) - 1, FRAMES).astype(int)
+            axis.imshow(np.concatenate(list(images[at]), 1))
+            axis.set_axis_off()
+            asked = drives.command[drives.first[k] + at]
+            said = "   ".join(f"{v:.1f} m/s {w:+.1f}" for v, w in asked)
+            axis.set_title(f"drive {k} in {header['scenes'][drives.scene[k]]['name']}: {said} rad/s", fontsize=6.5)
+    _shares(below.subplots(1, 3), drives)
+    return figure
+
+
+def _some(folder: Path, count: int) -> list[tuple[int, np.ndarray]]:
+    """A few drives with their images, from files all over the folder."""
+    files = [(int(rows[len(rows) // 2]), rows, images) for rows, images in _thin(drive_images(folder), count)]
+    drives, out = load_drives(folder), []
+    for k, rows, images in files:
+        ends = np.cumsum(drives.steps[rows])
+        at = int(np.flatnonzero(rows == k)[0])
+        out.append((k, images[ends[at] - drives.steps[k] : ends[at]]))
+    return out
+
+
+def _thin(files, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """`count` of an iterable, evenly; it is gone through once and a few are held."""
+    held, every = [], 1
+    for i, item in enumerate(files):
+        if i % every == 0:
+            held.append(item)
+        if len(held) == 2 * count:
+            held, every = held[::2], 2 * every
+    return held[:count]
+
+
+def _shares(axes: Any, drives: Any) -> None:
+    going = np.repeat(drives.kept, drives.steps)
+    for axis, values, name in (
+        (axes[0], drives.command[going, 0], "commanded m/s"),
+        (axes[1], drives.command[going, 1], "commanded rad/s"),
+        (axes[2], drives.steps[drives.kept] / 10.0, "seconds a drive"),
+    ):
+        if len(values):
+            axis.hist(values, bins=21, color="tab:blue", weights=np.full(len(values), 1 / len(values)))
+        axis.set_xlabel(name, fontsize=8)
+        axis.tick_params(labelsize=7)
+        axis.grid(alpha=0.3)
+
+
+def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> Figure:
+    """Curves of a policy's run, and how its commands on held-out drives compare with the expert's.
+
+    Args:
+        lines: of metrics.jsonl.
+        results: of results.json.
+    """
+    figure, axes = plt.subplots(1, 4, figsize=(15, 3.6), layout="constrained")
+    epochs = [line["epoch"] for line in lines]
+    for name in ("forward", "consistency"):
+        axes[0].plot(epochs, [line[name] for line in lines], label=name)
+    axes[0].set_yscale("log")
+    axes[0].set_title("errors in feature space", fontsize=9)
+    for name in ("linear", "angular"):
+        axes[1].plot(epochs, [line[f"{name}_accuracy"] for line in lines], label=f"{name}, learned from")
+    if "test" in results:
+        for name, colour in (("linear", "tab:blue"), ("angular", "tab:orange")):
+            axes[1].axhline(results["test"][name]["accuracy"], color=colour, ls="--", label=f"{name}, held out")
+    axes[1].set_title("accuracy", fontsize=9)
+    axes[1].set_ylim(0, 1)
+    for axis in axes[:2]:
+        axis.set_xlabel("epoch")
+        axis.legend(fontsize=7)
+        axis.grid(alpha=0.3)
+    for axis, name, unit in ((axes[2], "linear", "m/s"), (axes[3], "angular", "rad/s")):
+        if "test" not in results:
+            axis.set_axis_off()
+            continue
+        counts = np.asarray(results["test"][name]["confusion"], float)
+        share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+        axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
+        for i, j in np.ndindex(*share.shape):
+            axis.text(j, i, f"{share[i, j]:.2f}", ha="center", va="center", fontsize=7)
+        values = [f"{v:+.2f}" for v in results["classes"][name]]
+        axis.set_xticks(range(len(values)), values, fontsize=7)
+        axis.set_yticks(range(len(values)), values, fontsize=7)
+        axis.set_xlabel(f"policy, {unit}")
+        axis.set_ylabel("expert")
+        axis.set_title(f"{name}, held-out steps", fontsize=9)
+    return figure

@@ -1,0 +1,222 @@
+"""Plans, maps and paths in, pictures of episodes and a video out."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+
+from interactive_nav_common.files import whole_file
+from topological_nav.figures.maps import floor_plan, room_points
+from topological_nav.maps.graph import TopologicalMap
+from topological_nav.scenes.space import FreeSpace
+
+WON, LOST = "tab:blue", "tab:red"
+FEW = 100
+"""Episodes of which each start and goal is drawn; of more, only those of the lost."""
+INK = 40.0
+"""Paths drawn so many times over each other make a solid colour, however many there are."""
+
+
+def map_lines(axis: Axes, made: TopologicalMap, passable: float) -> None:
+    """Draws a map in the background: its nodes, and the edges that count as open."""
+    open_ = made.p >= passable
+    ways = np.stack([made.xy_w[made.edges[open_, 0]], made.xy_w[made.edges[open_, 1]]], 1)
+    axis.add_collection(LineCollection(list(ways), colors="0.6", linewidths=0.5, zorder=1))
+    room_points(axis, made.xy_w, made.room, s=10, linewidths=0, zorder=2, alpha=0.8)
+
+
+def journeys_figure(
+    scene: str,
+    space: FreeSpace,
+    panels: Mapping[str, tuple[TopologicalMap | None, Mapping[int, np.ndarray], Mapping[int, Mapping[str, Any]]]],
+    passable: float,
+) -> Figure:
+    """Where contenders went in a scene, a panel each.
+
+    Args:
+        scene: its name.
+        space: its plan.
+        panels: contender -> its map, paths by episode, rows by episode.
+        passable: edges with at least this probability are drawn.
+    """
+    extent = np.ptp(space.centres(0.0), axis=0) + 0.8
+    columns = len(panels) if extent[1] >= extent[0] or len(panels) == 1 else min(2, len(panels))
+    lines = -(-len(panels) // columns)
+    width = 5.4
+    figure, grid = plt.subplots(
+        lines,
+        columns,
+        figsize=(width * columns, (width * extent[1] / extent[0] + 0.5) * lines),
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis in grid.ravel()[len(panels) :]:
+        axis.set_axis_off()
+    for axis, (name, (made, tracks, rows)) in zip(grid.ravel(), panels.items(), strict=False):
+        floor_plan(axis, space)
+        if made is not None:
+            map_lines(axis, made, passable)
+        for wins, colour in ((True, WON), (False, LOST)):  # what was lost lies above
+            mine = {number: row for number, row in rows.items() if bool(row["success"]) == wins}
+            alpha = max(0.01, min(0.65, INK / max(len(mine), 1)))  # of less, eight bits show nothing
+            ways = [tracks[number] for number in mine if number in tracks]
+            axis.add_collection(
+                LineCollection(ways, colors=colour, linewidths=0.9, alpha=alpha, zorder=3), autolim=False
+            )
+            shown = list(mine.values()) if len(rows) <= FEW or not wins else []
+            alpha = min(1.0, 2 * FEW / max(len(shown), 1))
+            for end, marker, size in (("start", "o", 3.5), ("goal", "*", 7)):
+                xy = [[row[f"{end}_{x}_w"] for row in shown] for x in "xy"]
+                axis.plot(*xy, marker, color=colour, markersize=size, alpha=alpha, zorder=4)
+        won = sum(bool(row["success"]) for row in rows.values())
+        whose = "" if len(rows) <= FEW else " of the others"
+        axis.set_title(
+            f"{scene}, {name}: {won:,} of {len(rows):,} reached (blue; red: not)\n● start, ★ goal{whose}", fontsize=8
+        )
+    return figure
+
+
+def episode_figure(
+    space: FreeSpace,
+    made: TopologicalMap,
+    track_w: np.ndarray,
+    phase: np.ndarray,
+    phases: Sequence[str],
+    start_w: np.ndarray,
+    goal_w: np.ndarray,
+    goal_node: int,
+    title: str,
+    passable: float,
+) -> Figure:
+    """One episode over plan and map.
+
+    Args:
+        space: the plan.
+        made: the map.
+        track_w: [t, 2] m, a point every control step.
+        phase: [t] number of the navigator's phase there.
+        phases: their names.
+        start_w: (2,) m.
+        goal_w: (2,) m.
+        goal_node: where the navigator wants to go.
+        title: above.
+        passable: edges with at least this probability are drawn.
+    """
+    extent = np.ptp(space.centres(0.0), axis=0) + 0.8
+    figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
+    floor_plan(axis, space)
+    map_lines(axis, made, passable)
+    axis.plot(*track_w.T, color="tab:blue", linewidth=1.2, zorder=3)
+    colours = {"localise": "tab:orange", "swing": "tab:purple", "lean": "tab:red"}
+    for name, colour in colours.items():
+        here = track_w[phase == phases.index(name)]
+        if len(here):
+            axis.scatter(*here.T, s=22, color=colour, zorder=4, label=name, linewidths=0)
+    axis.plot(*start_w, "o", color="k", markersize=7, zorder=5, label="start")
+    axis.plot(*goal_w, "*", color="tab:green", markersize=14, zorder=5, label="goal")
+    axis.plot(*made.xy_w[goal_node], "s", mfc="none", mec="tab:green", markersize=11, zorder=5, label="goal's node")
+    axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    axis.set_title(textwrap.fill(title, 90), fontsize=9)
+    return figure
+
+
+def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height: int) -> tuple[np.ndarray, Any]:
+    """[height, W, 3] u8 picture of plan and map, W even, and a function from world points [..., 2] to its pixels."""
+    extent = np.ptp(space.centres(0.0), axis=0) + 0.8
+    width = int(round(height * extent[0] / extent[1] / 2)) * 2
+    figure = plt.figure(figsize=(width / 100, height / 100), dpi=100)
+    axis = figure.add_axes((0, 0, 1, 1))
+    floor_plan(axis, space)
+    axis.set_aspect("auto")
+    map_lines(axis, made, passable)
+    memory = io.BytesIO()
+    figure.savefig(memory, dpi=100, format="png")
+    (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
+    plt.close(figure)
+    picture = np.asarray(Image.open(memory).convert("RGB").resize((width, height)))
+    scale = np.array([width / (x1 - x0), -height / (y1 - y0)])
+
+    def pixels(xy_w: np.ndarray) -> np.ndarray:
+        return (np.asarray(xy_w) - [x0, y1]) * scale
+
+    return picture, pixels
+
+
+def video_frame(
+    plan: np.ndarray,
+    pixels: Any,
+    track_w: np.ndarray,
+    yaw_rad: float,
+    goal_w: np.ndarray,
+    view: np.ndarray | None,
+    said: str,
+) -> np.ndarray:
+    """[H, W, 3] u8: the plan with the path so far; beside it what the camera saw last.
+
+    Args:
+        plan: of `plan_picture`.
+        pixels: of `plan_picture`.
+        track_w: [t, 2] m, the last of it where the robot is.
+        yaw_rad: its heading.
+        goal_w: (2,) m.
+        view: [h, w, 3] u8; None: no camera.
+        said: below the picture's upper edge.
+    """
+    image = Image.fromarray(plan)
+    draw = ImageDraw.Draw(image)
+    if len(track_w) > 1:
+        draw.line([tuple(p) for p in pixels(track_w)], fill=(31, 119, 180), width=2)
+    x, y = pixels(goal_w)
+    draw.ellipse((x - 7, y - 7, x + 7, y + 7), outline=(44, 160, 44), width=3)
+    here = track_w[-1]
+    nose = here + 0.5 * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+    x, y = pixels(here)
+    draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=(214, 39, 40))
+    draw.line([(x, y), tuple(pixels(nose))], fill=(214, 39, 40), width=3)
+    draw.text((6, 4), said, fill=(0, 0, 0))
+    out = np.asarray(image)
+    if view is None:
+        return out
+    width = int(round(len(plan) * view.shape[1] / view.shape[0] / 2)) * 2
+    seen = np.asarray(Image.fromarray(view).resize((width, len(plan)), Image.Resampling.NEAREST))
+    return np.concatenate([out, seen], 1)
+
+
+def write_video(frames: Iterable[np.ndarray], path: Path, rate: float) -> int:
+    """Writes H.264 whole or not at all; returns the number of frames."""
+    count, writer = 0, None
+    with whole_file(path) as partial:
+        named = partial.with_name(f"{partial.name}.mp4")
+        try:
+            for frame in frames:
+                if writer is None:
+                    size = (frame.shape[1], frame.shape[0])
+                    writer = imageio_ffmpeg.write_frames(
+                        str(named), size, fps=rate, codec="libx264", quality=7, macro_block_size=2  # type: ignore[arg-type]
+                    )  # fmt: skip
+                    with warnings.catch_warnings():
+                        # imageio-ffmpeg forks; its child becomes ffmpeg at once and never enters JAX.
+                        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+                        writer.send(None)
+                writer.send(np.ascontiguousarray(frame))
+                count += 1
+        finally:
+            if writer is not None:
+                writer.close()
+        named.replace(partial)
+    return count

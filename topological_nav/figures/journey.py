@@ -1,0 +1,174 @@
+"""One episode of a scene, driven by the navigator with everything it did kept: for a picture, a log and a film."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from interactive_nav_common.errors import ConfigError
+from topological_nav.evaluate.contest import Contest, venues_of
+from topological_nav.evaluate.evaluation import Journeys, NavigatorPlayer, Played, play
+from topological_nav.figures.episode_figures import episode_figure, plan_picture, video_frame, write_video
+from topological_nav.maps.graph import TopologicalMap
+from topological_nav.navigate.navigator import FACE, PHASES, Events, State
+from topological_nav.scenes.simulation import Seen
+from topological_nav.scenes.space import FreeSpace
+
+FILM_EVERY_S = 0.5
+FILM_RATE = 20.0
+"""Frames a second of film: ten times as fast as it was."""
+FILM_HEIGHT = 480
+
+
+@dataclasses.dataclass(frozen=True)
+class Driven:
+    """An episode."""
+
+    scene: str
+    number: int
+    space: FreeSpace
+    map: TopologicalMap
+    journey: Journeys
+    played: Played
+    goal_node: int
+    passable: float
+    time_s: np.ndarray
+    """[t] of every control step."""
+    xy_w: np.ndarray
+    """[t, 2] m."""
+    yaw_rad: np.ndarray
+    """[t]."""
+    phase: np.ndarray
+    """[t] i8."""
+    views: dict[int, np.ndarray]
+    """Control step -> image, where it was filmed."""
+    told: list[str]
+    """What happened, a line each."""
+
+    @property
+    def outcome(self) -> str:
+        """In words."""
+        played = self.played
+        what = "reached the goal" if played.success[0] else "did not reach the goal"
+        return (
+            f"{what} after {played.duration_s[0]:.0f} s and {played.path_m[0]:.1f} m (shortest "
+            f"{self.journey.shortest_m[0]:.1f} m), {played.goal_m[0]:.2f} m from it, "
+            f"{played.contact_runs[0]} of {played.runs[0]} runs with a contact"
+        )
+
+    def figure(self) -> Figure:
+        """Path over plan and map."""
+        return episode_figure(
+            self.space,
+            self.map,
+            self.xy_w,
+            self.phase,
+            PHASES,
+            self.journey.start_xy_w[0],
+            self.journey.goal_xy_w[0],
+            self.goal_node,
+            f"{self.scene}, episode {self.number}: {self.outcome}",
+            self.passable,
+        )
+
+
+def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callable[[float], None]) -> Driven:
+    """Drives one of the episodes of a contest's only scene, as the contest's only contender.
+
+    Args:
+        contest: one scene, dense or sparse.
+        number: of the episode.
+        filmed: keep images.
+        progress: told the simulated time; may raise to stop.
+
+    Raises:
+        ConfigError: the scene has no such episode.
+    """
+    (venue,) = venues_of(contest)
+    if not 0 <= number < len(venue.journeys):
+        raise ConfigError(
+            f"episode is {number}, expected 0 to {len(venue.journeys) - 1}; episodes=N makes more of the scene"
+        )
+    journey = venue.journeys.take(np.array([number]))
+    navigator = venue.navigator(contest.contenders[0])
+    made = navigator.map
+    seen_at: list[tuple[float, np.ndarray, float, int]] = []
+    views: dict[int, np.ndarray] = {}
+    told: list[str] = []
+    every = max(1, round(FILM_EVERY_S / venue.simulator.dt_s))
+
+    def watch(time_s: float, seen: Seen, state: State, events: Events) -> None:
+        if filmed and not contest.truth and len(seen_at) % every == 0:
+            views[len(seen_at)] = venue.camera(seen.xy_w[:1], seen.yaw_rad[:1])[0]
+        seen_at.append((time_s, seen.xy_w[0], seen.yaw_rad[0], int(state.phase[0])))
+        told.extend(f"{time_s:7.1f} s  {said}" for said in _said(made, state, events))
+
+    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, contest.config, watch)
+    played = play(player, venue.simulator, journey, contest.config, lambda _, time_s: progress(time_s))
+    assert player.state is not None
+    time_s, xy, yaw, phase = zip(*seen_at, strict=True)
+    return Driven(
+        venue.scene.name,
+        number,
+        venue.space,
+        made,
+        journey,
+        played,
+        int(player.state.goal[0]),
+        contest.config.passable,
+        np.array(time_s),
+        np.array(xy),
+        np.array(yaw),
+        np.array(phase),
+        views,
+        told,
+    )
+
+
+def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
+    node, edge = int(state.node[0]), int(state.edge[0])
+    if events.localised[0] or events.glanced[0]:
+        yield f"{'looked about' if events.localised[0] else 'glanced'}: at node {node}"
+    still = bool(events.run_ended[0]) and not events.glanced[0] and state.phase[0] == FACE
+    if still:
+        yield f"glanced: still at node {node}"
+    if events.blocked[0]:
+        yield "no heading near the edge's is open"
+    if events.lost[0]:
+        yield f"the map has no way from node {node} to {int(state.goal[0])}"
+    elif edge >= 0 and (events.localised[0] or events.glanced[0] or events.blocked[0] or still):
+        degrees = np.rad2deg(made.angle_rad[edge])
+        yield f"next: node {made.edges[edge, 1]}, heading {degrees:.0f} degrees, p {made.p[edge]:.2f}"
+    if events.run_started[0] and state.run[0] == 0:
+        yield "drives"
+    if events.arrived[0]:
+        yield "is at the goal's node"
+    if events.timed_out[0]:
+        yield "out of time"
+
+
+def film(driven: Driven, path: Path) -> int:
+    """Writes a film, the plan beside the camera's images; returns the number of frames."""
+    plan, pixels = plan_picture(driven.space, driven.map, driven.passable, FILM_HEIGHT)
+    every = (
+        max(1, round(FILM_EVERY_S / max(driven.time_s[1] - driven.time_s[0], 1e-3))) if len(driven.time_s) > 1 else 1
+    )
+
+    def frames() -> Iterator[np.ndarray]:
+        for step in range(0, len(driven.time_s), every):
+            said = f"{driven.scene}  {driven.time_s[step]:.0f} s  {PHASES[driven.phase[step]]}"
+            yield video_frame(
+                plan,
+                pixels,
+                driven.xy_w[: step + 1],
+                float(driven.yaw_rad[step]),
+                driven.journey.goal_xy_w[0],
+                driven.views.get(step),
+                said,
+            )
+
+    return write_video(frames(), path, FILM_RATE)

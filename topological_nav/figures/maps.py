@@ -1,0 +1,185 @@
+"""Plans, rooms, images, curves and maps in, pictures out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from interactive_nav_common.files import whole_file
+from topological_nav.data.dataset import load_plan, load_rooms, read_header
+from topological_nav.maps.build import Built
+from topological_nav.maps.graph import Route
+from topological_nav.scenes.space import FreeSpace
+
+PALETTE = [*plt.get_cmap("tab20").colors[::2], *plt.get_cmap("tab20").colors[1::2]]  # type: ignore[attr-defined]
+"""Colours of rooms; after twenty they repeat."""
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a PNG whole or not at all, and forgets the figure."""
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=130, format="png")
+    plt.close(figure)
+
+
+def floor_plan(axis: Axes, space: FreeSpace) -> None:
+    """Draws free space white and obstacles grey, cut to where there is free space."""
+    rows, columns = space.clearance_m.shape
+    (x0, y0), step = space.origin_w, space.resolution_m
+    axis.imshow(
+        space.clearance_m > 0,
+        origin="lower",
+        extent=(x0, x0 + columns * step, y0, y0 + rows * step),
+        cmap=ListedColormap(["0.78", "1.0"]),
+        interpolation="nearest",
+    )
+    free = space.centres(0.0)
+    axis.set_xlim(free[:, 0].min() - 0.4, free[:, 0].max() + 0.4)
+    axis.set_ylim(free[:, 1].min() - 0.4, free[:, 1].max() + 0.4)
+    axis.set_aspect("equal")
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def room_points(axis: Axes, points_w: np.ndarray, labels: np.ndarray, **style: Any) -> None:
+    """Draws points in their rooms' colours."""
+    axis.scatter(*points_w.T, c=[PALETTE[k % len(PALETTE)] for k in labels], **style)
+
+
+def rooms_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """One row a scene, one column a method: the rooms found where their number is known, else where it is chosen.
+
+    Args:
+        rows: of `rooms.compare`.
+    """
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    spaces = [next(r["space"] for r in rows if r["scene"] == scene) for scene in scenes]
+    extents = [np.ptp(space.centres(0.0), axis=0) + 0.8 for space in spaces]
+    heights = [extent[1] / extent[0] for extent in extents]
+    figure, grid = plt.subplots(
+        len(scenes),
+        len(methods),
+        figsize=(3.6 * len(methods), 3.6 * sum(heights) + 0.55 * len(scenes)),
+        height_ratios=heights,
+        squeeze=False,
+        layout="constrained",
+    )
+    for line, scene in zip(grid, scenes, strict=True):
+        for axis, method in zip(line, methods, strict=True):
+            mine = [r for r in rows if r["scene"] == scene and r["method"] == method]
+            shown, rooms = mine[0], mine[0]["rooms"]
+            floor_plan(axis, shown["space"])
+            room_points(axis, rooms.points_w, rooms.labels, s=5, linewidths=0)
+            if shown["recorded"] is not None:
+                for x0, y0, x1, y1 in shown["recorded"]:
+                    axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.9, edgecolor="k"))
+            said = [
+                f"{r['count']} rooms ({r['chosen_by']})"
+                + ("" if r["agreement"] is None else f" ARI {r['agreement']:.2f}")
+                for r in mine
+            ]
+            axis.set_title(f"{scene}, {method}\n" + "; ".join(said), fontsize=7.5)
+    return figure
+
+
+def dataset_figure(folder: Path) -> Figure:
+    """Where a dataset's images were taken, a panel a scene, and level images of some positions below."""
+    header, config = read_header(folder)
+    scenes = [(s["name"], load_plan(folder, s["name"])) for s in header["scenes"]]
+    rooms = load_rooms(folder)
+    shown = np.linspace(0, len(rooms.xy_w) - 1, min(6, len(rooms.xy_w))).astype(int)
+    columns = min(4, len(scenes))
+    lines = -(-len(scenes) // columns)
+    figure = plt.figure(figsize=(12, 3.4 * lines + 1.25 * len(shown)), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=[3.4 * lines, 1.25 * len(shown)])
+    above, below = parts
+    for axis in np.ravel(above.subplots(lines, columns, squeeze=False))[len(scenes) :]:
+        axis.set_axis_off()
+    for axis, (name, plan) in zip(above.axes, scenes, strict=False):
+        axis.scatter(*plan.rooms.points_w.T, s=1, c="0.85", linewidths=0)
+        for held, marker in ((False, "o"), (True, "^")):
+            mine = plan.test == held
+            room_points(axis, plan.xy_w[mine], plan.room[mine], s=22, marker=marker, edgecolors="k", linewidths=0.4)
+        step = 0.35 * np.stack([np.cos(plan.passages.heading_rad), np.sin(plan.passages.heading_rad)], -1)
+        ways = list(np.stack([plan.passages.xy_w, plan.passages.xy_w + step], 1))
+        colours = np.where(plan.passages.free[:, config.passage_column], "tab:green", "tab:red")
+        axis.add_collection(LineCollection(ways, colors=list(colours), linewidths=0.7))
+        axis.set_aspect("equal")
+        axis.tick_params(labelsize=6)
+        axis.set_title(
+            f"{name}: {len(plan.xy_w)} positions (▲ for testing), {len(plan.passages)} passages\n"
+            f"(green free for {config.passage_length_m:g} m, red blocked)",
+            fontsize=7,
+        )
+    grid = below.subplots(len(shown), 1, squeeze=False)[:, 0]
+    for axis, position in zip(grid, shown, strict=True):
+        strip = rooms.images[position, 1, :: max(config.headings // 9, 1)]
+        axis.imshow(np.concatenate(list(strip), 1))
+        axis.set_axis_off()
+        axis.set_title(f"room {rooms.names[rooms.label[position]]}, level, turning left", fontsize=7, loc="left")
+    return figure
+
+
+def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
+    """Loss and accuracy over epochs, a column a phase.
+
+    Args:
+        lines: of a run's metrics.jsonl.
+    """
+    names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
+    phases = list(dict.fromkeys(line["phase"] for line in lines))
+    figure, grid = plt.subplots(1, len(phases), figsize=(4.6 * len(phases), 3.2), squeeze=False, layout="constrained")
+    for axis, phase in zip(grid[0], phases, strict=True):
+        mine = [line for line in lines if line["phase"] == phase]
+        epochs = [line["epoch"] for line in mine]
+        axis.plot(epochs, [line["loss"] for line in mine], marker=".", label="loss")
+        if "accuracy" in mine[0]:
+            axis.plot(epochs, [line["accuracy"] for line in mine], marker=".", label="accuracy on training images")
+        axis.set_title(names[phase], fontsize=9)
+        axis.set_xlabel("epoch")
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    return figure
+
+
+def map_figure(built: Built, route: Route | None = None) -> Figure:
+    """A map over the floor plan: edges red to green by probability, each direction on its own half.
+
+    Args:
+        built: of `build.build_map`.
+        route: drawn on top.
+    """
+    made = built.map
+    extent = np.ptp(built.space.centres(0.0), axis=0)
+    figure, axis = plt.subplots(figsize=(8.4, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")
+    floor_plan(axis, built.space)
+    start, end = made.xy_w[made.edges[:, 0]], made.xy_w[made.edges[:, 1]]
+    order = np.argsort(made.p)
+    halves = LineCollection(
+        list(np.stack([start, (start + end) / 2], 1)[order]), cmap="RdYlGn", linewidths=1.1, zorder=2
+    )
+    halves.set_array(made.p[order])
+    halves.set_clim(0.0, 1.0)
+    axis.add_collection(halves)
+    room_points(axis, made.xy_w, made.room, s=34, edgecolors="k", linewidths=0.6, zorder=4)
+    for node, (x, y) in enumerate(made.xy_w):
+        axis.annotate(str(node), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=5, zorder=5)
+    if route is not None:
+        axis.plot(*made.xy_w[list(route.nodes)].T, color="tab:blue", linewidth=2.6, zorder=3)
+    figure.colorbar(halves, ax=axis, label="probability that the way is free", shrink=0.6, pad=0.01)
+    axis.set_title(f"{made.scene}: {len(made.xy_w)} nodes, {len(made.edges)} directed edges", fontsize=9)
+    return figure

@@ -1,0 +1,225 @@
+"""Images and labels in, trained variables out: on an accelerator a whole epoch is one compiled program.
+
+The images stay on the device as u8. An epoch's order and augmentation follow from the seed and its number alone, so a
+run that goes on from a checkpoint ends where an uninterrupted one does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from topological_nav.learn.networks import Contrast, Network, augmented, vicreg_loss
+
+EVALUATED, DEVICE_EVALUATED = (8, 64), (16, 64, 256)
+"""Images a call where nothing is learned, on a CPU and on an accelerator: each call takes the least that serves."""
+VIEW_STEPS = 2
+"""Two views of a place differ by at most so many headings."""
+
+
+@flax.struct.dataclass
+class Learner:
+    """What an epoch changes."""
+
+    params: Any
+    batch_stats: Any
+    opt_state: Any
+
+
+Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, jax.Array]]]
+"""(learner, images, labels, key) -> learner and means over the epoch; compiled. Labels may be a tree of arrays."""
+
+
+def make_learner(
+    module: nn.Module, image_shape: tuple[int, int], tx: optax.GradientTransformation, seed: int
+) -> Learner:
+    """Fresh weights.
+
+    Args:
+        module: `Network` or `Contrast`.
+        image_shape: height and width.
+        tx: its state is made too.
+        seed: of the weights.
+    """
+    made = initial(variable_shapes(module, image_shape), seed)
+    return Learner(made["params"], made["batch_stats"], tx.init(made["params"]))
+
+
+def variable_shapes(module: nn.Module, image_shape: tuple[int, int]) -> dict[str, Any]:
+    """`params` and `batch_stats` of a module as shapes; nothing is computed."""
+    key, image = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, *image_shape, 3), jnp.uint8)
+    return {"batch_stats": {}, **jax.eval_shape(lambda k, x: module.init(k, x, train=False), key, image)}
+
+
+def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
+    """First values of variables: the same on every device, and without a program to compile.
+
+    Convolutions as in He et al. 2015 by outputs (sd root of 2 over fan out), dense layers by inputs (1 over root of
+    fan in), scales and variances 1, everything else 0.
+    """
+    rng = np.random.default_rng(seed)
+
+    def value(path: Any, leaf: Any) -> jax.Array:
+        name, shape = path[-1].key, leaf.shape
+        if name == "kernel":
+            conv = len(shape) == 4
+            sd = math.sqrt(2.0 / (math.prod(shape[:2]) * shape[3])) if conv else 1.0 / math.sqrt(shape[0])
+            return jnp.asarray(rng.normal(0.0, sd, shape), leaf.dtype)
+        assert name in ("bias", "scale", "mean", "var"), name
+        return jnp.full(shape, 1.0 if name in ("scale", "var") else 0.0, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(value, shapes)
+
+
+def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
+    """The learner with the backbone of other variables (`params`, `batch_stats`); raises ValueError if it differs."""
+    mine, theirs = learner.params["body"], donor["params"]["body"]
+    shapes = [jax.tree.map(jnp.shape, tree) for tree in (mine, theirs)]
+    if shapes[0] != shapes[1]:
+        raise ValueError("its backbone differs in kind or width")
+    stats = dict(learner.batch_stats)
+    if "body" in stats:
+        stats["body"] = donor["batch_stats"]["body"]
+    return learner.replace(params={**learner.params, "body": theirs}, batch_stats=stats)
+
+
+def labelled_epoch(
+    network: Network, tx: optax.GradientTransformation, batch: int, smoothing: float, augment: bool, scored: int = 0
+) -> Epoch:
+    """An epoch of classification; images [N, H, W, 3] u8, labels [N] i32, of passages [N, outputs].
+
+    The last, incomplete batch is left out: order changes every epoch, so every image has its turn.
+
+    Args:
+        network: of rooms with as many outputs as classes, of passages with as many as lengths.
+        tx: optimiser.
+        batch: images an update; all where there are fewer.
+        smoothing: of one-hot labels, of rooms.
+        augment: vary the images; those of passages also by mirroring.
+        scored: of passages, the output whose accuracy is told.
+    """
+
+    def loss_of(params, stats, x, y, key):
+        variables = {"params": params, "batch_stats": stats}
+        logits, new = network.apply(variables, x, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+        if network.task == "passages":
+            loss = optax.sigmoid_binary_cross_entropy(logits, y.astype(jnp.float32)).mean()
+            right = (logits[:, scored] > 0) == y[:, scored]
+        else:
+            target = optax.smooth_labels(jax.nn.one_hot(y, network.outputs), smoothing)
+            loss = optax.softmax_cross_entropy(logits, target).mean()
+            right = logits.argmax(1) == y
+        return loss, (new.get("batch_stats", stats), right.mean())
+
+    def steps(images, key):
+        count = len(images)
+        size = min(batch, count)
+        key_order, key_steps = jax.random.split(key)
+        order = jax.random.permutation(key_order, count)[: count // size * size].reshape(-1, size)
+        return order, jax.random.split(key_steps, len(order))
+
+    def update(learner, images, labels, step):
+        rows, key = step
+        key_image, key_drop = jax.random.split(key)
+        x = images[rows]
+        x = augmented(key_image, x, network.task == "passages") if augment else x
+        grad = jax.value_and_grad(loss_of, has_aux=True)
+        (loss, (stats, right)), slope = grad(learner.params, learner.batch_stats, x, labels[rows], key_drop)
+        change, opt_state = tx.update(slope, learner.opt_state, learner.params)
+        new = Learner(optax.apply_updates(learner.params, change), stats, opt_state)
+        return new, {"loss": loss, "accuracy": right}
+
+    return compiled_epoch(steps, update)
+
+
+def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int) -> Epoch:
+    """An epoch without labels: two views of each place, up to `VIEW_STEPS` headings apart and lit differently.
+
+    Images are [P, K, H, W, 3] u8, K headings of a place and pitch; every image is the first view once. Labels are
+    not looked at.
+    """
+
+    def loss_of(params, stats, x):
+        variables = {"params": params, "batch_stats": stats}
+        z, new = module.apply(variables, x, train=True, mutable=["batch_stats"])
+        a, b = jnp.split(z, 2)
+        return vicreg_loss(a, b), new.get("batch_stats", stats)
+
+    def steps(images, key):
+        places, around = images.shape[:2]
+        count = places * around
+        size = min(batch, count)
+        key_order, key_turn, key_steps = jax.random.split(key, 3)
+        order = jax.random.permutation(key_order, count)[: count // size * size].reshape(-1, size)
+        turn = jax.random.randint(key_turn, order.shape, -VIEW_STEPS, VIEW_STEPS + 1)
+        other = order // around * around + (order % around + turn) % around
+        return order, other, jax.random.split(key_steps, len(order))
+
+    def update(learner, images, labels, step):
+        del labels
+        first, second, key = step
+        flat = images.reshape(-1, *images.shape[2:])
+        x = augmented(key, flat[jnp.concatenate([first, second])], False)
+        (loss, stats), slope = jax.value_and_grad(loss_of, has_aux=True)(learner.params, learner.batch_stats, x)
+        change, opt_state = tx.update(slope, learner.opt_state, learner.params)
+        return Learner(optax.apply_updates(learner.params, change), stats, opt_state), {"loss": loss}
+
+    return compiled_epoch(steps, update)
+
+
+def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epoch:
+    """An epoch of updates: one program on an accelerator, one program an update on a CPU.
+
+    XLA's CPU convolutions are about eight times slower inside a loop of the program (53 against 441 images/s,
+    ResNet-18 of width 8 at 64 x 48 on two busy cores).
+
+    Args:
+        steps: images and key to a tree of arrays [S, ...], one row an update.
+        update: learner, images, labels and a row to the learner and a dict of numbers.
+    """
+    planned, one = jax.jit(steps), jax.jit(update, donate_argnums=0)
+
+    def whole(learner, images, labels, key):
+        learner, told = jax.lax.scan(lambda state, row: update(state, images, labels, row), learner, steps(images, key))
+        return learner, jax.tree.map(jnp.mean, told)
+
+    def by_updates(learner, images, labels, key):
+        rows, told = planned(images, key), []
+        for i in range(len(jax.tree.leaves(rows)[0])):
+            learner, numbers = one(learner, images, labels, jax.tree.map(lambda x, i=i: x[i], rows))
+            told.append(numbers)
+        return learner, jax.tree.map(lambda *x: jnp.stack(x).mean(), *told)
+
+    return by_updates if jax.default_backend() == "cpu" else jax.jit(whole, donate_argnums=0)
+
+
+def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -> np.ndarray:
+    """A compiled function's rows for any number of images [N, H, W, 3], a fixed number at a time; fewer are padded."""
+    sizes = EVALUATED if jax.default_backend() == "cpu" else DEVICE_EVALUATED
+    rows, waiting, first = [], None, 0
+    while first < len(images) or waiting is None:
+        size = next((n for n in sizes if n >= len(images) - first), sizes[-1])
+        part = images[first : first + size]
+        padded = np.concatenate([part, np.zeros((size - len(part), *part.shape[1:]), part.dtype)])
+        asked = function(jnp.asarray(padded)), len(part)
+        if waiting is not None:  # copied while an accelerator works on the next
+            rows.append(np.asarray(waiting[0]))
+        waiting, first = asked, first + size
+    rows.append(np.asarray(waiting[0])[: waiting[1]])  # cut here: on a device each length would be compiled
+    return np.concatenate(rows)
+
+
+def padded_size(count: int) -> int:
+    """Rows of a batch that holds `count`: few sizes, because each is compiled. Powers of two, on accelerators of four,
+    where little is faster than 16."""
+    if jax.default_backend() == "cpu":
+        return 1 << (count - 1).bit_length()
+    return max(16, 1 << ((count - 1).bit_length() + 1) // 2 * 2)

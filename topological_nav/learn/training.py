@@ -1,0 +1,359 @@
+"""A dataset and settings in, a run folder out: backbone without labels where asked for, then rooms or passages.
+
+RUN/config.yaml      settings; a run that is started again with the same ones goes on
+    versions.json    packages, device, commit
+    metrics.jsonl    one line an epoch, of both phases
+    checkpoint.msgpack  the last epoch's learner
+    weights.msgpack, network.json   what was learned, and how to build it
+    results.json     scores on what was held out
+    curves.png
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from sklearn.metrics import confusion_matrix, f1_score
+
+from interactive_nav_common.config import to_dict
+from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.versions import versions
+from topological_nav.config import PITCHES, TrainConfig
+from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
+from topological_nav.data.passages import logits_at
+from topological_nav.errors import RunError, readable
+from topological_nav.learn.learning import (
+    Learner,
+    in_batches,
+    labelled_epoch,
+    make_learner,
+    paired_epoch,
+    variable_shapes,
+    with_backbone,
+)
+from topological_nav.learn.localise import localisation_scores
+from topological_nav.learn.networks import Contrast, Network
+from topological_nav.learn.runs import (
+    CHECKPOINT,
+    DESCRIPTION,
+    RESULTS,
+    WEIGHTS,
+    claimed,
+    cut_metrics,
+    read_checkpoint,
+    read_description,
+    read_weights,
+    restored,
+    run_epochs,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A network and its weights."""
+
+    network: Network
+    variables: dict[str, Any]
+    about: dict[str, Any]
+    """Content of network.json."""
+
+    @property
+    def stored(self) -> str:
+        """Names the numbers that it computes with: the run's digest, and the precision of an exported network."""
+        return self.about["digest"] + (f"-{self.about['export']['precision']}" if "export" in self.about else "")
+
+    def logits(self, images: np.ndarray) -> np.ndarray:
+        """[N, outputs] of images [N, H, W, 3] u8, of the size that it learned from.
+
+        Raises:
+            RunError: images of another size.
+        """
+        return self._rows(images, "__call__")
+
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """Probability that the way ahead is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`.
+
+        Raises:
+            RunError: images of another size.
+        """
+        logits = self.logits(images).astype(float)
+        return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
+
+    def embed(self, images: np.ndarray) -> np.ndarray:
+        """[N, D] localisation embeddings of images [N, H, W, 3] u8; see `Network.embed`."""
+        return self._rows(images, "embed")
+
+    def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
+        expected = (self.about["data"]["height"], self.about["data"]["width"], 3)
+        if images.shape[1:] != expected:
+            raise RunError(
+                f"images are {images.shape[1:]}, expected {expected}, the size that the network learned from"
+            )
+        method_of = _applied(self.network, method)  # type: ignore[arg-type]  (flax modules are hashable)
+        return in_batches(functools.partial(method_of, self.variables), images)
+
+
+@functools.cache
+def _applied(network: Network, method: str) -> Callable[..., jax.Array]:
+    """A network's method, compiled once."""
+    return jax.jit(lambda variables, images: network.apply(variables, images, method=method))  # type: ignore[return-value]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Work:
+    """What a run learns from and is scored by."""
+
+    task: str
+    outputs: int
+    images: np.ndarray
+    """[N, H, W, 3] u8 for learning."""
+    labels: np.ndarray
+    """[N] i32; of passages [N, outputs]."""
+    places: np.ndarray
+    """[P, K, H, W, 3] u8, the headings around places of training, for learning without labels."""
+    held_out: np.ndarray
+    """[M, H, W, 3] u8."""
+    truth: np.ndarray
+    """[M] i32; of passages [M, outputs]."""
+    groups: dict[str, np.ndarray]
+    """Name -> rows of `held_out` that are scored together."""
+    names: tuple[str, ...]
+    rooms: RoomImages
+    lengths_m: tuple[float, ...] = ()
+    """Of the outputs, of passages."""
+    scored: int = 0
+    """Which of them is scored, of passages."""
+
+
+def train(
+    task: str,
+    dataset: Path,
+    out: Path,
+    config: TrainConfig,
+    tell: Callable[[str], None] = lambda _: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> dict[str, Any] | None:
+    """Trains a network, or goes on with it.
+
+    Args:
+        task: rooms or passages.
+        dataset: a dataset folder.
+        out: the run folder.
+        config: settings.
+        tell: told one line an epoch.
+        should_stop: asked after every epoch.
+
+    Returns:
+        The content of results.json; None where it was stopped before the end.
+
+    Raises:
+        DatasetError: the dataset cannot be used.
+        RunError: `out` holds another run, or the backbone to start from does not fit.
+    """
+    header, data = read_header(dataset)
+    work = _work(task, dataset, config)
+    with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        shape = (data.height, data.width)
+        network = Network(task, config.network, config.width, config.hidden, work.outputs)
+        tx = optax.adam(config.learning_rate)
+        learner = make_learner(network, shape, tx, config.seed)
+        phases: list[tuple[str, int]] = [("labels", config.epochs)]
+        if config.init == "selfsup":
+            phases.insert(0, ("pairs", config.selfsup_epochs))
+        elif config.init != "scratch":
+            learner = _started_from(learner, Path(config.init))
+        saved = read_checkpoint(out / CHECKPOINT)
+        cut_metrics(out, ("pairs", "labels"), saved)
+        for phase, epochs in phases:
+            if phase == "pairs":
+                contrast, contrast_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
+                current = make_learner(contrast, shape, contrast_tx, config.seed)
+                epoch = paired_epoch(contrast, contrast_tx, config.selfsup_batch)
+                images, labels = work.places, np.zeros(0, np.int32)
+            else:
+                current, images, labels = learner, work.images, work.labels
+                epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
+            first = 0
+            if saved and saved["phase"] == phase:
+                first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
+            elif saved and phase == "pairs":
+                continue  # a checkpoint of the later phase holds this one's outcome
+            shown, truth = jnp.asarray(images), jnp.asarray(labels)
+            keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
+
+            def one(learner, number, epoch=epoch, shown=shown, truth=truth, keys=keys):
+                return epoch(learner, shown, truth, jax.random.fold_in(keys, number))
+
+            current, done = run_epochs(phase, current, one, range(first, epochs), out, tell, should_stop)
+            if not done:
+                return None
+            if phase == "pairs":
+                learner = with_backbone(learner, {"params": current.params, "batch_stats": current.batch_stats})
+            else:
+                learner = current
+        variables = {"params": learner.params, "batch_stats": learner.batch_stats}
+        about = {
+            "task": task,
+            "backbone": config.network,
+            "width": config.width,
+            "hidden": config.hidden,
+            "outputs": work.outputs,
+            "names": list(work.names),
+            **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
+            "data": header["settings"],
+            "fov_deg": header["fov_deg"],
+            "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
+        }
+        results = _scores(save_trained(out, Trained(network, variables, about)), work)
+        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+        return results
+
+
+def save_trained(out: Path, trained: Trained) -> Trained:
+    """Writes a network as `load_trained` reads it; returns it with the digest of its weights in `about`."""
+    weights = flax.serialization.to_bytes(jax.device_get(trained.variables))
+    kept = {name: value for name, value in trained.about.items() if name != "export"}
+    about = {**kept, "digest": hashlib.sha256(weights).hexdigest()}
+    with whole_file(out / WEIGHTS) as partial:
+        partial.write_bytes(weights)
+    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
+    return dataclasses.replace(trained, about=about)
+
+
+def load_trained(run: Path) -> Trained:
+    """The network of a finished run, or of an export of one (`export`): its weights are f32 in memory either way.
+
+    Raises:
+        RunError: no such run, or it is not finished, damaged, or a passage detector of one length without saying which.
+    """
+    run = Path(run)
+    about = read_description(run, "network", "TASK")
+    if about["task"] == "passages" and "lengths_m" not in about:
+        raise RunError(
+            f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
+            "its dataset again and train it again"
+        )
+    with readable(run / DESCRIPTION, RunError, "train again"):
+        network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
+        template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
+    return Trained(network, read_weights(run, template, about), about)
+
+
+def _work(task: str, dataset: Path, config: TrainConfig) -> _Work:
+    rooms = load_rooms(dataset)
+    size = rooms.images.shape[3:]
+    around = rooms.images.shape[2]
+    places = rooms.images[~rooms.test].reshape(-1, around, *size)
+    if task == "passages":
+        passages: PassageImages = load_passages(dataset)
+        held = passages.test
+        groups = {"all": np.arange(int(held.sum()))}
+        return _Work(
+            task, len(passages.lengths_m), passages.images[~held], passages.free[~held].astype(np.int32), places,
+            passages.images[held], passages.free[held].astype(np.int32), groups, ("blocked", "free"), rooms,
+            passages.lengths_m, passages.scored,
+        )  # fmt: skip
+    pitches = list(range(3)) if config.pitch == "all" else [PITCHES.index(config.pitch)]
+    learned = rooms.images[~rooms.test][:, pitches]
+    label = np.broadcast_to(rooms.label[~rooms.test][:, None, None], learned.shape[:3])
+    held = rooms.images[rooms.test][:, :, ::3]
+    truth = np.broadcast_to(rooms.label[rooms.test][:, None, None], held.shape[:3])
+    pitch = np.broadcast_to(np.arange(3)[None, :, None], held.shape[:3]).ravel()
+    groups = {name: np.flatnonzero(pitch == i) for i, name in enumerate(PITCHES)}
+    if config.pitch == "all":
+        groups["all"] = np.arange(len(pitch))
+    else:
+        groups = {config.pitch: groups[config.pitch]}
+    return _Work(
+        task, len(rooms.names), learned.reshape(-1, *size), label.ravel().astype(np.int32), places,
+        held.reshape(-1, *size), truth.ravel().astype(np.int32), groups, rooms.names, rooms,
+    )  # fmt: skip
+
+
+def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
+    """Accuracy and macro F1 of what was held out, and how well the embedding localises."""
+    results: dict[str, Any] = {
+        "task": work.task,
+        "parameters": trained.about["parameters"],
+        "trained_on": len(work.images),
+    }
+    if len(work.held_out):
+        logits, truth = trained.logits(work.held_out), work.truth
+        if work.task == "passages":
+            results["lengths"] = length_scores(logits, truth, work.lengths_m)
+            found, truth = (logits[:, work.scored] > 0).astype(np.int32), truth[:, work.scored]
+        else:
+            found = logits.argmax(1)
+        results["groups"] = {
+            name: {
+                "images": len(rows),
+                "accuracy": float((found[rows] == truth[rows]).mean()),
+                "macro_f1": float(f1_score(truth[rows], found[rows], average="macro")),
+            }
+            for name, rows in work.groups.items()
+        }
+        if work.task == "passages":
+            results["confusion"] = confusion_matrix(truth, found, labels=[0, 1]).tolist()
+    results["localisation"] = localisation(trained, work.rooms)
+    return results
+
+
+def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[float]) -> list[dict[str, float]]:
+    """For each length the share of images that are free so far, and of those judged right; logits and free [N, L]."""
+    return [
+        {"ahead_m": length, "free": float(truth.mean()), "accuracy": float(((logit > 0) == truth).mean())}
+        for length, logit, truth in zip(lengths_m, logits.T, free.T, strict=True)
+    ]
+
+
+def localisation(trained: Trained, rooms: RoomImages) -> dict[str, Any]:
+    """Scores of the embedding: training positions as nodes, every third level image of test positions as queries.
+
+    Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`.
+    """
+    level, size = PITCHES.index("level"), rooms.images.shape[3:]
+    rows, weights = {}, []
+    for scene in np.unique(rooms.scene):
+        nodes, queries = ((rooms.scene == scene) & (rooms.test == held) for held in (False, True))
+        if not nodes.any() or not queries.any():
+            continue
+        shown = rooms.images[nodes][:, level]
+        embedded = trained.embed(shown.reshape(-1, *size)).reshape(*shown.shape[:2], -1)
+        asked = rooms.images[queries][:, level, ::3]
+        each = asked.shape[1]
+        name = rooms.names[rooms.label[nodes][0]].rpartition("/")[0]
+        rows[name] = localisation_scores(
+            trained.embed(asked.reshape(-1, *size)),
+            np.repeat(rooms.xy_w[queries], each, 0),
+            np.repeat(rooms.label[queries], each),
+            embedded,
+            rooms.xy_w[nodes],
+            rooms.label[nodes],
+        )
+        weights.append(int(queries.sum()))
+    if rows:
+        keys = next(iter(rows.values()))
+        rows["mean"] = {k: float(np.average([r[k] for r in rows.values()], weights=weights)) for k in keys}
+    return rows
+
+
+def _started_from(learner: Learner, run: Path) -> Learner:
+    donor = load_trained(run)
+    try:
+        return with_backbone(learner, donor.variables)
+    except ValueError as error:
+        raise RunError(
+            f"init: {run} does not fit: {error}; it is {donor.about['backbone']} of width {donor.about['width']}"
+        ) from None

@@ -1,0 +1,1 @@
+"""Topological maps: built, planned on, asked where an image is."""

@@ -1,0 +1,266 @@
+"""A scene and two trained networks in, its topological map out: nodes placed, images drawn, edges judged."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.config import to_dict
+from interactive_nav_common.files import whole_file
+from topological_nav.config import DataConfig, MapConfig
+from topological_nav.data.dataset import headings, lens_of
+from topological_nav.errors import MapError, SpaceError
+from topological_nav.learn.training import Trained, load_trained
+from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
+from topological_nav.maps.sight import NetworkSight, Sight
+from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
+from topological_nav.scenes.rooms import Rooms, find_rooms, recorded_rooms
+from topological_nav.scenes.space import FreeSpace, free_space
+from topological_nav.settings import overlaid
+
+CHUNK = 252
+"""Images drawn between two reports: fourteen calls of the renderer."""
+Progress = Callable[[str, int, int], None]
+CPU_SUPERSAMPLE = 2
+"""Beyond it drawing is what a CPU mostly does, and the networks answer nearly the same (docs/topological.md)."""
+SAME = ("robot", "engine", "width", "height", "fov_deg", "headings")
+"""What two networks' images must have in common to look through one camera."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """A map, and what it was made in and found to be."""
+
+    map: TopologicalMap
+    space: FreeSpace
+    free: np.ndarray
+    """[E] bool: whether each edge's way is free on the plan."""
+    scores: dict[str, Any]
+    """Nodes a room, connectedness, and how the edges compare with the plan."""
+
+
+def build_map(
+    scene_folder: Path,
+    localiser_run: Path,
+    detector_run: Path,
+    config: MapConfig,
+    progress: Progress = lambda *_: None,
+    parts: Path | None = None,
+) -> Built:
+    """Builds a scene's map.
+
+    Args:
+        scene_folder: the scene.
+        localiser_run: run folder of a network whose embedding localises.
+        detector_run: run folder of a passage detector.
+        config: of the map.
+        progress: told what is drawn, images done and images in all; may raise to stop.
+        parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
+
+    Raises:
+        RunError: a run is not finished.
+        MapError: the networks learned from different cameras, or the second judges no passages.
+        SceneError, SpaceError: the scene cannot be used.
+    """
+    localiser, detector = load_trained(localiser_run), load_trained(detector_run)
+    data = drawn_for(camera_of(localiser, detector), config.supersample)
+    scene, robot = load_scene(scene_folder), get_robot(data.robot)
+    space = free_space(scene, robot.height_m)
+    known = recorded_rooms(scene.digest)
+    rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
+    judged = overlaid(DataConfig(), detector.about["data"], str(detector_run))
+    margin_m, points = judged.passage_margin_m, judged.passage_points
+    xy, lacking = place_nodes(space, rooms, config, margin_m, points)
+    if not len(xy):
+        raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
+    around = headings(data)
+    pictures = _Pictures(scene, data, robot, progress, parts)
+    pictures.total = len(xy) * len(around)
+    images = pictures.draw(np.repeat(xy, len(around), 0), np.tile(around, len(xy)), "nodes")
+    embeddings = localiser.embed(images).reshape(len(xy), len(around), -1)
+
+    def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        if config.edge_image == "nearest":
+            turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
+            looked = images.reshape(len(xy), len(around), *images.shape[1:])[edges[:, 0], turn]
+        else:
+            pictures.total += len(edges)
+            looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
+        return detector.passage(looked, lengths(xy, edges))
+
+    about = {
+        "settings": to_dict(config),
+        "data": to_dict(data),
+        "localiser": localiser.about["digest"],
+        "detector": detector.about["digest"],
+        "margin_m": margin_m,
+        "points": points,
+    }
+    made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
+    free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
+    scores = _scores(made, free, config, lacking)
+    if config.check:
+        places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
+        pictures.total += len(places) * len(around)
+        images = pictures.draw(np.repeat(places, len(around), 0), np.tile(around, len(places)), "check")
+        looked = images.reshape(len(places), len(around), *images.shape[1:])
+        for match in ("aligned", "nearest"):
+            sight = NetworkSight(made, localiser, detector, match)
+            scores |= localisation_check(sight, made, looked, around, places)
+    return Built(made, space, free, scores)
+
+
+def localisation_check(
+    sight: Sight, made: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
+) -> dict[str, str]:
+    """How well a map localises, in words, by all images of a place and by its first alone.
+
+    Args:
+        sight: of the map.
+        made: the map.
+        images: [P, K, ...] of P places.
+        heading_rad: [K] along which they were taken.
+        xy_w: [P, 2] m, where.
+    """
+    count, around = images.shape[:2]
+    each = sight.distances(images.reshape(-1, *images.shape[2:]), np.tile(heading_rad, count))
+    each = each.reshape(count, around, -1)
+    away = np.linalg.norm(xy_w[:, None] - made.xy_w, axis=-1)
+    said = {}
+    for what, evidence in (
+        (f"{around} images", each.sum(1) if sight.summed else each.min(1)),
+        ("1 image", each[:, 0]),
+    ):
+        found = evidence.argmin(-1)
+        error = away[np.arange(count), found]
+        said[f"localised by {what}, {'aligned' if sight.summed else 'nearest'}"] = (
+            f"nearest node {(found == away.argmin(-1)).mean():.3f}, within 1.5 m {(error < 1.5).mean():.3f}, "
+            f"median error {np.median(error):.2f} m (least possible {np.median(away.min(-1)):.2f} m)"
+        )
+    return said
+
+
+def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, data: DataConfig) -> TopologicalMap:
+    """The map that perfect networks would make: ways that are free on the plan have p = 1, others 0.
+
+    It has no embeddings: only `sight.TrueSight` can localise on it.
+    """
+    margin_m, points = data.passage_margin_m, data.passage_points
+    xy, _ = place_nodes(space, rooms, config, margin_m, points)
+
+    def probability(edges: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return space.segment_free(xy[edges[:, 0]], xy[edges[:, 1]], points, margin_m).astype(float)
+
+    about = {"settings": to_dict(config), "made": "from the plan"}
+    nothing = np.zeros((len(xy), data.headings, 0))
+    return assemble(scene.name, scene.digest, xy, rooms.of(xy), nothing, config.edge_m, probability, about)
+
+
+def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
+    """How a navigator's images are drawn: as networks learned, but so many times larger before they are averaged.
+
+    Args:
+        data: what the networks learned from.
+        supersample: as asked for; None: as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
+
+    Raises:
+        UserError: the engine that they learned from is not installed.
+    """
+    need_engine(data.engine)
+    if supersample is None:
+        most = CPU_SUPERSAMPLE if jax.default_backend() == "cpu" else data.supersample
+        supersample = min(data.supersample, most)
+    return dataclasses.replace(data, supersample=supersample)
+
+
+def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
+    """What draws a scene as a dataset's images were drawn."""
+    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
+
+
+def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
+    """The settings of the camera that both networks learned from.
+
+    Raises:
+        MapError: they learned from different cameras, or the second judges no passages.
+    """
+    if detector.about["task"] != "passages":
+        raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
+    first, second = ({**n.about["data"], "fov_deg": n.about["fov_deg"]} for n in (localiser, detector))
+    for name in SAME:
+        if first[name] != second[name]:
+            raise MapError(
+                f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
+                "train both on one dataset"
+            )
+    return overlaid(DataConfig(), first, "network.json")
+
+
+class _Pictures:
+    """Level images of a scene, a chunk at a time, each kept in a file until the map is made."""
+
+    def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None):
+        self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
+        self._done, self.total = 0, 0
+        self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()
+
+    @functools.cached_property
+    def _renderer(self) -> SceneRenderer:
+        return renderer_of(self._scene, self._data)
+
+    def draw(self, xy: np.ndarray, heading: np.ndarray, what: str) -> np.ndarray:
+        """[N, H, W, 3] u8: images from places [N, 2] along headings [N]."""
+        drawn = []
+        for first in range(0, len(xy), CHUNK):
+            rows = slice(first, first + CHUNK)
+            drawn.append(self._chunk(xy[rows], heading[rows]))
+            self._done += len(drawn[-1])
+            self._progress(what, self._done, self.total)
+        return np.concatenate(drawn)
+
+    def _chunk(self, xy: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        kept = None
+        if self._parts is not None:
+            poses = np.concatenate([xy, heading[:, None]], 1).astype(float)
+            kept = self._parts / f"{hashlib.sha256(self._of + poses.tobytes()).hexdigest()[:16]}.npy"
+            if kept.is_file():
+                with contextlib.suppress(ValueError, EOFError, OSError):  # a damaged or vanished one is drawn again
+                    return np.load(kept)
+        images = self._renderer.draw(camera_pose(self._robot, xy, heading, np.zeros(len(xy))))
+        if kept is not None:
+            with whole_file(kept) as partial, open(partial, "wb") as file:
+                np.save(file, images)
+        return images
+
+
+def forget(parts: Path) -> None:
+    """Removes the images that `build_map` kept, once the map is written."""
+    for path in parts.glob("*.npy"):
+        path.unlink(missing_ok=True)  # by another process that made the same map
+    with contextlib.suppress(OSError):
+        parts.rmdir()
+
+
+def _scores(made: TopologicalMap, free: np.ndarray, config: MapConfig, lacking: list[str]) -> dict[str, Any]:
+    open_ = made.p >= config.passable
+    parts = made.open_parts(config.passable)
+    scores: dict[str, Any] = {
+        "nodes a room": " ".join(str(n) for n in np.bincount(made.room)),
+        "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
+        "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
+        "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
+    }
+    if lacking:
+        scores["lacking"] = "; ".join(lacking)
+    return scores

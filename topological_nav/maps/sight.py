@@ -1,0 +1,163 @@
+"""What a navigator makes of images: how far each node of its map is from where they were taken, and what lies ahead.
+
+The navigator itself never looks into an image. `NetworkSight` asks trained networks; `TrueSight` stands in for perfect
+ones in tests and measurements: its "images" are poses.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from topological_nav.errors import MapError
+from topological_nav.learn.training import Trained
+from topological_nav.maps.graph import TopologicalMap
+from topological_nav.scenes.space import FreeSpace
+
+OUT_OF_SIGHT_M = 100.0
+"""Added to the distance of a node behind a wall, for `TrueSight`."""
+LINE_POINTS = 50
+"""Looked up on a line of sight."""
+
+
+class Sight(Protocol):
+    """Judges images, in batches; an image is one row of an array, of any shape that the judge understands."""
+
+    summed: bool
+    """Whether distances of several images are summed; else the least counts."""
+
+    def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """Images [n, ...] taken along headings [n] to [n, N]: how far each node is."""
+        ...
+
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """Probability that the way ahead is navigable for lengths [n], or for M lengths of each [n, M]; as they are.
+
+        A number is a length for all images, and gives [n].
+        """
+        ...
+
+
+class NetworkSight:
+    """A map, the network that embeds and the one that judges passages."""
+
+    def __init__(self, made: TopologicalMap, localiser: Trained, detector: Trained, match: str = "aligned"):
+        """Checks that the map is of these networks.
+
+        Args:
+            made: the map.
+            localiser: its embedding localises.
+            detector: judges passages.
+            match: aligned or nearest, see `config.NavigatorConfig.match`.
+
+        Raises:
+            MapError: the map was made with other networks, whose embeddings mean something else.
+        """
+        for name, network in (("localiser", localiser), ("detector", detector)):
+            used, own = made.about.get(name, ""), network.about["digest"]
+            if used != own:
+                raise MapError(
+                    f"the map of '{made.scene}' was made with {name} {used[:12] or 'unknown'}, this one is {own[:12]}; "
+                    "build the map again with it, or name the runs it was made with"
+                )
+        self._nodes = made.embeddings.astype(float)
+        self._localiser, self._detector, self.summed = localiser, detector, match == "aligned"
+
+    def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """[n, N] Euclidean distances of embeddings: to the node's image of that heading, or to its nearest."""
+        asked = self._localiser.embed(images).astype(float)
+        nodes, around = self._nodes, self._nodes.shape[1]
+        if self.summed:
+            turn = np.rint(np.asarray(heading_rad) / (2 * np.pi) * around).astype(int) % around
+            out = np.empty((len(asked), len(nodes)))
+            for k in np.unique(turn):
+                rows = turn == k
+                out[rows] = _apart(asked[rows], nodes[:, k])
+            return out
+        return _apart(asked, nodes.reshape(-1, nodes.shape[-1])).reshape(len(asked), -1, around).min(-1)
+
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """The detector's probability; see `Sight.passage`."""
+        return self._detector.passage(images, ahead_m)
+
+
+class TrueSight:
+    """The truth in the place of networks: images are poses [n, 3], x and y (m) and yaw (rad), world frame."""
+
+    summed = True
+
+    def __init__(self, made: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
+        """Takes the plan.
+
+        Args:
+            made: the map; of it only where its nodes stand.
+            space: free space of its scene.
+            margin_m: clearance that it needs.
+        """
+        self._xy, self._space, self._margin_m = made.xy_w.astype(float), space, margin_m
+
+    def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """[n, N] m to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
+        del heading_rad
+        here = np.broadcast_to(images[:, None, :2], (len(images), len(self._xy), 2))
+        seen = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
+        return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~seen
+
+    def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
+        """1 where the way ahead is free, else 0; see `Sight.passage`.
+
+        Who stands nearer to an obstacle than the margin may leave it: the way may begin as near, but come no nearer.
+        """
+        ahead = np.asarray(ahead_m, float)
+        ahead = np.broadcast_to(ahead, (len(images), *ahead.shape[1:]))
+        poses = images.reshape(len(images), *[1] * ahead.ndim, -1)
+        xy, yaw = poses[..., :2], poses[..., 2]
+        along = (ahead[..., None] * np.linspace(0.0, 1.0, LINE_POINTS))[..., None]
+        room = self._space.at(xy + along * np.stack([np.cos(yaw), np.sin(yaw)], -1))
+        least = np.minimum(self._margin_m, room[..., :1])
+        free = ((room >= least - 1e-9) & (room > 0.0)).all(-1) & (room[..., -1] >= self._margin_m - 1e-9)
+        return free.astype(float)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[n, m] Euclidean distances of rows [n, D] and [m, D], in double precision as in `localise.nearest_node`."""
+    squares = (a**2).sum(-1)[:, None] + (b**2).sum(-1) - 2.0 * a @ b.T
+    return np.sqrt(np.maximum(squares, 0.0))
+
+
+class PassagePolicy:
+    """The baseline that drives by the passage detector alone: straight on while it agrees, else it swings about.
+
+    It turns left by `SWEEP_RAD`, then right by twice as much, and so on wider, until the detector agrees.
+    """
+
+    period = 3
+    """Control steps between two looks; in between the last command holds."""
+    CRUISE_M_S = 0.4
+    TURN_RAD_S = 0.5
+    SWEEP = 4
+    """Looks (of 0.15 rad) that the first turn to the left lasts."""
+
+    def __init__(self, sight: Sight, passable: float = 0.5, ahead_m: float = 1.0):
+        """Takes whose judgement it trusts.
+
+        Args:
+            sight: judges images.
+            passable: least probability of a free way.
+            ahead_m: how far it must be free: what it takes to stop and turn.
+        """
+        self._sight, self._passable, self._ahead_m = sight, passable, ahead_m
+
+    def start(self, batch: int) -> Any:
+        """[batch] i32 looks since the way was last free."""
+        return np.zeros(batch, np.int32)
+
+    def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """See `driving.LocalPolicy`."""
+        free = self._sight.passage(images, self._ahead_m) >= self._passable
+        # Turns end after 1, 3, 5, ... times SWEEP looks: sides change after SWEEP * k^2.
+        side = np.where(np.floor(np.sqrt(state / self.SWEEP)).astype(int) % 2 == 0, 1.0, -1.0)
+        linear = np.where(free, self.CRUISE_M_S, 0.0)
+        angular = np.where(free, 0.0, side * self.TURN_RAD_S)
+        return np.where(free, 0, state + 1).astype(np.int32), linear, angular

@@ -1,0 +1,492 @@
+"""Images, heading and time in, velocity commands out: the navigator, a state machine over a batch of episodes.
+
+    LOCALISE  turn about, looking along `images` headings; the nearest node is where the robot is
+       |      there: ARRIVED; else Dijkstra gives the next edge
+    FACE      turn to the edge's angle by PID, and ask the passage detector
+       |      whether the way is free for as long as the edge is; agrees: DRIVE; else
+    SWING     the same at headings left and right of it, wider and wider
+       |      none agrees: the edge costs more from now on; another one: FACE, else all round; still none:
+    LEAN      turn to the most open of the headings asked, and drive all the same
+    DRIVE     the local policy, in runs of 5 s, or until the edge's head is passed; after twelve: LOCALISE. After each
+              a glance tells by the image ahead whether the robot is still at its node or at a neighbour of it. An
+              edge that was driven in vain costs more from now on. Plan anew from there: FACE
+
+`Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
+sees a position, and looks at images only through `sight.Sight`. `Pilot` keeps the state for those who drive one robot.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from interactive_nav_common.errors import ConfigError
+from topological_nav.config import NavigatorConfig
+from topological_nav.drives.driving import LocalPolicy
+from topological_nav.learn.learning import padded_size
+from topological_nav.maps.graph import TopologicalMap
+from topological_nav.maps.sight import Sight
+
+LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
+PHASES = ("localise", "face", "swing", "lean", "drive", "arrived", "stopped", "timed out")
+TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
+PENALTY = 3.0
+"""Added to the weight of an edge that proved blocked: as if it were free with a probability 20 times less."""
+GOLDEN_RAD = np.pi * (3.0 - np.sqrt(5.0))
+"""Where the map has no way, headings are tried that are this far apart: never the same twice."""
+SLACK_S = 1e-3
+"""Clocks of simulators are sums of steps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
+
+    phase: np.ndarray
+    """i8, one of `PHASES`."""
+    goal: np.ndarray
+    """i32 node."""
+    node: np.ndarray
+    """i32 node of the last localisation, -1 before the first."""
+    edge: np.ndarray
+    """i32 edge that is followed; -1 where the map has no way, or none is planned yet."""
+    began_s: np.ndarray
+    """When the episode began; NaN before its first step."""
+    looks: np.ndarray
+    """i32 images taken in this localisation."""
+    evidence: np.ndarray
+    """[B, N] what they say: sums, or least, of distances."""
+    base_rad: np.ndarray
+    """The edge's angle; in a localisation, the first heading."""
+    target_rad: np.ndarray
+    """Heading to reach."""
+    swing: np.ndarray
+    """i32 headings asked since the edge was planned."""
+    best_p: np.ndarray
+    best_rad: np.ndarray
+    """The most open of them, for `NavigatorConfig.clear_m`."""
+    penalty: np.ndarray
+    """[B, E] added to the edges' weights."""
+    driven: np.ndarray
+    """i32 edge that was driven since the robot was last found, -1: none."""
+    lost: np.ndarray
+    """i32 times that the map had no way."""
+    integral: np.ndarray
+    """PID: integral term, rad/s."""
+    error_rad: np.ndarray
+    """PID: error of the step before; NaN where it starts."""
+    clock_s: np.ndarray
+    """Time of the step before."""
+    run: np.ndarray
+    """i32 runs done since the robot last looked about."""
+    run_end_s: np.ndarray
+    watch_s: np.ndarray
+    """Next time to look, within a run, whether the edge's head is passed."""
+    least: np.ndarray
+    """Least distance to the head in this run, as `Sight.distances` tells it."""
+    acts: np.ndarray
+    """i32 control steps of this run."""
+    linear: np.ndarray
+    """m/s, the last command."""
+    angular: np.ndarray
+    """rad/s."""
+    hidden: Any
+    """The local policy's."""
+
+    def take(self, rows: np.ndarray) -> State:
+        """Those rows of the batch."""
+        return jax.tree.map(lambda x: np.asarray(x)[rows], self)
+
+    @property
+    def over(self) -> np.ndarray:
+        """[B] bool: arrived, stopped or out of time."""
+        return self.phase >= ARRIVED
+
+
+jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(State)], [])
+
+
+@dataclasses.dataclass(frozen=True)
+class Events:
+    """What happened in a step, [B] bool each; whose run ended may be told to stop by those who know better."""
+
+    localised: np.ndarray
+    """Turned about, and `State.node` is new."""
+    glanced: np.ndarray
+    """Saw a neighbour of the last node after a run, and `State.node` is new."""
+    lost: np.ndarray
+    """The map has no way from there."""
+    blocked: np.ndarray
+    """No heading near the edge's is open."""
+    run_started: np.ndarray
+    run_ended: np.ndarray
+    arrived: np.ndarray
+    timed_out: np.ndarray
+
+
+class Navigator:
+    """A map, eyes and a local policy."""
+
+    def __init__(self, made: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
+        """Takes what it needs.
+
+        Args:
+            made: the map; positions of its nodes are not used.
+            sight: judges images.
+            policy: drives along an edge. A member `period` says that it looks at every so manieth image only.
+            config: settings.
+
+        Raises:
+            ConfigError: as many images a localisation as the map's nodes have no share of.
+        """
+        around = made.embeddings.shape[1]
+        if config.match == "aligned" and around % config.images:
+            raise ConfigError(f"images is {config.images}, expected a divisor of {around}, the map's images a node")
+        self.map = dataclasses.replace(made, metre_cost=config.metre_cost)
+        self.sight, self.policy, self.config = sight, policy, config
+        self._tolerance = np.deg2rad(config.tolerance_deg)
+        self._period = int(getattr(policy, "period", 1))
+        self._near = np.eye(len(made.xy_w), dtype=bool)
+        self._all_round = int(np.ceil(360.0 / config.swing_deg)) - 1
+        self._near[made.edges[:, 0], made.edges[:, 1]] = True
+        self._ask_m = _asked_m(made.length_m, config)
+
+    def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+        """[B] i32: the nodes nearest to goals, by the images [B, K, ...] taken there along headings [K]."""
+        batch, count = images.shape[:2]
+        away = self.sight.distances(images.reshape(batch * count, *images.shape[2:]), np.tile(heading_rad, batch))
+        away = away.reshape(batch, count, -1)
+        return (away.sum(1) if self.sight.summed else away.min(1)).argmin(-1).astype(np.int32)
+
+    def start(self, goal: np.ndarray) -> State:
+        """B fresh episodes.
+
+        Args:
+            goal: [B] nodes, of `goal_nodes`.
+        """
+        batch, zero = len(goal), np.zeros(len(goal))
+        count = np.zeros(batch, np.int32)
+        return State(
+            phase=np.full(batch, LOCALISE, np.int8),
+            goal=np.asarray(goal, np.int32),
+            node=count - 1,
+            edge=count - 1,
+            began_s=zero + np.nan,
+            looks=count,
+            evidence=self._no_evidence(batch),
+            base_rad=zero,
+            target_rad=zero + np.nan,
+            swing=count,
+            best_p=zero - 1.0,
+            best_rad=zero,
+            penalty=np.zeros((batch, len(self.map.edges))),
+            driven=count - 1,
+            lost=count,
+            integral=zero,
+            error_rad=zero + np.nan,
+            clock_s=zero + np.nan,
+            run=count,
+            run_end_s=zero,
+            watch_s=zero,
+            least=zero + np.inf,
+            acts=count,
+            linear=zero,
+            angular=zero,
+            hidden=jax.tree.map(np.asarray, self.policy.start(batch)),
+        )
+
+    def stop(self, state: State, rows: np.ndarray) -> State:
+        """The state with some episodes [B] bool ended from outside."""
+        phase = np.where(rows & ~state.over, STOPPED, state.phase).astype(np.int8)
+        return dataclasses.replace(state, phase=phase, linear=state.linear * ~rows, angular=state.angular * ~rows)
+
+    def looks(self, state: State, heading_rad: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
+        """[B] bool: whose image `step` will look at, given these; the others' need not be taken."""
+        heading = np.asarray(heading_rad, float)
+        turning = _any_of(state.phase, TURNING)
+        # A first target is the heading itself, or near it.
+        target = np.where(np.isnan(state.target_rad), self._first_heading(heading), state.target_rad)
+        reached = turning & (np.abs(wrap(target - heading)) <= self._tolerance)
+        ends = np.asarray(time_s) >= state.run_end_s - SLACK_S
+        acts = ends | (state.acts % self._period == 0) | self._watches(state, np.asarray(time_s))
+        return reached | ((state.phase == DRIVE) & acts)
+
+    def step(
+        self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
+    ) -> tuple[State, np.ndarray, np.ndarray, Events]:
+        """One control step.
+
+        Args:
+            state: of `start` or `step`.
+            images: [B, ...] what the robots see now; those that `looks` leaves out may be anything.
+            heading_rad: [B] absolute, world frame, as by a compass.
+            time_s: [B] or one for all; must not go back.
+
+        Returns:
+            The new state, linear [B] (m/s) and angular [B] (rad/s) velocity to command, and what happened.
+        """
+        batch = len(state.phase)
+        heading = np.asarray(heading_rad, float)
+        time = np.broadcast_to(np.asarray(time_s, float), (batch,))
+        s = _Work(state, batch)
+        fresh = np.isnan(s.began_s)
+        s.began_s[fresh] = time[fresh]
+        late = ~state.over & (time - s.began_s >= self.config.limit_s - SLACK_S)
+        s.phase[late], s.timed_out[late] = TIMED_OUT, True
+
+        begins = (s.phase == LOCALISE) & np.isnan(s.target_rad)
+        s.base_rad[begins] = s.target_rad[begins] = self._first_heading(heading[begins])
+
+        self._localise(s, images, heading)
+        self._face(s, images, heading, time)
+        self._drive(s, images, heading, time)
+        self._turn(s, heading, time)
+        still = s.phase >= ARRIVED
+        s.linear[still] = s.angular[still] = 0.0
+        s.clock_s[:] = time
+        new = s.state()
+        return new, new.linear.copy(), new.angular.copy(), s.events()
+
+    def _first_heading(self, heading: np.ndarray) -> np.ndarray:
+        """The nearest heading along which nodes have images."""
+        step = 2 * np.pi / self.map.embeddings.shape[1]
+        return wrap(np.rint(heading / step) * step)
+
+    def _no_evidence(self, batch: int) -> np.ndarray:
+        return np.full((batch, len(self.map.xy_w)), 0.0 if self.sight.summed else np.inf)
+
+    def _reached(self, s: _Work, heading: np.ndarray, *phases: int) -> np.ndarray:
+        """Rows in one of the phases whose heading is reached."""
+        return np.flatnonzero(_any_of(s.phase, phases) & (np.abs(wrap(s.target_rad - heading)) <= self._tolerance))
+
+    def _watches(self, s: State | _Work, time: np.ndarray) -> np.ndarray:
+        """[B] bool: who looks now, within a run, whether the edge's head is passed."""
+        if not self.config.glance or not self.config.watch_s:
+            return np.zeros(len(s.phase), bool)
+        return (s.phase == DRIVE) & (s.edge >= 0) & (time >= s.watch_s - SLACK_S)
+
+    def _localise(self, s: _Work, images: np.ndarray, heading: np.ndarray) -> None:
+        rows = self._reached(s, heading, LOCALISE)
+        if not len(rows):
+            return
+        away = self.sight.distances(images[rows], heading[rows])
+        s.evidence[rows] = s.evidence[rows] + away if self.sight.summed else np.minimum(s.evidence[rows], away)
+        s.looks[rows] += 1
+        s.target_rad[rows] = wrap(s.base_rad[rows] + s.looks[rows] * 2 * np.pi / self.config.images)
+        s.restart_pid(rows)
+        done = rows[s.looks[rows] >= self.config.images]
+        self._found(s, done, s.evidence[done].argmin(-1).astype(np.int32))
+        s.localised[done] = True
+        self._decide(s, done, heading)
+
+    def _found(self, s: _Work, rows: np.ndarray, node: np.ndarray) -> None:
+        """Where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
+        s.node[rows] = node
+        edge = s.driven[rows]
+        tail, head = self.map.edges[edge].T if len(self.map.edges) else (node, node)
+        failed = (edge >= 0) & (node != head) & ~(self.map.left[head, node] < self.map.left[head, tail])
+        s.penalty[rows[failed], edge[failed]] += self.config.retry_cost
+        s.driven[rows] = -1
+
+    def _decide(self, s: _Work, rows: np.ndarray, heading: np.ndarray) -> None:
+        """Where to go from the nodes found."""
+        there = rows[s.node[rows] == s.goal[rows]]
+        s.phase[there], s.arrived[there] = ARRIVED, True
+        self._plan(s, rows[s.node[rows] != s.goal[rows]], heading)
+
+    def _plan(self, s: _Work, rows: np.ndarray, heading: np.ndarray) -> None:
+        for i in rows:
+            edge = self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i])
+            s.edge[i] = edge
+            if edge >= 0:
+                s.base_rad[i] = self.map.angle_rad[edge]
+            else:
+                s.lost[i] += 1
+                s.lost_now[i] = True
+                s.base_rad[i] = wrap(heading[i] + GOLDEN_RAD)
+        s.phase[rows] = FACE
+        s.target_rad[rows] = s.base_rad[rows]
+        s.swing[rows], s.best_p[rows] = 0, -1.0
+        s.restart_pid(rows)
+
+    def _face(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
+        self._begin_drive(s, self._reached(s, heading, LEAN), time)
+        rows = self._reached(s, heading, FACE, SWING)
+        if not len(rows):
+            return
+        clear_m = np.full(len(rows), self.config.clear_m)
+        p, clear = self.sight.passage(images[rows], np.stack([self._ask_m[s.edge[rows]], clear_m], -1)).T
+        better = rows[clear > s.best_p[rows]]
+        s.best_p[better], s.best_rad[better] = clear[clear > s.best_p[rows]], s.target_rad[better]
+        agrees = p >= self.config.passable
+        self._begin_drive(s, rows[agrees], time)
+        rows = rows[~agrees]
+        s.swing[rows] += 1
+        # +1, -1, +2, -2, ... steps from the edge's angle.
+        count = s.swing[rows]
+        offset = np.where(count % 2 == 1, 1, -1) * ((count + 1) // 2) * np.deg2rad(self.config.swing_deg)
+        s.phase[rows] = SWING
+        s.target_rad[rows] = wrap(s.base_rad[rows] + offset)
+        s.restart_pid(rows)
+        blocked = rows[count == 2 * self.config.swings + 1]
+        s.blocked[blocked] = True
+        for i in blocked:
+            old = s.edge[i]
+            if old >= 0 and s.penalty[i, old] < PENALTY:
+                s.penalty[i, old] += PENALTY
+                if self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i]) != old:
+                    self._plan(s, np.array([i]), heading)
+        # Without another way it goes on swinging, all round.
+        asked = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
+        s.phase[asked], s.target_rad[asked] = LEAN, s.best_rad[asked]
+
+    def _begin_drive(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
+        s.phase[rows], s.driven[rows] = DRIVE, s.edge[rows]
+        self._begin_run(s, rows, time)
+
+    def _begin_run(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
+        if len(rows):
+            s.run_end_s[rows], s.acts[rows] = time[rows] + self.config.run_s, 0
+            s.watch_s[rows], s.least[rows] = time[rows] + self.config.watch_s, np.inf
+            s.run_started[rows] = True
+            s.put_hidden(rows, self.policy.start(len(rows)))
+
+    def _drive(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
+        over = (time >= s.run_end_s - SLACK_S) | self._passed(s, images, heading, time)
+        ended = np.flatnonzero((s.phase == DRIVE) & over)
+        if len(ended):
+            s.run_ended[ended] = True
+            s.run[ended] += 1
+            tired = s.run[ended] >= self.config.runs
+            self._begin_localise(s, ended[tired])
+            ended = ended[~tired]
+            if self.config.glance and len(ended):
+                away = self.sight.distances(images[ended], heading[ended])
+                found = np.where(self._near[s.node[ended]], away, np.inf).argmin(-1).astype(np.int32)
+                new = found != s.node[ended]
+                s.glanced[ended[new]] = True
+                self._found(s, ended, found)
+                # A glance is no proof of having arrived: that takes a look about.
+                there = new & (found == s.goal[ended])
+                self._begin_localise(s, ended[there])
+                # Where the map has no way, on along the heading that was chosen.
+                on = ~new & (s.edge[ended] < 0)
+                self._plan(s, ended[~there & ~on], heading)
+                ended = ended[on]
+            self._begin_run(s, ended, time)
+        acting = np.flatnonzero((s.phase == DRIVE) & (s.acts % self._period == 0))
+        if len(acting):
+            # Padded by the first row: what is compiled for few sizes serves all.
+            size = padded_size(len(acting))
+            rows = np.concatenate([acting, np.full(size - len(acting), acting[0])])
+            hidden, linear, angular = self.policy.act(jax.tree.map(lambda x: x[rows], s.hidden), images[rows])
+            s.put_hidden(acting, jax.tree.map(lambda x: np.asarray(x)[: len(acting)], hidden))
+            s.linear[acting] = np.asarray(linear)[: len(acting)]
+            s.angular[acting] = np.asarray(angular)[: len(acting)]
+        s.acts[s.phase == DRIVE] += 1
+
+    def _passed(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """[B] bool: of all nodes in question the edge's head is nearest, and it is getting farther."""
+        passed = np.zeros(len(s.phase), bool)
+        rows = np.flatnonzero(self._watches(s, time))
+        if len(rows):
+            s.watch_s[rows] += self.config.watch_s
+            away = self.sight.distances(images[rows], heading[rows])
+            head = self.map.edges[s.edge[rows], 1]
+            there = away[np.arange(len(rows)), head]
+            nearest = np.where(self._near[s.node[rows]], away, np.inf).argmin(-1) == head
+            passed[rows] = nearest & (there > s.least[rows])
+            s.least[rows] = np.minimum(s.least[rows], there)
+        return passed
+
+    def _begin_localise(self, s: _Work, rows: np.ndarray) -> None:
+        s.phase[rows], s.looks[rows], s.edge[rows], s.run[rows] = LOCALISE, 0, -1, 0
+        s.target_rad[rows] = np.nan
+        s.evidence[rows] = self._no_evidence(len(rows))
+        s.linear[rows] = s.angular[rows] = 0.0
+        s.restart_pid(rows)
+
+    def _turn(self, s: _Work, heading: np.ndarray, time: np.ndarray) -> None:
+        """PID to the target heading, as `simple_pid.PID` computes it."""
+        rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
+        config, most = self.config, self.config.max_turn_rad_s
+        error = wrap(s.target_rad[rows] - heading[rows])
+        dt = np.maximum(np.nan_to_num(time[rows] - s.clock_s[rows], nan=0.0), 0.0)
+        last = np.where(np.isnan(s.error_rad[rows]), error, s.error_rad[rows])
+        s.integral[rows] = np.clip(s.integral[rows] + config.ki * error * dt, -most, most)
+        rate = np.divide(wrap(error - last), dt, out=np.zeros_like(error), where=dt > 0)
+        s.linear[rows] = 0.0
+        s.angular[rows] = np.clip(config.kp * error + s.integral[rows] + config.kd * rate, -most, most)
+        s.error_rad[rows] = error
+
+
+class Pilot:
+    """One robot's navigator, or a batch of them, that remembers its own state: what a ROS node holds."""
+
+    def __init__(self, navigator: Navigator, goal_images: np.ndarray, goal_heading_rad: np.ndarray):
+        """Finds the goals' nodes.
+
+        Args:
+            navigator: of the scene.
+            goal_images: [B, K, ...] taken at the goals.
+            goal_heading_rad: [K] along which headings.
+        """
+        self.navigator = navigator
+        self.state = navigator.start(navigator.goal_nodes(goal_images, goal_heading_rad))
+
+    def step(
+        self, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray, Events]:
+        """Images [B, ...], headings [B] and time to linear [B] and angular [B] velocity, and events."""
+        self.state, linear, angular, events = self.navigator.step(self.state, images, heading_rad, time_s)
+        return linear, angular, events
+
+
+class _Work:
+    """A copy of a state that a step writes into, and its events."""
+
+    def __init__(self, state: State, batch: int):
+        self._names = [f.name for f in dataclasses.fields(State)]
+        for name in self._names:
+            value = getattr(state, name)
+            setattr(self, name, value if name == "hidden" else value.copy())
+        self._events = {"lost": "lost_now"}
+        for field in dataclasses.fields(Events):
+            setattr(self, self._events.get(field.name, field.name), np.zeros(batch, bool))
+
+    def restart_pid(self, rows: np.ndarray) -> None:
+        self.integral[rows], self.error_rad[rows] = 0.0, np.nan
+
+    def put_hidden(self, rows: np.ndarray, new: Any) -> None:
+        def put(old: Any, value: Any) -> np.ndarray:
+            out = np.array(old)
+            out[rows] = np.asarray(value)
+            return out
+
+        self.hidden = jax.tree.map(put, self.hidden, new)
+
+    def state(self) -> State:
+        return State(**{name: getattr(self, name) for name in self._names})
+
+    def events(self) -> Events:
+        names = [f.name for f in dataclasses.fields(Events)]
+        return Events(**{name: getattr(self, self._events.get(name, name)) for name in names})
+
+
+def _asked_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
+    """[E + 1] m: how far the way must be free to drive along each edge of lengths [E], and, last, along none."""
+    asked = np.minimum(length_m - np.minimum(config.slack_m, 0.5 * length_m), config.ahead_m)
+    return np.append(asked, config.clear_m)
+
+
+def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:
+    """[B] bool; many times as fast as `np.isin` for few rows."""
+    return np.logical_or.reduce([phase == one for one in phases])
+
+
+def wrap(angle_rad: Any) -> Any:
+    """Angles in [-pi, pi)."""
+    return (np.asarray(angle_rad) + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,222 @@
+"""Where a robot stands and looks in, what its camera sees out: a scene at rest, drawn in batches of any size.
+
+`warp` (MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's own renderer, which needs EGL or OSMesa)
+both draw the visual meshes with their textures. Their light differs, so the images of one do not fit networks that
+learned from the other.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.sensing.base import CameraPose, Lens, look_along
+from interactive_nav_common.errors import UserError
+
+CPU_IMAGES = (1, 2, 6, 18)
+"""Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""
+DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
+"""Least and most images a call on an accelerator, and the most pixels drawn for them."""
+Painter = Callable[[np.ndarray, np.ndarray], Any]
+"""Positions [n, 3] and axes [n, 3, 3] of cameras to images [n, H, W, 3] u8, in an array of any kind."""
+_SHOWN = 2
+"""Geom group of all that is drawn."""
+
+
+def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pitch_rad: np.ndarray) -> CameraPose:
+    """Where the camera of a robot is that stands on the floor.
+
+    Args:
+        robot: its camera is fixed to its base, whose frame lies on the floor.
+        xy_w: [..., 2] m, of the base.
+        heading_rad: [...], yaw of the base.
+        pitch_rad: [...], how far up the camera looks beside its mount's own pitch.
+
+    Raises:
+        UserError: the robot's camera is carried by another link.
+    """
+    camera = robot.camera
+    if camera.body != robot.base_body:
+        raise UserError(
+            f"the camera of '{robot.name}' sits on '{camera.body}', expected its base '{robot.base_body}'; "
+            "choose a robot with a camera on its base, such as ttbot"
+        )
+    shape = np.broadcast_shapes(np.shape(xy_w)[:-1], np.shape(heading_rad), np.shape(pitch_rad))
+    xy = np.broadcast_to(xy_w, (*shape, 2))
+    heading, pitch = np.broadcast_to(heading_rad, shape), np.broadcast_to(pitch_rad, shape) - camera.pitch_rad
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y, z = camera.pos_m
+    pos = np.stack([xy[..., 0] + cos * x - sin * y, xy[..., 1] + sin * x + cos * y, np.full(shape, z)], -1)
+    forward = np.stack([np.cos(pitch) * cos, np.cos(pitch) * sin, np.sin(pitch)], -1)
+    return look_along(np.asarray(pos, np.float32), np.asarray(forward, np.float32))
+
+
+def need_engine(engine: str) -> None:
+    """Refuses an engine of pictures or physics that is not installed, before any work is done for it.
+
+    Raises:
+        UserError: it is `warp`, and the package warp-lang is not there.
+    """
+    if engine == "warp":
+        try:
+            importlib.import_module("warp")
+        except ImportError as error:
+            raise UserError(
+                f"engine 'warp' does not start here ({error}); install its extra: pip install -e '.[warp]' "
+                "(networks see by the engine that they learned from; what is drawn anew can have engine=gl)"
+            ) from error
+
+
+class SceneRenderer:
+    """Draws one scene, its furniture at rest and no robot in it."""
+
+    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp"):
+        """Loads the scene's meshes; the first picture may compile.
+
+        Args:
+            scene: what is drawn.
+            lens: of the images returned.
+            supersample: images are drawn this many times larger along each side and averaged.
+            engine: warp or gl.
+
+        Raises:
+            UserError: the engine does not start here.
+        """
+        need_engine(engine)
+        self._lens, self._by = lens, supersample
+        self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
+        self._model = _visual_model(scene, self._large)
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, self._data)
+        self._painters: dict[int, Painter] = {}
+        """By images a call."""
+        if engine == "warp":
+            self._sizes = batch_sizes(self._large, jax.default_backend())
+            self._painter(self._sizes[0])  # an engine that does not start says so here
+        else:
+            self._sizes = (1,)
+            self._painters[1] = self._gl_painter()
+
+    def draw(self, pose: CameraPose) -> np.ndarray:
+        """[N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
+        pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
+        count, first = len(pos), 0
+        out = np.empty((count, self._lens.height, self._lens.width, 3), np.uint8)
+        drawn: list[tuple[int, Any]] = []
+
+        def fetch(waiting: int) -> None:
+            while len(drawn) > waiting:
+                at, images = drawn.pop(0)
+                out[at : at + len(images)] = np.asarray(images)[: count - at]
+
+        for size in calls(count, self._sizes):
+            # Padded by the last camera: Warp draws batches of fixed sizes only.
+            rows = np.minimum(np.arange(first, first + size), count - 1)
+            drawn.append((first, self._painter(size)(pos[rows], axes[rows])))
+            first += size
+            fetch(1)  # the accelerator draws the next batch while this one is copied
+        fetch(0)
+        return out
+
+    def _painter(self, size: int) -> Painter:
+        if size not in self._painters:
+            self._painters[size] = self._warp_painter(size)
+        return self._painters[size]
+
+    def _warp_painter(self, size: int) -> Painter:
+        from interactive_nav.sensing.warp import WarpColour
+
+        painter = WarpColour(self._model, self._large, size, [_SHOWN])
+        xpos = jnp.asarray(np.tile(self._data.geom_xpos, (size, 1, 1)), jnp.float32)
+        xmat = jnp.asarray(np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (size, 1, 1, 1)), jnp.float32)
+
+        @jax.jit
+        def paint(xpos: jax.Array, xmat: jax.Array, pos: jax.Array, axes: jax.Array) -> jax.Array:
+            return shrink(painter.draw(xpos, xmat, CameraPose(pos, axes)), self._by)
+
+        return lambda pos, axes: paint(xpos, xmat, pos, axes)
+
+    def _gl_painter(self) -> Painter:
+        from topological_nav.scenes.gl import GlPainter
+
+        painter, by = GlPainter(self._model, self._data, self._large, _SHOWN), self._by
+        # Without `self`: a context holds some 100 MiB, and goes with its renderer, not when cycles are collected.
+        return lambda pos, axes: shrink(painter.draw(pos, axes), by)
+
+
+def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
+    """Images a call of the engine, ascending; each is compiled when it is first needed.
+
+    Args:
+        lens: of the images as they are drawn.
+        platform: `jax.default_backend()`. On an accelerator: powers of two up to what `DEVICE_PIXELS` allows.
+    """
+    if platform == "cpu":
+        return CPU_IMAGES
+    least, most = DEVICE_BATCH
+    most = min(most, max(least, DEVICE_PIXELS // (lens.width * lens.height)))
+    return tuple(1 << n for n in range(least.bit_length() - 1, most.bit_length()))
+
+
+def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
+    """Sizes of the calls that draw `count` images: none in vain where there are calls of one, else as few calls as can
+    be, the last one the least that serves."""
+    made: list[int] = []
+    while count > 0:
+        if sizes[0] == 1:
+            made.append(max(n for n in sizes if n <= count))
+        else:
+            made.append(next((n for n in sizes if n >= count), sizes[-1]))
+        count -= made[-1]
+    return made
+
+
+def shrink(images: Any, by: int) -> Any:
+    """[N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, halves rounded to even.
+
+    In whole numbers, so that NumPy and every device give the same; the result is of the images' own kind of array.
+    """
+    if by == 1:
+        return images
+    xp = jnp if isinstance(images, jax.Array) else np
+    n, height, width, channels = images.shape
+    # Rows first, in one piece of memory each: NumPy is several times slower over both axes at once.
+    rows = images.reshape(n, height // by, by, width, channels).sum(2, dtype=xp.uint32)
+    total = rows.reshape(n, height // by, width // by, by, channels).sum(3, dtype=xp.uint32)
+    area = by * by
+    whole, rest = total // area, total % area
+    up = (2 * rest > area) | ((2 * rest == area) & (whole % 2 == 1))
+    return (whole + up).astype(xp.uint8)
+
+
+def _visual_model(scene: Scene, lens: Lens) -> mujoco.MjModel:
+    """The scene's visual meshes and floor in one group; boxes stand for bodies without a mesh."""
+    spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
+    with_mesh = {g.parent.name for g in spec.geoms if g.group == _SHOWN}
+    for geom in list(spec.geoms):
+        plane, box = geom.type == mujoco.mjtGeom.mjGEOM_PLANE, geom.type == mujoco.mjtGeom.mjGEOM_BOX
+        shown = geom.group == _SHOWN or plane or (box and geom.parent.name not in with_mesh)
+        geom.group = _SHOWN if shown else 4
+        if plane:
+            geom.rgba = [0.56, 0.50, 0.43, 1.0]
+    for camera in list(spec.cameras):
+        spec.delete(camera)  # MJX-Warp would draw through every camera of the model
+    if not any(body.joints for body in spec.bodies):
+        # MJX-Warp wants at least one degree of freedom.
+        body = spec.worldbody.add_body(name="unseen", pos=[0, 0, -60.0])
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE)
+        body.mass, body.inertia, body.explicitinertial = 1.0, np.ones(3), True
+    spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
+    spec.worldbody.add_camera(name="view", fovy=lens.fov_deg)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = max(lens.width, 640), max(lens.height, 480)
+    spec.stat.extent = 1.0  # the clipping planes are given as shares of the extent
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 100.0
+    return spec.compile()

@@ -1,0 +1,191 @@
+"""`python -m topological_nav.rooms SCENE... -o rooms.png`: free positions in, rooms by three kinds of clustering out.
+
+Positions are clustered by their coordinates alone. Where a scene's plan is recorded (`plans.py`: the generated
+scenes), the rooms found are compared with it by the adjusted Rand index.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from sklearn.cluster import KMeans, SpectralClustering
+from sklearn.metrics import adjusted_rand_score, silhouette_score
+from sklearn.mixture import GaussianMixture
+from threadpoolctl import threadpool_limits
+
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from topological_nav.config import DataConfig
+from topological_nav.errors import SpaceError
+from topological_nav.scenes.plans import RECORDED
+from topological_nav.scenes.space import FreeSpace, free_space
+
+METHODS = ("kmeans", "gmm", "spectral")
+MAX_ROOMS = 15
+"""Most rooms that a choice by BIC or silhouette considers."""
+CLUSTERED = 1000
+"""Free positions that are clustered: enough that a doorway holds several."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rooms:
+    """Rooms of a scene, told by the nearest of many labelled positions."""
+
+    points_w: np.ndarray
+    """[n, 2] m."""
+    labels: np.ndarray
+    """[n] i32, 0 to count - 1, in the order of the rooms' means by x, then y."""
+    method: str
+    chosen_by: str
+    """What decided their number: config, recorded, bic or silhouette."""
+
+    @property
+    def count(self) -> int:
+        """Number of rooms."""
+        return int(self.labels.max()) + 1
+
+    def of(self, xy_w: np.ndarray) -> np.ndarray:
+        """[...] i32 room of each point [..., 2]."""
+        _, nearest = cKDTree(self.points_w).query(np.asarray(xy_w, float))
+        return self.labels[nearest]
+
+
+def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarray:
+    """[n] i32 labels of points [n, 2], numbered by the clusters' means along x, then y.
+
+    Args:
+        points: coordinates, m.
+        method: kmeans, gmm (full covariances, five starts) or spectral (ten nearest neighbours).
+        count: of clusters.
+        seed: of their starts.
+
+    Raises:
+        ValueError: another method, or more clusters than points.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method is '{method}', expected one of {', '.join(METHODS)}")
+    if not 1 <= count <= len(points):
+        raise ValueError(f"count is {count}, expected between 1 and the {len(points)} points")
+    if count == 1:
+        return np.zeros(len(points), np.int32)
+    with threadpool_limits(1):  # on problems this small, threads cost more than they give
+        if method == "kmeans":
+            labels = KMeans(count, n_init=10, random_state=seed).fit_predict(points)  # type: ignore[arg-type]
+        elif method == "gmm":
+            labels = _mixture(points, count, seed).predict(points)
+        else:
+            near = min(10, len(points) - 1)
+            labels = SpectralClustering(
+                count, affinity="nearest_neighbors", n_neighbors=near, assign_labels="cluster_qr", random_state=seed
+            ).fit_predict(points)
+    return _ordered(points, np.asarray(labels))
+
+
+def choose_count(points: np.ndarray, method: str, seed: int, most: int = MAX_ROOMS) -> tuple[int, str]:
+    """Number of clusters where nobody knows it, and the criterion's name.
+
+    The Gaussian mixture takes the least Bayesian information criterion, the others the greatest silhouette, which
+    needs at least two clusters.
+    """
+    most = min(most, len(points) - 1)
+    if method == "gmm":
+        with threadpool_limits(1):
+            scores = [_mixture(points, k, seed).bic(points) for k in range(1, most + 1)]
+        return 1 + int(np.argmin(scores)), "bic"
+    scores = [silhouette_score(points, cluster(points, method, k, seed)) for k in range(2, most + 1)]
+    return 2 + int(np.argmax(scores)), "silhouette"
+
+
+def find_rooms(
+    space: FreeSpace, method: str, num_rooms: int | None, known: np.ndarray | None, seed: int, clearance_m: float
+) -> Rooms:
+    """Clusters a scene's free positions.
+
+    Args:
+        space: of the scene.
+        method: see `cluster`.
+        num_rooms: their number; None: as known, else chosen.
+        known: [k, 4] recorded rooms (x0, y0, x1, y1), if there are any.
+        seed: of positions and clustering.
+        clearance_m: of the positions.
+
+    Raises:
+        SpaceError: too little free space for that many rooms.
+    """
+    centres = space.centres(clearance_m)
+    rng = np.random.default_rng([seed, 1])
+    points = centres[np.sort(rng.choice(len(centres), min(CLUSTERED, len(centres)), replace=False))]
+    if num_rooms is not None:
+        count, by = num_rooms, "config"
+    elif known is not None:
+        count, by = len(known), "recorded"
+    else:
+        count, by = choose_count(points, method, seed)
+    if count > len(points):
+        raise SpaceError(f"{count} rooms in {len(points)} free cells; expected fewer rooms or a finer map")
+    return Rooms(points, cluster(points, method, count, seed), method, by)
+
+
+def recorded_rooms(digest: str) -> np.ndarray | None:
+    """[k, 4] x0, y0, x1, y1 (m, world) of a scene's rooms, by its digest; None where its plan is not recorded."""
+    return np.array(RECORDED[digest]) if digest in RECORDED else None
+
+
+def room_of(known: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
+    """[n] i32: the recorded room that holds each point [n, 2], or in a doorway the nearest one."""
+    low, high = known[None, :, :2], known[None, :, 2:]
+    outside = np.maximum(np.maximum(low - xy_w[:, None], xy_w[:, None] - high), 0.0)
+    return np.linalg.norm(outside, axis=-1).argmin(1).astype(np.int32)
+
+
+def agreement(rooms: Rooms, known: np.ndarray) -> float:
+    """Adjusted Rand index of the rooms found with the recorded ones: 1 the same, 0 as good as chance."""
+    return float(adjusted_rand_score(room_of(known, rooms.points_w), rooms.labels))
+
+
+def compare(scene_folders: Sequence[Path], seed: int = 0, clearance_m: float = 0.2) -> list[dict[str, Any]]:
+    """Rooms by every method, with their number known and chosen, for some scenes.
+
+    Returns:
+        One row a scene, method and way to choose the number: scene, method, chosen_by, count, known (number of
+        recorded rooms or None), agreement (or None), rooms (`Rooms`), space (`FreeSpace`).
+    """
+    height_m = get_robot(DataConfig().robot).height_m
+    rows = []
+    for folder in scene_folders:
+        scene = load_scene(folder)
+        space, known = free_space(scene, height_m), recorded_rooms(scene.digest)
+        for method in METHODS:
+            for given in [known, None] if known is not None else [None]:
+                rooms = find_rooms(space, method, None, given, seed, clearance_m)
+                rows.append(
+                    {
+                        "scene": Path(folder).name,
+                        "method": method,
+                        "chosen_by": rooms.chosen_by,
+                        "count": rooms.count,
+                        "known": None if known is None else len(known),
+                        "agreement": None if known is None else agreement(rooms, known),
+                        "rooms": rooms,
+                        "space": space,
+                        "recorded": known,
+                    }
+                )
+    return rows
+
+
+def _mixture(points: np.ndarray, count: int, seed: int) -> GaussianMixture:
+    return GaussianMixture(count, covariance_type="full", n_init=5, reg_covar=1e-4, random_state=seed).fit(points)
+
+
+def _ordered(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    used = np.unique(labels)
+    means = np.array([points[labels == k].mean(0) for k in used])
+    place = np.empty(len(used), np.int32)
+    place[np.lexsort((means[:, 1], means[:, 0]))] = np.arange(len(used))
+    return place[np.searchsorted(used, labels)]

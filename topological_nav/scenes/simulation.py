@@ -1,0 +1,156 @@
+"""Velocity commands in, poses, images and contacts out: TTbot in a scene, many at a time, at 10 Hz.
+
+Physics is `interactive_nav`'s environment with furniture where it stands at rest and nothing strewn about. Images show
+the scene at rest as well: what a robot has pushed away is still seen where it stood.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.config import NavConfig
+from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.task.env import InteractiveNav
+from interactive_nav.types import EpisodeStart
+from interactive_nav_common.machine import usable_cores
+from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
+
+Camera = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Places [n, 2] (m) and headings [n] (rad) to what is seen there [n, ...]."""
+CONTROL = "twist"
+"""Control mode whose action is a base velocity."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """Where a batch of robots is."""
+
+    xy_w: np.ndarray
+    """[B, 2] m."""
+    yaw_rad: np.ndarray
+    """[B]."""
+    path_m: np.ndarray
+    """[B] driven so far."""
+    movable: np.ndarray
+    """[B] bool: touched something movable in the last control step."""
+    wall: np.ndarray
+    """[B] bool: touched a wall in it."""
+    broken: np.ndarray
+    """[B] bool: the physics gave up on it, or lost contacts."""
+
+
+def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = None) -> InteractiveNav:
+    """The environment that evaluation steps, on past what it itself would call the end of an episode.
+
+    Args:
+        scene: the only one.
+        robot: its name; it must know control mode `twist`.
+        backend: of physics.
+        radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
+
+    Raises:
+        UserError: the backend is not installed.
+    """
+    need_engine(backend)
+    config = NavConfig(
+        backend=backend,
+        control_mode=CONTROL,
+        num_objects=0,
+        observations=("localisation",),
+        episode_steps=10**8,
+        num_waypoints=1,
+        threads=usable_cores() if backend in ("auto", "native") else 0,
+    )
+    spec = get_robot(robot, CONTROL)
+    if radius_m is not None:
+        spec = dataclasses.replace(spec, footprint_radius_m=radius_m)
+    return InteractiveNav(spec, (scene,), config)
+
+
+def episode_starts(start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, objects: int) -> EpisodeStart:
+    """Starts of B episodes in an environment's first scene, small objects left out."""
+    batch = len(start_xy_w)
+    return EpisodeStart(
+        scene_index=jnp.zeros(batch, jnp.int32),
+        start_xy_w=jnp.asarray(start_xy_w, jnp.float32),
+        start_yaw_rad=jnp.asarray(yaw_rad, jnp.float32),
+        goal_xy_w=jnp.asarray(goal_xy_w, jnp.float32),
+        small_xy_w=jnp.zeros((batch, objects, 2)),
+        small_yaw_rad=jnp.zeros((batch, objects)),
+        small_placed=jnp.zeros((batch, objects), bool),
+    )
+
+
+class Simulator:
+    """A batch of robots in one environment; the state travels, so that it can be thinned out."""
+
+    def __init__(self, env: Any):
+        """Compiles on the first call, and anew for every size of a batch.
+
+        Args:
+            env: of `make_env`, or any `InteractiveNav`.
+        """
+        self.env = env
+        self._reset = jax.jit(jax.vmap(env.reset_to))
+        # A step writes where the state lay: for buffers that have moved MJX-Warp captures its graphs anew.
+        self._advance = jax.jit(jax.vmap(env.advance), donate_argnums=0)
+        self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
+        self._packed = jax.jit(_packed)
+        self._last: tuple[Any, Seen] | None = None
+
+    @property
+    def dt_s(self) -> float:
+        """Control period."""
+        return self.env.dt
+
+    def start(
+        self, start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, number: np.ndarray, seed: int
+    ) -> Any:
+        """States of B episodes, with observations; noise of an episode depends on its number [B] and the seed."""
+        objects = len(self.env.world.small_objects)
+        keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.asarray(number))
+        return self._reset(episode_starts(start_xy_w, yaw_rad, goal_xy_w, objects), keys)
+
+    def drive(self, state: Any, linear: np.ndarray, angular: np.ndarray) -> Any:
+        """One control step under base velocities [B] m/s and [B] rad/s; the state given is used up."""
+        robot: RobotSpec = self.env.robot
+        return self._advance(state, np.asarray(robot.drive(linear, angular, np), np.float32))
+
+    def act(self, state: Any, action: Any) -> Any:
+        """One control step under the environment's own actions [B, A], observed; the state given is used up."""
+        return self._step(state, action)
+
+    def seen(self, state: Any) -> Seen:
+        """Where the robots are."""
+        if self._last is None or self._last[0] is not state:
+            nav = state.info["nav"]
+            of = (nav.robot_pos_w, nav.yaw_rad, nav.robot_path_m, nav.touching, nav.overflow_steps)
+            told = np.asarray(self._packed(of, state.metrics["nonfinite"])).astype(float)
+            xy, (yaw, path), flags = told[:, :2], told[:, 2:4].T, told[:, 4:].T > 0
+            self._last = state, Seen(xy, yaw, path, *flags)
+        return self._last[1]
+
+
+def _packed(nav: tuple[jax.Array, ...], nonfinite: jax.Array) -> jax.Array:
+    """[B, 7] f32: what `Seen` tells, in one array, because every transfer from an accelerator makes it wait."""
+    pos, yaw, path, touching, overflow = nav
+    broken = (nonfinite > 0) | (overflow > 0)
+    return jnp.concatenate([pos[:, :2], jnp.stack([yaw, path, *touching.T[:2], broken], 1)], 1).astype(jnp.float32)
+
+
+def scene_camera(renderer: SceneRenderer, robot: RobotSpec) -> Camera:
+    """Level images of a robot's camera."""
+    return lambda xy, yaw: renderer.draw(camera_pose(robot, xy, yaw, np.zeros(len(xy))))
+
+
+def pose_camera(xy_w: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
+    """The camera of `sight.TrueSight`: [n, 3] poses."""
+    return np.concatenate([np.asarray(xy_w, float), np.asarray(yaw_rad, float)[:, None]], -1)

@@ -1,0 +1,117 @@
+"""A scene in, its free space out: where a robot may stand, and whether a straight way is free.
+
+Obstacles are the walls and everything movable where it stands at rest, up to the robot's height, doors included.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import shapely
+
+from interactive_nav.geodesic import clearance
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.topdown import shadow
+from topological_nav.errors import SpaceError
+
+_FREE_M = 1e-6
+"""Clearance of a cell that is free at all."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeSpace:
+    """A grid of distances to the nearest obstacle."""
+
+    clearance_m: np.ndarray
+    """[rows along y, columns along x] from a cell's centre; 0 where blocked."""
+    resolution_m: float
+    origin_w: tuple[float, float]
+    """World x, y of the outer corner of cell [0, 0]."""
+
+    def centres(self, least_m: float) -> np.ndarray:
+        """[n, 2] m, world: centres of the cells with at least this clearance, row by row."""
+        rows, columns = np.nonzero(self.clearance_m >= max(least_m, _FREE_M))
+        return np.asarray(self.origin_w) + (np.stack([columns, rows], -1) + 0.5) * self.resolution_m
+
+    def at(self, xy_w: np.ndarray) -> np.ndarray:
+        """[...] m: clearance of the cells that hold points [..., 2]; 0 outside the map."""
+        cell = np.floor((np.asarray(xy_w, float) - self.origin_w) / self.resolution_m).astype(int)
+        rows, columns = self.clearance_m.shape
+        column, row = cell[..., 0], cell[..., 1]
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        found = self.clearance_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+        return np.where(inside, found, 0.0)
+
+    def segment_free(self, start_w: np.ndarray, end_w: np.ndarray, points: int, margin_m: float) -> np.ndarray:
+        """Whether straight ways are free: every looked-up point has the margin.
+
+        Args:
+            start_w: [..., 2] m.
+            end_w: [..., 2] m.
+            points: looked up on each way, both ends included.
+            margin_m: clearance that each needs; 0: its cell is free.
+
+        Returns:
+            [...] bool.
+        """
+        share = np.linspace(0.0, 1.0, points)[:, None]
+        start_w, end_w = np.asarray(start_w, float), np.asarray(end_w, float)
+        along = start_w[..., None, :] + share * (end_w - start_w)[..., None, :]
+        # A point on the border of two cells belongs to either: a hair of slack keeps the answer the same both ways.
+        return np.asarray((self.at(along) >= max(margin_m, _FREE_M) - 1e-9).all(-1))
+
+    def sample(self, rng: np.random.Generator, count: int, least_m: float) -> np.ndarray:
+        """[count, 2] m: different cell centres with at least this clearance, uniform over them.
+
+        Raises:
+            SpaceError: there are fewer.
+        """
+        centres = self.centres(least_m)
+        if len(centres) < count:
+            raise SpaceError(
+                f"{len(centres)} cells are at least {least_m} m from obstacles, expected {count}; "
+                "ask for fewer positions or less clearance"
+            )
+        return centres[np.sort(rng.choice(len(centres), count, replace=False))]
+
+
+def free_space(scene: Scene, height_m: float) -> FreeSpace:
+    """The free space of a scene.
+
+    Args:
+        scene: its furniture stands at rest.
+        height_m: of the robot: what hangs higher is no obstacle.
+    """
+    maps = scene.maps
+    rows, columns = maps.traversable.shape
+    x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
+    y = maps.origin_w[1] + (np.arange(rows) + 0.5) * maps.resolution_m
+    grid_x, grid_y = np.meshgrid(x, y)
+    free = maps.traversable.copy()
+    for body in scene.movables:
+        # A box's lowest point is at least its centre less its half diagonal.
+        low = body.pos_w[2] + body.boxes[:, 2] - np.linalg.norm(body.boxes[:, 7:10], axis=1)
+        boxes = body.boxes[low < height_m]
+        if len(boxes):
+            free &= ~shapely.contains_xy(shadow(boxes, body.pos_w, body.quat_w), grid_x, grid_y)
+    return FreeSpace(clearance(free, maps.resolution_m), maps.resolution_m, maps.origin_w)
+
+
+def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of `count` points (all, where there are fewer), far from each other: each next one is the farthest.
+
+    Args:
+        points: [n, 2].
+        count: at least 0.
+        rng: draws the first.
+    """
+    if count <= 0 or not len(points):
+        return np.zeros(0, int)
+    picked = [int(rng.integers(len(points)))]
+    away = np.linalg.norm(points - points[picked[0]], axis=1)
+    while len(picked) < min(count, len(points)):
+        nearest = int(np.argmax(away))
+        picked.append(nearest)
+        away = np.minimum(away, np.linalg.norm(points - points[nearest], axis=1))
+    return np.asarray(picked)

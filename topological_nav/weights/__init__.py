@@ -1,0 +1,1 @@
+"""Networks and maps that come with the package."""

@@ -1,0 +1,330 @@
+"""Finished runs in, a small folder out that carries them: weights in half precision, where they came from, maps.
+
+OUT/rooms/ passages/ policy/   weights.msgpack.xz, network.json, config.yaml, versions.json, results.json
+    maps/SCENE.npz             embeddings in half precision
+    export.json                commit, device and digest of every run, sizes, how well the networks agree with the runs'
+
+Everything that reads a run folder reads these. Kernels and matrices are fp16; biases, scales and statistics, one number
+in a hundred, stay f32: a variance may exceed what fp16 holds. `digest` in network.json stays that of the run, so that
+maps and policies made with either belong to both: an export whose predictions differ is refused.
+`export.weights_digest` is of what `weights.msgpack.xz` unpacks to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePath
+from typing import Any
+
+import flax.serialization
+import jax
+import numpy as np
+
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import whole_folder, write_text
+from interactive_nav_common.versions import versions
+from topological_nav.config import PITCHES, ExportConfig
+from topological_nav.data.dataset import headings, load_rooms
+from topological_nav.drives.driving import TrainedPolicy, load_policy
+from topological_nav.errors import MapError, RunError
+from topological_nav.learn.localise import nearest_node
+from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
+from topological_nav.learn.training import Trained, load_trained
+from topological_nav.maps.build import CHUNK, camera_of, renderer_of
+from topological_nav.maps.graph import load_map, save_map
+from topological_nav.scenes.rendering import camera_pose
+from topological_nav.scenes.space import free_space
+from topological_nav.weights.packaged import ABOUT
+
+FORMAT = 1
+PRECISION = "fp16"
+VERSIONS = "versions.json"
+Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """What runs and their exports make of the same images: P places, K headings."""
+
+    embedding: np.ndarray
+    """[2, P K] distance between the two embeddings of an image, by the localiser and by the detector."""
+    apart: np.ndarray
+    """[P K] distance of an image's embedding to the nearest of another place, by the localiser."""
+    probability: np.ndarray
+    """[2, P K, L] that the way is free for each of the detector's lengths, by the run and by the export."""
+    scores: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    about: dict[str, Any]
+    """Content of export.json."""
+    sizes: dict[str, int]
+    """Part -> bytes."""
+    compared: Compared
+
+
+def export(
+    localiser: Path,
+    detector: Path,
+    policy: Path | None,
+    maps: Path | None,
+    images: np.ndarray,
+    out: Path,
+    config: ExportConfig,
+    progress: Progress = lambda *_: None,
+) -> Exported:
+    """Writes an export, whole or not at all; one that stands at `out` is replaced.
+
+    Args:
+        localiser: run folder of a room classifier.
+        detector: of a passage detector.
+        policy: of a local policy that learned with both, or None.
+        maps: folder of SCENE.npz, all made with both, or None.
+        images: [P, K, H, W, 3] u8 level images around P places, by which exports are compared with runs.
+        out: the folder.
+        config: limits.
+        progress: told what is done, parts done and in all; may raise to stop.
+
+    Raises:
+        RunError: a run cannot be used, lacks commit or device, or does not survive half precision; or the folder would
+            be too large.
+        MapError: a map was made with other networks.
+    """
+    out = Path(os.path.abspath(out))
+    if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out}: is something else than an export; choose another folder (-o)")
+    runs = {"rooms": Path(localiser), "passages": Path(detector)} | ({"policy": Path(policy)} if policy else {})
+    files = sorted(Path(maps).glob("*.npz")) if maps else []
+    if maps and not files:
+        raise MapError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
+    networks = _networks(runs["rooms"], runs["passages"])
+    driver = load_policy(policy, localiser, detector) if policy else None
+    total = len(runs) + len(files) + 1
+    with whole_folder(out, overwrite=True) as made:
+        about: dict[str, Any] = {"format": FORMAT, "precision": PRECISION, "networks": {}, "maps": {}}
+        for done, (task, run) in enumerate(runs.items()):
+            progress(task, done, total)
+            about["networks"][task] = _export_run(task, run, made / task, config)
+        for done, path in enumerate(files, len(runs)):
+            progress(path.stem, done, total)
+            about["maps"][path.stem] = _export_map(path, made / "maps" / path.name, networks)
+        progress("comparing", total - 1, total)
+        exported = load_trained(made / "rooms"), load_trained(made / "passages")
+        compared = compare(networks, exported, driver, load_policy(made / "policy") if driver else None, images)
+        for name in ("largest_embedding_distance", "largest_probability_difference"):
+            if not compared.scores[name] <= config.tolerance:
+                raise RunError(
+                    f"{PRECISION} changes the predictions: {name} is {compared.scores[name]:.2g}, expected at most "
+                    f"{config.tolerance:g} (tolerance)"
+                )
+        about |= {"compared": compared.scores, "exported_by": {"commit": versions()["commit"]}}
+        write_text(made / ABOUT, json.dumps(about, indent=1) + "\n")
+        sizes = sizes_of(made)
+        if sum(sizes.values()) > config.limit_mib * 2**20:
+            raise RunError(f"{out}: {size_lines(sizes, config.limit_mib)}")
+    progress("comparing", total, total)
+    return Exported(about, sizes, compared)
+
+
+def sizes_of(folder: Path) -> dict[str, int]:
+    """Bytes of an export by what they are for: weights of each network, maps, descriptions."""
+    sizes: dict[str, int] = {}
+    for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
+        part = path.relative_to(folder).parts[0]
+        what = part if path.name == PACKED_WEIGHTS or part == "maps" else "descriptions"
+        sizes[what] = sizes.get(what, 0) + path.stat().st_size
+    return sizes
+
+
+def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
+    """In words, the largest first."""
+    parts = sorted(sizes.items(), key=lambda item: -item[1])
+    told = ", ".join(f"{name} {size / 2**20:.2f}" for name, size in parts)
+    total = sum(sizes.values()) / 2**20
+    said = f"{total:.2f} MiB: {told}"
+    if total > limit_mib:
+        said += (
+            f"; expected at most {limit_mib:g} MiB (limit_mib): leave maps out, or train with a smaller width, hidden "
+            "or projection"
+        )
+    return said
+
+
+def half(variables: Any) -> Any:
+    """Variables with every array of two or more axes in half precision.
+
+    Raises:
+        RunError: a number is too large for it.
+    """
+
+    def halved(path: Any, leaf: Any) -> np.ndarray:
+        value = np.asarray(leaf)
+        if value.ndim < 2:
+            return value
+        with np.errstate(over="ignore"):
+            small = value.astype(np.float16)
+        if not np.isfinite(small).all():
+            where = "/".join(str(getattr(key, "key", key)) for key in path)
+            raise RunError(f"{where} holds {np.abs(value).max():.3g}, more than {PRECISION} can; train again")
+        return small
+
+    return jax.tree_util.tree_map_with_path(halved, flax.serialization.to_state_dict(jax.device_get(variables)))
+
+
+def compare(
+    networks: tuple[Trained, Trained],
+    exported: tuple[Trained, Trained],
+    driver: TrainedPolicy | None,
+    exported_driver: TrainedPolicy | None,
+    images: np.ndarray,
+) -> Compared:
+    """What runs and exports make of the same images.
+
+    Args:
+        networks: localiser and detector of the runs.
+        exported: of the export.
+        driver: the run's policy, or None.
+        exported_driver: the export's.
+        images: [P, K, H, W, 3] u8; each place's images are also shown to the policies one after the other.
+    """
+    places, around = images.shape[:2]
+    flat = images.reshape(-1, *images.shape[2:])
+    before, after = ([net.embed(flat) for net in pair] for pair in (networks, exported))
+    embedding = np.stack([np.linalg.norm(a - b, axis=-1) for a, b in zip(before, after, strict=True)])
+    logits = [pair[1].logits(flat).astype(float) for pair in (networks, exported)]
+    probability = 1.0 / (1.0 + np.exp(-np.stack(logits)))
+    rooms = [pair[0].logits(flat).argmax(-1) for pair in (networks, exported)]
+    scores = {
+        "images": len(flat),
+        "largest_embedding_distance": float(embedding.max()),
+        "mean_embedding_distance": float(embedding.mean()),
+        "largest_probability_difference": float(np.abs(probability[0] - probability[1]).max()),
+        "same_passage": float(((probability[0] > 0.5) == (probability[1] > 0.5)).mean()),
+        "same_room": float((rooms[0] == rooms[1]).mean()),
+    }
+    apart = np.zeros(len(flat))
+    if places > 1:
+        grouped = before[0].reshape(places, around, -1)
+        found = np.zeros((2, len(flat)), int)
+        for place in range(places):
+            rows = slice(place * around, (place + 1) * around)
+            others = np.delete(grouped, place, 0)
+            for i, queries in enumerate((before[0], after[0])):
+                found[i, rows], gap = nearest_node(queries[rows], others)
+                apart[rows] = gap if i == 0 else apart[rows]
+        scores["same_nearest_place"] = float((found[0] == found[1]).mean())
+        scores["mean_distance_to_nearest_place"] = float(apart.mean())
+    if driver is not None and exported_driver is not None:
+        said = [np.array(list(_driven(one, images))) for one in (driver, exported_driver)]
+        same = (said[0] == said[1]).mean((0, 2))
+        scores |= {"same_linear": float(same[0]), "same_angular": float(same[1])}
+    return Compared(embedding, apart, probability, scores)
+
+
+def level_images(
+    source: Path, networks: tuple[Trained, Trained], places: int, progress: Progress = lambda *_: None, seed: int = 0
+) -> np.ndarray:
+    """[P, K, H, W, 3] u8: level images around places of a dataset, or of a scene, which is drawn.
+
+    Args:
+        source: dataset folder, or scene folder.
+        networks: localiser and detector: a scene is drawn as they learned to see.
+        places: at most so many, of a dataset evenly from all.
+        progress: told what is drawn, images done and in all; may raise to stop.
+        seed: of the places in a scene.
+
+    Raises:
+        TopologicalError, SceneError: the source cannot be used.
+    """
+    source = Path(source)
+    if (source / "dataset.json").is_file():
+        images = load_rooms(source).images[:, PITCHES.index("level")]
+        return images[np.unique(np.linspace(0, len(images) - 1, places).round().astype(int))]
+    if not (source / "scene.json").is_file():
+        raise ConfigError(
+            f"{source}: is neither a dataset nor a scene; name one whose images to compare by: --images PATH"
+        )
+    data, scene = camera_of(*networks), load_scene(source)
+    robot = get_robot(data.robot)
+    xy = free_space(scene, robot.height_m).sample(np.random.default_rng([seed, 19]), places, data.clearance_m)
+    around = headings(data)
+    poses = np.repeat(xy, len(around), 0), np.tile(around, len(xy))
+    renderer, drawn = renderer_of(scene, data), []
+    for first in range(0, len(poses[0]), CHUNK):
+        where, heading = (part[first : first + CHUNK] for part in poses)
+        progress(scene.name, first, len(poses[0]))
+        drawn.append(renderer.draw(camera_pose(robot, where, heading, np.zeros(len(where)))))
+    return np.concatenate(drawn).reshape(len(xy), len(around), *drawn[0].shape[1:])
+
+
+def _networks(localiser: Path, detector: Path) -> tuple[Trained, Trained]:
+    networks = load_trained(localiser), load_trained(detector)
+    if networks[0].about["task"] != "rooms":
+        raise RunError(f"{localiser}: was trained for '{networks[0].about['task']}', expected a run of 'train rooms'")
+    camera_of(*networks)
+    return networks
+
+
+def _driven(policy: TrainedPolicy, images: np.ndarray) -> Iterator[np.ndarray]:
+    """[2, P] velocities at each of K steps."""
+    state = policy.start(len(images))
+    for step in range(images.shape[1]):
+        state, linear, angular = policy.act(state, images[:, step])
+        yield np.stack([linear, angular])
+
+
+def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[str, Any]:
+    """Writes a run's folder and returns where it came from."""
+    for name in (CONFIG, VERSIONS, RESULTS):
+        if not (run / name).is_file():
+            raise RunError(f"{run}: has no {name}; finish the run first")
+    made = json.loads((run / VERSIONS).read_text())
+    made["commit"] = made.get("commit") or config.commit
+    made["argv"] = [_without_folder(word) for word in made.get("argv", [])]
+    device = made.get("device", {}).get("kind")
+    if not made["commit"] or not device:
+        raise RunError(f"{run}: {VERSIONS} names no {'device' if made['commit'] else 'commit'}; say commit=HASH")
+    about = json.loads((run / DESCRIPTION).read_text())
+    weights = flax.serialization.msgpack_serialize(half(flax.serialization.msgpack_restore(weights_content(run))))
+    about["export"] = {"precision": PRECISION, "weights_digest": hashlib.sha256(weights).hexdigest()}
+    if task == "policy":
+        for network, other in zip(about["networks"], ("rooms", "passages"), strict=True):
+            network["run"] = f"../{other}"
+    out.mkdir(parents=True)
+    (out / PACKED_WEIGHTS).write_bytes(packed(weights))
+    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
+    write_text(out / VERSIONS, json.dumps(made, indent=1) + "\n")
+    for name in (CONFIG, RESULTS):
+        shutil.copyfile(run / name, out / name)
+    return {
+        "digest": about["digest"],
+        "parameters": about["parameters"],
+        "commit": made["commit"],
+        "device": device,
+        "command": made["argv"],
+    }
+
+
+def _export_map(path: Path, out: Path, networks: tuple[Trained, Trained]) -> dict[str, Any]:
+    made = load_map(path)
+    for name, network in zip(("localiser", "detector"), networks, strict=True):
+        if made.about.get(name) != network.about["digest"]:
+            raise MapError(f"{path}: was made with another {name}; build the map again with the exported one")
+    save_map(dataclasses.replace(made, embeddings=made.embeddings.astype(np.float16)), out)
+    return {"scene_digest": made.digest, "nodes": len(made.xy_w), "edges": len(made.edges)}
+
+
+def _without_folder(word: str) -> str:
+    """A word of a command line; an absolute path without the folders that it has on one machine alone."""
+    key, sign, value = word.rpartition("=")
+    return f"{key}{sign}{PurePath(value).name}" if PurePath(value).is_absolute() else word

@@ -1,0 +1,133 @@
+"""Which networks, policy and maps are used where none are named: the user's own runs, else those of the package.
+
+The package's lie in `topological_nav/weights/`, a folder as `export` writes it, laid out like `runs/topological`:
+
+rooms/ passages/ policy/   networks; the policy may be absent
+maps/SCENE.npz             may be absent: then a scene's map is made when it is first needed
+export.json                where all of it came from
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from topological_nav.config import PASSAGE_POLICY, RUNS
+from topological_nav.errors import MapError, RunError
+from topological_nav.learn.runs import DESCRIPTION, read_description
+from topological_nav.maps.graph import load_map
+
+ABOUT = "export.json"
+
+
+def packaged_weights() -> Path:
+    """Where the package's own weights lie, if it has any."""
+    return Path(str(importlib.resources.files("topological_nav"))) / "weights"
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What is used."""
+
+    localiser: Path
+    detector: Path
+    policy: str
+    """A run folder, or `PASSAGE_POLICY`."""
+    maps: tuple[Path, ...]
+    """Folders that may have the scene's map; the first is where a new one is kept."""
+    renewed: bool
+    """Whether a map there that does not fit may be made anew: nobody but this program wrote it."""
+    said: str
+    """One line on where the networks come from; empty: they were named."""
+
+    @property
+    def told(self) -> str:
+        """The same with the policy."""
+        return f"{self.said}; local policy: {self.policy}" if self.said else ""
+
+
+def choose(
+    localiser: Path | None,
+    detector: Path | None,
+    policy: str | None = None,
+    needs: Sequence[str] = ("rooms", "passages"),
+) -> Choice:
+    """Fills in what was not named.
+
+    Networks that were not named come from one place: `RUNS`, where those needed are finished, else the package. The
+    policy of that place is used if neither network was named, else it is `PASSAGE_POLICY`.
+
+    Args:
+        localiser: run folder; None: not named.
+        detector: the same.
+        policy: the same, or `PASSAGE_POLICY`.
+        needs: rooms and passages, or the one that is looked at.
+
+    Raises:
+        RunError: neither place has them.
+    """
+    given = {"rooms": localiser, "passages": detector}
+    missing = [task for task in needs if given[task] is None]
+    if not missing:
+        own = localiser or RUNS / "rooms", detector or RUNS / "passages"
+        return Choice(*own, policy or PASSAGE_POLICY, (RUNS / "maps",), False, "")
+    packaged = packaged_weights()
+    place = next((p for p in (RUNS, packaged) if all(_finished(p / task) for task in missing)), None)
+    if place is None:
+        what = " and ".join(missing)
+        options = " or ".join({"rooms": "--localiser RUN", "passages": "--detector RUN"}[task] for task in missing)
+        raise RunError(
+            f"no trained networks of {what}: neither {RUNS} nor the installed package has them; train them (python -m "
+            f"topological_nav train {missing[0]}) or name a run folder: {options}"
+        )
+    found = {task: given[task] or place / task for task in given}
+    if policy is None:
+        policy = PASSAGE_POLICY
+        if not any(given.values()) and _finished(place / "policy"):
+            policy = str(place / "policy")
+    if place == RUNS:
+        said = f"networks: {' and '.join(str(found[task]) for task in missing)}"
+        maps, renewed = (RUNS / "maps",), False
+    else:
+        said = f"networks: {' and '.join(missing)} of the package, {packaged}{_origin(packaged)}"
+        maps, renewed = (RUNS / "maps-packaged", packaged / "maps"), True
+    return Choice(found["rooms"], found["passages"], policy, maps, renewed, said)
+
+
+def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
+    """The first map of a scene that these networks can use; None: there is none.
+
+    Args:
+        choice: networks, and where maps lie.
+        scene: its name.
+        digest: of its files.
+
+    Raises:
+        RunError: a run is not finished, or damaged.
+    """
+    networks = [read_description(run, "network", "TASK")["digest"] for run in (choice.localiser, choice.detector)]
+    for folder in choice.maps:
+        path = folder / f"{scene}.npz"
+        if path.is_file():
+            try:
+                made = load_map(path, digest)
+            except MapError:
+                continue
+            if [made.about.get(name) for name in ("localiser", "detector")] == networks:
+                return path
+    return None
+
+
+def _finished(run: Path) -> bool:
+    return (run / DESCRIPTION).is_file()
+
+
+def _origin(folder: Path) -> str:
+    try:
+        about = json.loads((folder / ABOUT).read_text())["networks"]["rooms"]
+        return f" (commit {about['commit'][:12]}, {about['device']})"
+    except (OSError, ValueError, KeyError):
+        return ""

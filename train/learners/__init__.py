@@ -1,0 +1,1 @@
+"""PPO, SAC and DDPG: environments in, policies out."""

@@ -1,0 +1,226 @@
+"""A batched environment and a config in, a policy trained by DDPG out, in the shape of Brax's SAC.
+
+Deep deterministic policy gradient (Lillicrap et al. 2016, arXiv:1509.02971) as the original benchmark has it: Huber
+loss, target networks of policy and critic, Ornstein-Uhlenbeck noise (reference benchmark, section 8.2). Several
+critics with the least of them as target (Fujimoto et al. 2018, arXiv:1802.09477) are an option.
+
+Time limits: a step with `truncation` = 1 is left out of the critic's loss, as in Brax's SAC: what comes after it is
+not known (the environment shows a new episode's observation).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from brax.envs import Env
+from brax.training import gradients, types
+from brax.training.acme import running_statistics
+from brax.training.networks import FeedForwardNetwork
+
+from train.config import DDPGConfig, TrainConfig
+from train.learners import networks, offpolicy
+from train.learners.learner import Callbacks, TrainResult
+
+
+@flax.struct.dataclass
+class DDPGNetworks:
+    """As Brax's `SACNetworks`, without a distribution."""
+
+    policy_network: FeedForwardNetwork
+    """apply(normalizer, params, observation) -> [..., A] before tanh."""
+    q_network: FeedForwardNetwork
+    """apply(normalizer, params, observation, action) -> [..., critics]."""
+
+    def action(self, normalizer_params: Any, policy_params: Any, observation: Any) -> jax.Array:
+        """The policy's actions [..., A] in [-1, 1]."""
+        return jnp.tanh(self.policy_network.apply(normalizer_params, policy_params, observation))
+
+
+@flax.struct.dataclass
+class DDPGState:
+    """All that learning changes."""
+
+    policy_optimizer_state: optax.OptState
+    policy_params: Any
+    target_policy_params: Any
+    q_optimizer_state: optax.OptState
+    q_params: Any
+    target_q_params: Any
+    normalizer_params: running_statistics.RunningStatisticsState
+    gradient_steps: jax.Array
+    key: jax.Array
+
+
+def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: float) -> tuple[Any, Any]:
+    """The losses of critic and policy, with arguments in Brax's order."""
+
+    def critic_loss(
+        q_params: Any,
+        target_policy_params: Any,
+        normalizer_params: Any,
+        target_q_params: Any,
+        transitions: types.Transition,
+    ) -> jax.Array:
+        q_old_action = ddpg_network.q_network.apply(
+            normalizer_params, q_params, transitions.observation, transitions.action
+        )
+        next_action = ddpg_network.action(normalizer_params, target_policy_params, transitions.next_observation)
+        next_q = ddpg_network.q_network.apply(
+            normalizer_params, target_q_params, transitions.next_observation, next_action
+        )
+        target_q = jax.lax.stop_gradient(
+            transitions.reward * reward_scaling + transitions.discount * discounting * jnp.min(next_q, axis=-1)
+        )
+        extras: Any = transitions.extras
+        truncation = extras["state_extras"]["truncation"]
+        q_error = (q_old_action - target_q[..., None]) * (1.0 - truncation)[..., None]
+        return jnp.mean(optax.losses.huber_loss(q_error))
+
+    def actor_loss(
+        policy_params: Any, normalizer_params: Any, q_params: Any, transitions: types.Transition
+    ) -> jax.Array:
+        action = ddpg_network.action(normalizer_params, policy_params, transitions.observation)
+        q = ddpg_network.q_network.apply(normalizer_params, q_params, transitions.observation, action)
+        return -jnp.mean(q[..., 0])
+
+    return critic_loss, actor_loss
+
+
+@dataclasses.dataclass(frozen=True)
+class DDPG:
+    """All that learning does not change; an `offpolicy.Agent`."""
+
+    config: DDPGConfig
+    networks: DDPGNetworks
+    size: networks.ObservationSize
+    action_size: int
+    shared: bool
+    """The policy looks through the critic's encoder."""
+
+    @property
+    def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+        """Of policy and critic."""
+        return optax.adam(self.config.actor_learning_rate), optax.adam(self.config.critic_learning_rate)
+
+    def init(self, key_networks: jax.Array, key: jax.Array) -> DDPGState:
+        """A learner that has learned nothing."""
+        key_policy, key_q = jax.random.split(key_networks)
+        policy_params = offpolicy.own_params(self.networks.policy_network.init(key_policy), self.shared)
+        q_params = self.networks.q_network.init(key_q)
+        policy_optimizer, q_optimizer = self._optimizers
+        return DDPGState(
+            policy_optimizer_state=policy_optimizer.init(policy_params),
+            policy_params=policy_params,
+            target_policy_params=policy_params,
+            q_optimizer_state=q_optimizer.init(q_params),
+            q_params=q_params,
+            target_q_params=q_params,
+            normalizer_params=networks.init_normalizer(self.size),
+            gradient_steps=jnp.zeros((), jnp.int32),
+            key=key,
+        )
+
+    def policy(self, learner: DDPGState) -> types.Policy:
+        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); never random."""
+        params = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
+
+        def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
+            del key
+            return self.networks.action(learner.normalizer_params, params, observation), {}
+
+        return act
+
+    def init_noise(self) -> jax.Array:
+        """Zeros [envs, A]."""
+        return jnp.zeros((self.config.num_envs or 1, self.action_size))
+
+    def explore(
+        self, learner: DDPGState, observation: Any, noise: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The policy's actions with noise added, cut to [-1, 1]."""
+        c = self.config
+        sd = jnp.linspace(c.noise_sd[0], c.noise_sd[-1], noise.shape[0])[:, None]
+        kept = 1.0 - c.noise_damping if c.noise == "ou" else 0.0
+        noise = kept * noise + sd * jax.random.normal(key, noise.shape)
+        action, _ = self.policy(learner)(observation, key)
+        return jnp.clip(action + noise, -1.0, 1.0), noise
+
+    def gradient_step(
+        self, learner: DDPGState, transitions: types.Transition, key: jax.Array
+    ) -> tuple[DDPGState, dict[str, jax.Array]]:
+        """Critic, policy, and where they are due the targets."""
+        del key  # nothing is drawn
+        c = self.config
+        critic_loss, actor_loss = make_losses(self.networks, c.reward_scaling, c.discounting)
+        policy_optimizer, q_optimizer = self._optimizers
+
+        def own_actor_loss(policy_params: Any, q_params: Any, normalizer_params: Any) -> jax.Array:
+            whole = offpolicy.seeing(policy_params, q_params, self.shared)
+            return actor_loss(whole, normalizer_params, q_params, transitions)
+
+        # No axis to average gradients over: one device.
+        critic_update = gradients.gradient_update_fn(critic_loss, q_optimizer, None)  # type: ignore[arg-type]
+        actor_update = gradients.gradient_update_fn(own_actor_loss, policy_optimizer, None)  # type: ignore[arg-type]
+
+        normalizer = learner.normalizer_params
+        critic_loss_value, q_params, q_optimizer_state = critic_update(
+            learner.q_params,
+            offpolicy.seeing(learner.target_policy_params, learner.target_q_params, self.shared),
+            normalizer,
+            learner.target_q_params,
+            transitions,
+            optimizer_state=learner.q_optimizer_state,
+        )
+        actor_loss_value, policy_params, policy_optimizer_state = actor_update(
+            learner.policy_params, learner.q_params, normalizer, optimizer_state=learner.policy_optimizer_state
+        )
+        steps = learner.gradient_steps + 1
+        tau = jnp.where(steps % c.target_update_period == 0, c.tau, 0.0)
+        q = self.networks.q_network.apply(normalizer, learner.q_params, transitions.observation, transitions.action)
+        metrics = {"critic_loss": critic_loss_value, "actor_loss": actor_loss_value, "q_mean": jnp.mean(q)}
+        return DDPGState(
+            policy_optimizer_state=policy_optimizer_state,
+            policy_params=policy_params,
+            target_policy_params=offpolicy.soft_update(learner.target_policy_params, policy_params, tau),
+            q_optimizer_state=q_optimizer_state,
+            q_params=q_params,
+            target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, tau),
+            normalizer_params=normalizer,
+            gradient_steps=steps,
+            key=learner.key,
+        ), metrics
+
+
+def make_agent(env: Env, config: TrainConfig) -> DDPG:
+    """The networks and settings for an environment's observations and actions.
+
+    Raises:
+        ValueError: images too small for the convolutions, or nothing for the critic to see.
+    """
+    size: Any = env.observation_size
+    policy_network = offpolicy.make_policy_network(config.network, config.ddpg, size, env.action_size)
+    q_network = offpolicy.make_q_network(config.network, config.ddpg, size, env.action_size, config.ddpg.num_critics)
+    made = DDPGNetworks(policy_network, q_network)  # type: ignore[call-arg]
+    return DDPG(config.ddpg, made, size, env.action_size, offpolicy.shares_encoder(config.network, size))
+
+
+def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
+    """Trains a policy, see `offpolicy.train`."""
+    return offpolicy.train(make_agent, env, config, callbacks)
+
+
+def template(env: Env, config: TrainConfig) -> DDPGState:
+    """A learner in the shape of this config's checkpoints."""
+    key = jax.random.PRNGKey(0)
+    return make_agent(env, config).init(key, key)
+
+
+def policy(env: Env, config: TrainConfig, learner: DDPGState, deterministic: bool) -> types.Policy:
+    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); the same whether `deterministic` or not."""
+    del deterministic
+    return make_agent(env, config).policy(learner)

@@ -1,0 +1,301 @@
+"""Observation shapes in, actor and critic networks out, as Brax's losses take them.
+
+A vector goes through Brax's own multi-layer perceptrons. With images the networks are the original benchmark's
+(reference benchmark, section 8.1): depth and segmentation stacked as channels into three convolutions, the vector
+into a layer of its own, both concatenated, then the head. An action enters a critic through a layer of its own.
+
+Parameters of a network with images are `{"encoder": ..., "head": ...}`, so that learners can share the encoder:
+a `Split` holds both parts.
+
+Images are u8 (divided by 255 here) or floats in [0, 1]; only the vector is normalised.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training import distribution
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.networks import FeedForwardNetwork
+from flax import linen
+
+from train.config import NetworkConfig
+
+ObservationSize = int | Mapping[str, tuple[int, ...]]
+"""Length of the vector, or with images the shape under each key (`interactive_nav.sensing.sensors`)."""
+PIXELS = "pixels/"
+GLOROT = jax.nn.initializers.glorot_uniform()
+
+
+def critic_output_init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> jax.Array:
+    """Uniform within 0.003: a new critic predicts about nothing (reference benchmark, section 8.1)."""
+    return jax.random.uniform(key, tuple(shape), dtype, -0.003, 0.003)
+
+
+def vector_part(observation: Any) -> Any:
+    """What is normalised of an observation: the vector itself, or the dict without its images."""
+    if not isinstance(observation, Mapping):
+        return observation
+    return {name: value for name, value in observation.items() if not name.startswith(PIXELS)}
+
+
+def init_normalizer(size: ObservationSize) -> running_statistics.RunningStatisticsState:
+    """Running mean and deviation of the vector part that have seen nothing."""
+    shapes: Any = {name: tuple(shape) for name, shape in size.items()} if isinstance(size, Mapping) else (size,)
+    if isinstance(shapes, dict):
+        arrays: Any = {name: specs.Array(shape, jnp.dtype("float32")) for name, shape in vector_part(shapes).items()}
+    else:
+        arrays = specs.Array(shapes, jnp.dtype("float32"))
+    return running_statistics.init_state(arrays)
+
+
+def update_normalizer(
+    statistics: running_statistics.RunningStatisticsState, observation: Any
+) -> running_statistics.RunningStatisticsState:
+    """The statistics after a batch of observations [..., N]."""
+    return running_statistics.update(statistics, vector_part(observation))
+
+
+def normalize(observation: Any, statistics: running_statistics.RunningStatisticsState) -> Any:
+    """The observation with its vector part normalised; images pass."""
+    part = running_statistics.normalize(vector_part(observation), statistics)  # type: ignore[arg-type]
+    return {**observation, **part} if isinstance(observation, Mapping) else part  # type: ignore[dict-item]
+
+
+def preprocess(enabled: bool) -> Callable[[Any, Any], Any]:
+    """`normalize`, or nothing."""
+    return normalize if enabled else lambda observation, _: observation
+
+
+class ImageEncoder(linen.Module):
+    """Images [..., H, W, C] to features [..., F]."""
+
+    config: NetworkConfig
+
+    @linen.compact
+    def __call__(self, images: jax.Array) -> jax.Array:
+        c = self.config
+        dtype = jnp.dtype(c.compute_dtype)
+        x = images.astype(dtype) / 255 if images.dtype == jnp.uint8 else images.astype(dtype)
+        for channels, kernel, stride in zip(c.conv_channels, c.conv_kernels, c.conv_strides, strict=True):
+            conv = linen.Conv(channels, (kernel,) * 2, stride, padding="VALID", kernel_init=GLOROT, dtype=dtype)
+            x = linen.relu(conv(x))
+        x = x.reshape((*x.shape[:-3], -1))
+        x = linen.relu(linen.Dense(c.image_features, kernel_init=GLOROT, dtype=dtype)(x))
+        return x.astype(jnp.float32)
+
+
+class Encoder(linen.Module):
+    """A dict observation to features: images and vector each through their own layers, concatenated."""
+
+    config: NetworkConfig
+    images: bool = True
+    """False: the vector alone."""
+
+    @linen.compact
+    def __call__(self, observation: Mapping[str, jax.Array]) -> jax.Array:
+        parts = []
+        pixels = [observation[name] for name in sorted(observation) if name.startswith(PIXELS)]
+        if self.images:
+            parts.append(ImageEncoder(self.config, name="image")(jnp.concatenate(pixels, -1)))
+        if "state" in observation:
+            dense = linen.Dense(self.config.state_features, kernel_init=GLOROT, name="state")
+            parts.append(linen.relu(dense(observation["state"])))
+        return jnp.concatenate(parts, -1)
+
+
+class Head(linen.Module):
+    """Features, and for a critic of actions the action, to outputs."""
+
+    layer_sizes: Sequence[int]
+    outputs: int
+    action_features: int = 0
+    output_init: Callable[..., Any] = GLOROT
+    layer_norm: bool = False
+
+    @linen.compact
+    def __call__(self, features: jax.Array, action: jax.Array | None = None) -> jax.Array:
+        x = features
+        if action is not None:
+            dense = linen.Dense(self.action_features, kernel_init=GLOROT, name="action")
+            x = jnp.concatenate([x, linen.relu(dense(action))], -1)
+        for i, size in enumerate(self.layer_sizes):
+            x = linen.relu(linen.Dense(size, kernel_init=GLOROT, name=f"hidden_{i}")(x))
+            x = linen.LayerNorm()(x) if self.layer_norm else x
+        return linen.Dense(self.outputs, kernel_init=self.output_init, name="output")(x)
+
+
+class TwinHead(linen.Module):
+    """Independent critics side by side: [..., critics]."""
+
+    layer_sizes: Sequence[int]
+    action_features: int
+    critics: int = 2
+    layer_norm: bool = False
+
+    @linen.compact
+    def __call__(self, features: jax.Array, action: jax.Array) -> jax.Array:
+        heads = [
+            Head(self.layer_sizes, 1, self.action_features, critic_output_init, self.layer_norm, name=f"critic_{i}")
+            for i in range(self.critics)
+        ]
+        return jnp.concatenate([head(features, action) for head in heads], -1)
+
+
+def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
+    """Raises ValueError where the images are too small for the convolutions."""
+    sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)} if isinstance(size, Mapping) else ()
+    for side in sides:
+        left = side
+        for kernel, stride in zip(config.conv_kernels, config.conv_strides, strict=True):
+            left = (left - kernel) // stride + 1
+        if left < 1:
+            raise ValueError(
+                f"images of {side} x {side} pixels are too small for kernels {config.conv_kernels} with strides "
+                f"{config.conv_strides}; expected larger images (env.image_size) or smaller kernels (network)"
+            )
+
+
+def dummy_observation(size: ObservationSize) -> Any:
+    """Zeros in the shape of a batch of one observation."""
+    if isinstance(size, Mapping):
+        return {name: jnp.zeros((1, *shape)) for name, shape in size.items()}
+    return jnp.zeros((1, size))
+
+
+def make_encoder(
+    config: NetworkConfig, size: ObservationSize, images: bool, prepare: Callable[[Any, Any], Any]
+) -> FeedForwardNetwork:
+    """What comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F].
+
+    Raises:
+        ValueError: images too small for the convolutions, or nothing to encode.
+    """
+    assert isinstance(size, Mapping)
+    check_image_size(config, size)
+    if not images and "state" not in size:
+        raise ValueError(
+            "network.critic_inputs is 'state', but the observation holds images only; expected 'all', or "
+            "observations with a vector (env.observations=waypoints,goal,velocity,depth,...)"
+        )
+    module = Encoder(config, images)
+    return FeedForwardNetwork(
+        init=lambda key: module.init(key, dummy_observation(size)),
+        apply=lambda statistics, params, observation: module.apply(params, prepare(observation, statistics)),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """A network in two parts: parameters `{"encoder": ..., "head": ...}`."""
+
+    encoder: FeedForwardNetwork
+    head: FeedForwardNetwork
+    """init(key), apply(None, params, features, *action)."""
+
+    def whole(self) -> FeedForwardNetwork:
+        """Both parts as one network of observations."""
+
+        def init(key: jax.Array) -> dict[str, Any]:
+            key_encoder, key_head = jax.random.split(key)
+            return {"encoder": self.encoder.init(key_encoder), "head": self.head.init(key_head)}
+
+        def apply(statistics: Any, params: Any, observation: Any, *action: jax.Array) -> jax.Array:
+            features = self.encoder.apply(statistics, params["encoder"], observation)
+            return self.head.apply(None, params["head"], features, *action)
+
+        return FeedForwardNetwork(init=init, apply=apply)
+
+
+def feature_count(config: NetworkConfig, size: Mapping[str, tuple[int, ...]], images: bool) -> int:
+    """Length of what an encoder gives."""
+    return images * config.image_features + ("state" in size) * config.state_features
+
+
+def make_split(
+    config: NetworkConfig,
+    size: ObservationSize,
+    images: bool,
+    prepare: Callable[[Any, Any], Any],
+    head: linen.Module,
+    action_size: int = 0,
+    squeeze: bool = False,
+) -> Split:
+    """An encoder with a head behind it.
+
+    Args:
+        config: of the encoder.
+        size: of observations, with images.
+        images: whether this network looks at them.
+        prepare: normalisation, see `preprocess`.
+        head: module of features, and of the action where `action_size` is positive.
+        action_size: length of the action a critic takes.
+        squeeze: drop the last axis of the output (a value).
+    """
+    assert isinstance(size, Mapping)
+    encoder = make_encoder(config, size, images, prepare)
+    features = jnp.zeros((1, feature_count(config, size, images)))
+    action = (jnp.zeros((1, action_size)),) if action_size else ()
+
+    def apply(_: Any, params: Any, features: jax.Array, *action: jax.Array) -> jax.Array:
+        out = head.apply(params, features, *action)
+        assert isinstance(out, jax.Array)
+        return out[..., 0] if squeeze else out
+
+    return Split(encoder, FeedForwardNetwork(init=lambda key: head.init(key, features, *action), apply=apply))
+
+
+@dataclasses.dataclass(frozen=True)
+class ActorCritic:
+    """A policy and a value network, and their parts where there are any."""
+
+    networks: ppo_networks.PPONetworks
+    """As Brax takes them."""
+    policy: Split | None = None
+    value: Split | None = None
+
+
+def make_ppo_networks(
+    config: NetworkConfig,
+    size: ObservationSize,
+    action_size: int,
+    policy_sizes: Sequence[int],
+    value_sizes: Sequence[int],
+    normalize_observations: bool,
+) -> ActorCritic:
+    """Policy (mean and deviation of a Gaussian before tanh) and value network.
+
+    Args:
+        config: of the encoders; read where observations have images.
+        size: of observations.
+        action_size: number of actions.
+        policy_sizes: hidden layers, behind the encoder if there is one.
+        value_sizes: likewise.
+        normalize_observations: whether the vector is normalised.
+
+    Raises:
+        ValueError: see `make_encoder`.
+    """
+    prepare = preprocess(normalize_observations)
+    if not isinstance(size, Mapping):
+        plain = ppo_networks.make_ppo_networks(
+            size,
+            action_size,
+            preprocess_observations_fn=prepare,  # type: ignore[arg-type]
+            policy_hidden_layer_sizes=policy_sizes,
+            value_hidden_layer_sizes=value_sizes,
+        )
+        return ActorCritic(plain)
+    actions = distribution.NormalTanhDistribution(event_size=action_size)
+    policy = make_split(config, size, True, prepare, Head(policy_sizes, actions.param_size))
+    critic_sees = config.critic_inputs == "all"
+    value = make_split(
+        config, size, critic_sees, prepare, Head(value_sizes, 1, output_init=critic_output_init), squeeze=True
+    )
+    networks = ppo_networks.PPONetworks(policy.whole(), value.whole(), actions)  # type: ignore[call-arg]
+    return ActorCritic(networks, policy, value)

@@ -1,0 +1,325 @@
+"""What SAC and DDPG share: acting into the replay, learning from it, beginning and resuming.
+
+One update steps every environment `steps_per_update` times and then takes `grad_steps_per_update` gradient steps, each
+on a batch of its own. Until the replay holds `min_replay_size` transitions it takes none (`gradient_steps` in the
+metrics says so), and a learner that never took any acts at random meanwhile, so every update is one and the same
+program and logs and checkpoints fall where they always do.
+
+The replay is data, not learner: it travels with the environments in `Snapshot.env_state`, is donated to the compiled
+update and written in place, and a checkpoint that has no room for it (`run.env_state_limit_mb`) leaves it out. Such a
+run begins new episodes when resumed and fills the replay with the policy it has before it learns on; those steps
+count like any others.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from brax.envs import Env
+from brax.training import networks as brax_networks
+from brax.training import types
+from brax.training.acme import running_statistics
+
+from interactive_nav_common.errors import ConfigError
+from train.config import NetworkConfig, OffPolicyConfig, TrainConfig
+from train.learners import networks, replay_buffer
+from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
+from train.learners.replay_buffer import Replay
+
+
+@flax.struct.dataclass
+class OffPolicyData:
+    """All that acting changes: the environments and what was seen of them."""
+
+    env_state: Any
+    replay: Replay
+    noise: Any
+    """State of the exploration noise, leaves [envs, ...]."""
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The environments' own `info`."""
+        return self.env_state.info
+
+    @property
+    def note(self) -> str:
+        """What a user should know before training starts, in one line."""
+        return replay_buffer.describe(self.replay)
+
+
+class Learner(Protocol):
+    """All that learning changes (a flax dataclass), as far as this module knows it."""
+
+    @property
+    def normalizer_params(self) -> running_statistics.RunningStatisticsState:
+        """Of the vector part of observations."""
+        ...
+
+    @property
+    def gradient_steps(self) -> jax.Array:
+        """() i32: taken since the start of the run."""
+        ...
+
+    @property
+    def key(self) -> jax.Array:
+        """What the next update draws from."""
+        ...
+
+    def replace(self, **changes: Any) -> Any:
+        """A copy with some fields changed."""
+        ...
+
+
+class Agent(Protocol):
+    """What makes SAC SAC and DDPG DDPG; changes nothing, holds no state."""
+
+    @property
+    def config(self) -> OffPolicyConfig:
+        """Resolved settings."""
+        ...
+
+    def init(self, key_networks: jax.Array, key: jax.Array) -> Any:
+        """A learner that has learned nothing; `key` is what its updates will draw from."""
+        ...
+
+    def init_noise(self) -> Any:
+        """Exploration noise of every environment at the start of an episode."""
+        ...
+
+    def explore(self, learner: Any, observation: Any, noise: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        """Actions [envs, A] in [-1, 1] to learn from, and the noise after them."""
+        ...
+
+    def gradient_step(
+        self, learner: Any, transitions: types.Transition, key: jax.Array
+    ) -> tuple[Any, dict[str, jax.Array]]:
+        """The learner after one gradient step on transitions [batch, ...], and its scalar metrics."""
+        ...
+
+
+def collect(agent: Agent, env: Env, learner: Any, data: OffPolicyData, key: jax.Array) -> tuple[OffPolicyData, Any]:
+    """Acts for one update.
+
+    Returns:
+        The data with `steps_per_update` more steps of every environment in the replay; and those steps without their
+        images, leaves [steps, envs, ...], with `sums` over ended episodes.
+    """
+    assert agent.config.steps_per_update, "the config must be resolved"
+    at_random = learner.gradient_steps == 0
+
+    def step(data: OffPolicyData, key: jax.Array) -> tuple[OffPolicyData, Any]:
+        key_explore, key_random = jax.random.split(key)
+        before = data.env_state
+        action, noise = agent.explore(learner, before.obs, data.noise, key_explore)
+        random = jax.random.uniform(key_random, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.where(at_random, random, action)
+        after = env.step(before, action)
+        done, truncated = after.done, after.info["truncation"]
+        replay = replay_buffer.insert(data.replay, before.obs, action, after.reward, done, truncated)
+        seen = {
+            "observation": networks.vector_part(before.obs),
+            "action": action,
+            "reward": after.reward,
+            "done": done,
+            "truncation": truncated,
+            "sums": episode_sums(after.info),
+        }
+        ended = done > 0
+        noise = jax.tree.map(
+            lambda x, start: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), start, x), noise, agent.init_noise()
+        )
+        return OffPolicyData(after, replay, noise), seen
+
+    return jax.lax.scan(step, data, jax.random.split(key, agent.config.steps_per_update))
+
+
+def learn(agent: Agent, learner: Any, replay: Replay, key: jax.Array) -> tuple[Any, dict[str, jax.Array], Any]:
+    """Takes gradient steps, if the replay is full enough.
+
+    Returns:
+        The learner; means of its metrics, 0 where no step was taken; and one batch learned from, the first that
+        metrics were not finite on if there is such a one.
+    """
+    c = agent.config
+    assert c.grad_steps_per_update and c.batch_size and c.min_replay_size, "the config must be resolved"
+    keys = jax.random.split(key, c.grad_steps_per_update)
+
+    def draw(key: jax.Array) -> types.Transition:
+        assert c.batch_size
+        return replay_buffer.sample(replay, key, c.batch_size, c.n_steps, c.discounting)
+
+    def one(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        key_draw, key_step = jax.random.split(key)
+        return agent.gradient_step(learner, draw(key_draw), key_step)
+
+    def body(i: jax.Array, carry: tuple[Any, Any, jax.Array]) -> tuple[Any, Any, jax.Array]:
+        learner, sums, good = carry
+        learner, metrics = one(learner, keys[i])
+        sums = jax.tree.map(jnp.add, sums, metrics)
+        return learner, sums, good + all_finite(sums).astype(jnp.int32)
+
+    _, metrics = jax.eval_shape(one, learner, keys[0])
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
+    ready = (replay_buffer.size(replay) >= c.min_replay_size) & (replay.filled > c.n_steps)
+    count = jnp.where(ready, c.grad_steps_per_update, 0)
+    learner, sums, good = jax.lax.fori_loop(0, count, body, (learner, zeros, jnp.zeros((), jnp.int32)))
+    means = jax.tree.map(lambda x: x / jnp.maximum(count, 1), sums)
+    key_draw, _ = jax.random.split(keys[jnp.minimum(good, c.grad_steps_per_update - 1)])
+    return learner, {**means, "gradient_steps": count.astype(jnp.float32)}, draw(key_draw)
+
+
+def update(agent: Agent, env: Env, learner: Any, data: OffPolicyData) -> tuple[Any, OffPolicyData, Update]:
+    """Acts, then learns."""
+    key_act, key_learn, key_next = jax.random.split(learner.key, 3)
+    data, seen = collect(agent, env, learner, data, key_act)
+    sums = jax.tree.map(jnp.sum, seen.pop("sums"))
+    normalizer = networks.update_normalizer(learner.normalizer_params, seen["observation"])
+    learner, losses, batch = learn(agent, learner.replace(normalizer_params=normalizer), data.replay, key_learn)
+    learner = learner.replace(key=key_next)
+    losses = {
+        **losses,
+        "reward_per_step": jnp.mean(seen["reward"]),
+        "replay_size": replay_buffer.size(data.replay).astype(jnp.float32),
+    }
+    finite = all_finite((losses, learner))
+    return learner, data, Update(losses, sums, finite, {"collected": seen, "learned": batch})
+
+
+def start(agent: Agent, env: Env, section: str, seed: int) -> Snapshot:
+    """The first state of learner, environments and replay, derived from the seed.
+
+    Args:
+        agent: see `Agent`.
+        env: natively batched and resetting itself.
+        section: of the config, for messages.
+        seed: of the run.
+
+    Raises:
+        ConfigError: the replay would take more memory than allowed.
+    """
+    c = agent.config
+    key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
+    env_state = reset_envs(agent, env, key_env)
+    make_replay = functools.partial(replay_buffer.init, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
+    check_memory(c, jax.eval_shape(make_replay), section)
+    data = OffPolicyData(env_state, make_replay(), agent.init_noise())
+    return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
+
+
+def reset_envs(agent: Agent, env: Env, key: jax.Array) -> Any:
+    """New episodes in every environment."""
+    return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
+
+
+def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
+    """Raises `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
+    if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
+        images = isinstance(replay.observation, Mapping)
+        smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"
+        raise ConfigError(
+            f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {replay_buffer.describe(replay)}; lower "
+            f"{section}.max_replay_size, choose {smaller} if it is not chosen yet, or raise the limit"
+        )
+
+
+def train(
+    make_agent: Callable[[Env, TrainConfig], Agent], env: Env, config: TrainConfig, callbacks: Callbacks
+) -> TrainResult:
+    """Trains a policy.
+
+    Args:
+        make_agent: of the algorithm.
+        env: natively batched and resetting itself (`interactive_nav.task.wrappers.AutoResetEnv`).
+        config: resolved, see `train.config.resolve`.
+        callbacks: progress, files and signals.
+
+    Raises:
+        ConfigError: the replay would take more memory than allowed.
+        DivergedError: see `train.learners.learner.run_loop`.
+    """
+    agent = make_agent(env, config)
+    begin = start(agent, env, config.algorithm, config.run.seed)
+    restored = callbacks.restore(begin)
+    if restored is not None:
+        empty: Any = begin.env_state
+        begin = restored
+        if begin.env_state is None:
+            key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), begin.env_steps)
+            env_state = reset_envs(agent, env, key)
+            begin = dataclasses.replace(begin, env_state=empty.replace(env_state=env_state))
+        del empty  # two replays might not fit
+    steps_per_update = (agent.config.num_envs or 0) * (agent.config.steps_per_update or 0)
+    return run_loop(functools.partial(update, agent, env), begin, steps_per_update, config.run, callbacks)
+
+
+def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
+    """Targets moved by `tau` towards the networks they follow, written as Brax writes it."""
+    return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)
+
+
+def make_policy_network(
+    network: NetworkConfig, config: OffPolicyConfig, size: networks.ObservationSize, outputs: int
+) -> brax_networks.FeedForwardNetwork:
+    """Observations to what parametrises actions.
+
+    Args:
+        network: encoders; read where observations have images.
+        config: layers.
+        size: of observations.
+        outputs: numbers that parametrise an action.
+    """
+    prepare, layers = networks.preprocess(config.normalize_observations), config.policy_hidden_layer_sizes
+    if isinstance(size, Mapping):
+        return networks.make_split(network, size, True, prepare, networks.Head(layers, outputs)).whole()
+    return brax_networks.make_policy_network(
+        outputs,
+        size,
+        preprocess_observations_fn=prepare,  # type: ignore[arg-type]
+        hidden_layer_sizes=layers,
+    )
+
+
+def make_q_network(
+    network: NetworkConfig, config: OffPolicyConfig, size: networks.ObservationSize, action_size: int, critics: int
+) -> brax_networks.FeedForwardNetwork:
+    """Observations and actions to values [..., critics]; with images the critics look through one encoder."""
+    prepare, layers = networks.preprocess(config.normalize_observations), config.q_hidden_layer_sizes
+    if isinstance(size, Mapping):
+        head = networks.TwinHead(layers, network.action_features, critics, config.q_layer_norm)
+        images = network.critic_inputs == "all"
+        return networks.make_split(network, size, images, prepare, head, action_size).whole()
+    return brax_networks.make_q_network(
+        size,
+        action_size,
+        preprocess_observations_fn=prepare,  # type: ignore[arg-type]
+        hidden_layer_sizes=layers,
+        n_critics=critics,
+        layer_norm=config.q_layer_norm,
+    )
+
+
+def shares_encoder(network: NetworkConfig, size: networks.ObservationSize) -> bool:
+    """Whether the policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
+    return network.share_encoder and isinstance(size, Mapping)
+
+
+def seeing(policy_params: Any, q_params: Any, shared: bool) -> Any:
+    """The parameters of the whole policy network.
+
+    Args:
+        policy_params: what the policy's optimiser moves.
+        q_params: whose encoder it looks through, if one is shared; the policy's loss does not move it.
+        shared: see `shares_encoder`.
+    """
+    return {**policy_params, "encoder": q_params["encoder"]} if shared else policy_params
+
+
+def own_params(policy_params: Any, shared: bool) -> Any:
+    """The part of the whole policy network's parameters that is its own."""
+    return {"head": policy_params["head"]} if shared else policy_params

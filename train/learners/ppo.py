@@ -1,0 +1,336 @@
+"""A batched environment and a config in, a policy trained by PPO out; Brax's losses, networks and unrolls.
+
+Brax's own `ppo.train` cannot be stopped and continued: it gives out parameters only, not the optimiser or the
+random key, and keeps its loop to itself. So the loop is ours (`learner.run_loop`) and the update below is
+Brax's, with its keys split in the same places: a test compares the parameters after an update with those of
+`brax.training.agents.ppo.train`. What differs is one device instead of pmap, and less memory: episode scores
+are summed before learning, and a sequence keeps only its last next-observation (the loss reads no other).
+
+Time limits: an episode cut by the clock has `done` = 1 and `truncation` = 1. Brax's GAE then leaves the cut
+step out and bootstraps the step before it from V(observation at the cut step), which is a state of the right
+episode; nothing is counted twice. `bootstrap_on_timeout`, its other way (reward += discount * V), is for
+environments that report `truncation` = 0 there: with `truncation` = 1 it is masked out, it takes V before the
+cut for V after it, and it multiplies V by `reward_scaling`. We do not use it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from brax.envs import Env
+from brax.training import acting, gradients, types
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo import losses as ppo_losses
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import optimizer as ppo_optimizer
+
+from train.config import NetworkConfig, PPOConfig, TrainConfig
+from train.learners import networks as nets
+from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
+
+
+@flax.struct.dataclass
+class SharedParams:
+    """Parameters of an actor and a critic that look through one encoder."""
+
+    encoder: Any
+    policy: Any
+    """Head of the policy."""
+    value: Any
+    """Head of the value."""
+
+
+@flax.struct.dataclass
+class PPOState:
+    """All that learning changes."""
+
+    optimizer_state: optax.OptState
+    params: ppo_losses.PPONetworkParams | SharedParams
+    normalizer_params: running_statistics.RunningStatisticsState
+    key: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOParts:
+    """All that learning does not change."""
+
+    config: PPOConfig
+    nets: nets.ActorCritic
+    optimizer: optax.GradientTransformation
+    observation_size: nets.ObservationSize
+    shared: bool = False
+    """Actor and critic have one encoder."""
+
+    @property
+    def networks(self) -> ppo_networks.PPONetworks:
+        """As Brax takes them, of observations."""
+        return self.nets.networks
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps collected for one update."""
+        c = self.config
+        assert c.batch_size and c.num_minibatches and c.unroll_length, "the config must be resolved"
+        return c.batch_size * c.num_minibatches * c.unroll_length
+
+
+def make_parts(
+    config: PPOConfig,
+    observation_size: nets.ObservationSize,
+    action_size: int,
+    network: NetworkConfig | None = None,
+) -> PPOParts:
+    """Networks and optimiser for observations of the given size.
+
+    Args:
+        config: resolved or not; sizes of batches are not read.
+        observation_size: length of the vector, or with images the shape under each key.
+        action_size: number of actions.
+        network: encoders of images.
+
+    Raises:
+        ValueError: the encoders do not fit the images.
+    """
+    network = network or NetworkConfig()
+    made = nets.make_ppo_networks(
+        network,
+        observation_size,
+        action_size,
+        config.policy_hidden_layer_sizes,
+        config.value_hidden_layer_sizes,
+        config.normalize_observations,
+    )
+    adam = optax.adam(config.learning_rate)
+    if config.learning_rate_schedule == "adaptive_kl":
+        adam = optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate)
+    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
+    return PPOParts(config, made, optimizer, observation_size, network.share_encoder and made.policy is not None)
+
+
+def init(parts: PPOParts, key_networks: jax.Array, key: jax.Array) -> PPOState:
+    """A learner that has learned nothing; `key` is what its updates will draw from."""
+    key_policy, key_value = jax.random.split(key_networks)
+    policy = parts.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
+    value = parts.networks.value_network.init(key_value)  # type: ignore[call-arg]
+    if parts.shared:
+        params: Any = SharedParams(encoder=policy["encoder"], policy=policy["head"], value=value["head"])
+    else:
+        params = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
+    return PPOState(
+        optimizer_state=parts.optimizer.init(params),
+        params=params,
+        normalizer_params=nets.init_normalizer(parts.observation_size),
+        key=key,
+    )
+
+
+def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[Any, Any]:
+    """Parameters of the policy and the value network as `PPOParts.networks` take them."""
+    if isinstance(params, SharedParams):
+        return (
+            {"encoder": params.encoder, "head": params.policy},
+            {"encoder": params.encoder, "head": params.value},
+        )
+    return params.policy, params.value
+
+
+def make_policy(parts: PPOParts, state: PPOState, deterministic: bool) -> types.Policy:
+    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+    make = ppo_networks.make_inference_fn(parts.networks)
+    return make((state.normalizer_params, *whole_params(state.params)), deterministic)
+
+
+def collect(
+    parts: PPOParts, env: Env, state: PPOState, env_state: Any, key: jax.Array
+) -> tuple[Any, types.Transition, dict[str, jax.Array]]:
+    """Acts for one update.
+
+    Returns:
+        The environments' new state; transitions with leaves [sequences, time, ...]; sums over ended episodes.
+    """
+    act, config = make_policy(parts, state, deterministic=False), parts.config
+    assert config.batch_size and config.num_minibatches and config.num_envs
+
+    def unroll(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], Any]:
+        env_state, key = carry
+        key, next_key = jax.random.split(key)
+        env_state, data = acting.generate_unroll(
+            env,
+            env_state,
+            act,
+            key,
+            config.unroll_length or 0,
+            extra_fields=("truncation", "episode_metrics", "episode_done"),
+        )
+        extras: Any = data.extras["state_extras"]  # type: ignore[call-overload,index]
+        sums = episode_sums(extras)
+        data = data._replace(
+            extras={
+                "policy_extras": data.extras["policy_extras"],
+                "state_extras": {"truncation": extras["truncation"]},
+            },
+            next_observation=jax.tree.map(lambda x: x[-1:], data.next_observation),
+        )
+        return (env_state, next_key), (data, sums)
+
+    length = config.batch_size * config.num_minibatches // config.num_envs
+    (env_state, _), (data, sums) = jax.lax.scan(unroll, (env_state, key), None, length=length)
+    # [unrolls, time, envs, ...] -> [unrolls * envs, time, ...]
+    data = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2).reshape((-1, x.shape[1]) + x.shape[3:]), data)
+    return env_state, data, jax.tree.map(jnp.sum, sums)
+
+
+def _heads(parts: PPOParts) -> ppo_networks.PPONetworks:
+    assert parts.nets.policy and parts.nets.value
+    return parts.networks.replace(policy_network=parts.nets.policy.head, value_network=parts.nets.value.head)
+
+
+def shared_loss(
+    params: SharedParams,
+    normalizer_params: Any,
+    data: types.Transition,
+    key: jax.Array,
+    *,
+    encode: Any,
+    **settings: Any,
+) -> tuple[jax.Array, types.Metrics]:
+    """Brax's loss of the two heads, on features that are computed once."""
+    data = data._replace(
+        observation=encode(normalizer_params, params.encoder, data.observation),
+        next_observation=encode(normalizer_params, params.encoder, data.next_observation),
+    )
+    heads = ppo_losses.PPONetworkParams(policy=params.policy, value=params.value)  # type: ignore[call-arg]
+    return ppo_losses.compute_ppo_loss(heads, None, data, key, **settings)
+
+
+def minibatch_step(
+    parts: PPOParts, normalizer_params: Any, carry: tuple[Any, Any, jax.Array], data: types.Transition
+) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
+    """One gradient step on transitions [batch, time, ...]; carry is (optimiser state, params, key)."""
+    optimizer_state, params, key = carry
+    key, key_loss = jax.random.split(key)
+    config = parts.config
+    loss_fn = functools.partial(
+        shared_loss if parts.shared else ppo_losses.compute_ppo_loss,
+        ppo_network=_heads(parts) if parts.shared else parts.networks,
+        **({"encode": parts.nets.policy.encoder.apply} if parts.shared and parts.nets.policy else {}),
+        entropy_cost=config.entropy_cost,
+        discounting=config.discounting,
+        reward_scaling=config.reward_scaling,
+        gae_lambda=config.gae_lambda,
+        clipping_epsilon=config.clipping_epsilon,
+        normalize_advantage=config.normalize_advantage,
+        vf_coefficient=config.vf_loss_coefficient,
+    )
+    loss_and_grad = gradients.loss_and_pgrad(loss_fn, pmap_axis_name=None, has_aux=True)  # type: ignore[arg-type]
+    (_, losses), grads = loss_and_grad(params, normalizer_params, data, key_loss)
+    if config.learning_rate_schedule == "adaptive_kl":
+        optimizer_state, rate = ppo_optimizer.adaptive_kl_learning_rate(
+            optimizer_state, losses["kl_mean"], config.desired_kl
+        )
+    else:
+        rate = jnp.asarray(config.learning_rate)
+    updates, optimizer_state = parts.optimizer.update(grads, optimizer_state)
+    params = optax.apply_updates(params, updates)
+    return (optimizer_state, params, key), {
+        **losses,
+        "learning_rate": rate,
+        "grad_norm": optax.tree.norm(grads),
+    }
+
+
+def sgd_pass(
+    parts: PPOParts,
+    data: types.Transition,
+    normalizer_params: Any,
+    carry: tuple[Any, Any, jax.Array],
+    _: None,
+) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
+    """One pass over the data in shuffled minibatches; carry is (optimiser state, params, key)."""
+    optimizer_state, params, key = carry
+    key, key_perm, key_grad = jax.random.split(key, 3)
+
+    def shuffle(x: jax.Array) -> jax.Array:
+        return jax.random.permutation(key_perm, x).reshape((parts.config.num_minibatches, -1) + x.shape[1:])
+
+    (optimizer_state, params, _key), losses = jax.lax.scan(
+        functools.partial(minibatch_step, parts, normalizer_params),
+        (optimizer_state, params, key_grad),
+        jax.tree.map(shuffle, data),
+    )
+    return (optimizer_state, params, key), losses
+
+
+def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[PPOState, Any, Update]:
+    """Collects one batch and learns from it: Brax's training step."""
+    key_sgd, key_unroll, key_next = jax.random.split(state.key, 3)
+    env_state, data, sums = collect(parts, env, state, env_state, key_unroll)
+    # As in Brax: with adaptive_kl the old policy's outputs must stay comparable, so normalise afterwards.
+    late = parts.config.learning_rate_schedule == "adaptive_kl"
+    seen = nets.update_normalizer(state.normalizer_params, data.observation)
+    normalizer_params = state.normalizer_params if late else seen
+    (optimizer_state, params, _), losses = jax.lax.scan(
+        functools.partial(sgd_pass, parts, data, normalizer_params),
+        (state.optimizer_state, state.params, key_sgd),
+        None,
+        length=parts.config.num_updates_per_batch,
+    )
+    losses = {**jax.tree.map(jnp.mean, losses), "reward_per_step": jnp.mean(data.reward)}
+    new_state = PPOState(optimizer_state=optimizer_state, params=params, normalizer_params=seen, key=key_next)
+    finite = all_finite((losses, params, seen.mean, seen.std))
+    return new_state, env_state, Update(losses, sums, finite, data)
+
+
+def start(parts: PPOParts, env: Env, seed: int) -> Snapshot:
+    """The first state of learner and environments; keys are derived from the seed as Brax derives them."""
+    key_networks, key_local = jax.random.split(jax.random.PRNGKey(seed))
+    key_local, key_env, _ = jax.random.split(jax.random.fold_in(key_local, 0), 3)
+    key_updates = jax.random.split(jax.random.split(key_local)[0], 1)[0]
+    return Snapshot(0, init(parts, key_networks, key_updates), reset_envs(parts, env, key_env))
+
+
+def reset_envs(parts: PPOParts, env: Env, key: jax.Array) -> Any:
+    """New episodes in every environment."""
+    return jax.jit(env.reset)(jax.random.split(key, parts.config.num_envs or 1))
+
+
+def parts_of(env: Any, config: TrainConfig) -> PPOParts:
+    """`make_parts` for an environment and a whole config."""
+    return make_parts(config.ppo, env.observation_size, env.action_size, config.network)
+
+
+def template(env: Any, config: TrainConfig) -> PPOState:
+    """A learner in the shapes that its checkpoints have."""
+    key = jax.random.PRNGKey(0)
+    return init(parts_of(env, config), key, key)
+
+
+def policy(env: Any, config: TrainConfig, learner: PPOState, deterministic: bool) -> types.Policy:
+    """What a learner has learned: see `make_policy`."""
+    return make_policy(parts_of(env, config), learner, deterministic)
+
+
+def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
+    """Trains a policy.
+
+    Args:
+        env: natively batched and resetting itself (`interactive_nav.task.wrappers.AutoResetEnv`).
+        config: resolved, see `train.config.resolve`.
+        callbacks: progress, files and signals.
+    """
+    parts = parts_of(env, config)
+    begin = start(parts, env, config.run.seed)
+    restored = callbacks.restore(begin)
+    if restored is not None:
+        begin = restored
+        if begin.env_state is None:
+            key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), begin.env_steps)
+            begin = dataclasses.replace(begin, env_state=reset_envs(parts, env, key))
+    update_fn = functools.partial(update, parts, env)
+    return run_loop(update_fn, begin, parts.steps_per_update, config.run, callbacks)

@@ -1,0 +1,179 @@
+"""Steps of many environments in, random transitions out: a ring in device memory that holds each image once.
+
+The ring is [slots, envs, ...]: one slot holds what every environment saw and did in one step. The next observation
+of a step is the observation in the next slot, so nothing is stored twice, and the newest `n_steps` slots cannot be
+drawn yet. Where an episode ended, the next slot belongs to another episode: its discount is 0, or, at a time limit,
+its truncation is 1 and the losses leave it out (see `sample`).
+
+Everything is pure; learners donate the ring to their compiled update, which then writes it in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from brax.training import types
+
+from train.learners.networks import PIXELS
+
+
+@flax.struct.dataclass
+class Replay:
+    """The ring."""
+
+    observation: Any
+    """[slots, envs, ...] before the step; images in their own type, vectors as configured."""
+    action: jax.Array
+    """[slots, envs, A]."""
+    reward: jax.Array
+    """[slots, envs] f32."""
+    done: jax.Array
+    """[slots, envs] bool: the step ended its episode, for whatever reason."""
+    truncated: jax.Array
+    """[slots, envs] bool: it was the time limit that did."""
+    position: jax.Array
+    """() i32: the slot that is written next."""
+    filled: jax.Array
+    """() i32: slots written so far, at most all."""
+
+
+def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> Replay:
+    """An empty ring.
+
+    Args:
+        slots: steps of each environment to keep.
+        observation: a batch of observations [envs, ...]; only shapes and types are read.
+        action_size: length of an action.
+        vector_dtype: how vectors are stored, float32 or float16.
+    """
+
+    def ring(name: str, x: jax.Array) -> jax.Array:
+        return jnp.zeros((slots, *x.shape), x.dtype if name.startswith(PIXELS) else vector_dtype)
+
+    if isinstance(observation, Mapping):
+        rings: Any = {name: ring(name, x) for name, x in observation.items()}
+    else:
+        rings = ring("", observation)
+    envs = jax.tree.leaves(observation)[0].shape[0]
+    return Replay(
+        observation=rings,
+        action=jnp.zeros((slots, envs, action_size)),
+        reward=jnp.zeros((slots, envs)),
+        done=jnp.zeros((slots, envs), bool),
+        truncated=jnp.zeros((slots, envs), bool),
+        position=jnp.zeros((), jnp.int32),
+        filled=jnp.zeros((), jnp.int32),
+    )
+
+
+def nbytes(replay: Replay) -> int:
+    """Memory of a ring, or of one with the shapes that `jax.eval_shape` tells beforehand, bytes."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
+
+
+def describe(replay: Replay) -> str:
+    """A ring's memory in one line; as `nbytes`."""
+    slots, envs = replay.reward.shape
+    total, transitions = nbytes(replay), slots * envs
+    return (
+        f"replay of {transitions:,} transitions ({slots:,} steps of {envs:,} environments) of "
+        f"{total / transitions:,.0f} bytes each takes {total / 1e9:.2f} GB on the device"
+    )
+
+
+def insert(
+    replay: Replay, observation: Any, action: jax.Array, reward: jax.Array, done: jax.Array, truncated: jax.Array
+) -> Replay:
+    """The ring with one step of every environment in place of its oldest.
+
+    Args:
+        replay: the ring.
+        observation: [envs, ...] before the step.
+        action: [envs, A].
+        reward: [envs].
+        done: [envs], not 0 where the step ended an episode.
+        truncated: [envs], not 0 where the time limit did.
+    """
+    at = replay.position
+    slots = replay.reward.shape[0]
+
+    def write(ring: jax.Array, x: jax.Array) -> jax.Array:
+        if ring.dtype == jnp.float16:  # beyond its range: its largest number, not infinity
+            x = jnp.clip(x, -65504.0, 65504.0)
+        return ring.at[at].set(x.astype(ring.dtype))
+
+    return Replay(
+        observation=jax.tree.map(write, replay.observation, observation),
+        action=write(replay.action, action),
+        reward=write(replay.reward, reward),
+        done=write(replay.done, done),
+        truncated=write(replay.truncated, truncated),
+        position=(at + 1) % slots,
+        filled=jnp.minimum(replay.filled + 1, slots),
+    )
+
+
+def size(replay: Replay) -> jax.Array:
+    """() i32: transitions in the ring, those included that cannot be drawn yet."""
+    return replay.filled * replay.reward.shape[1]
+
+
+def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
+    """Transitions drawn uniformly, with replacement, from all that have `n_steps` younger slots.
+
+    A transition covers `n_steps` steps, or fewer where the episode ends. For m steps of discount g it holds
+    reward r_1 + g r_2 + ... + g^(m-1) r_m and discount g^(m-1), or 0 where the last one is a failure or success:
+    Brax's losses multiply by the last g themselves. At a time limit there is no observation of what comes after
+    (the next slot shows a new episode): a window that meets one ends before that step and bootstraps from the
+    observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do.
+
+    Args:
+        replay: the ring; with no more than `n_steps` slots filled what is drawn means nothing.
+        key: random key.
+        batch_size: how many.
+        n_steps: at least 1.
+        discounting: g.
+
+    Returns:
+        Leaves [batch, ...]; vectors f32, images as stored; `extras["state_extras"]["truncation"]`.
+    """
+    slots, envs = replay.reward.shape
+    key_age, key_env = jax.random.split(key)
+    age = jax.random.randint(key_age, (batch_size,), 0, jnp.maximum(replay.filled - n_steps, 1))
+    env = jax.random.randint(key_env, (batch_size,), 0, envs)
+    first = replay.position - replay.filled + age
+
+    step = jnp.arange(n_steps)
+    window = ((first[:, None] + step) % slots, env[:, None])
+    done, truncated = replay.done[window], replay.truncated[window]
+    ended_before = jnp.cumsum(done, 1) - done > 0
+    counts = ~ended_before & ~(truncated & (step > 0))
+    length = jnp.sum(counts, 1)
+    reward = jnp.sum(jnp.where(counts, replay.reward[window] * discounting**step, 0.0), 1)
+    alive = ~jnp.any(counts & done, 1)
+
+    def at(slot: jax.Array) -> Any:
+        return _as_learned_from(jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation))
+
+    return types.Transition(  # type: ignore[call-arg]
+        observation=at(first),
+        action=replay.action[first % slots, env],
+        reward=reward,
+        discount=alive * jnp.float32(discounting) ** (length - 1),
+        next_observation=at(first + length),
+        extras={
+            "policy_extras": {},
+            "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)},
+        },  # type: ignore[arg-type]
+    )
+
+
+def _as_learned_from(observation: Any) -> Any:
+    """The observation with its vectors in f32 again."""
+    if not isinstance(observation, Mapping):
+        return observation.astype(jnp.float32)
+    return {name: x if name.startswith(PIXELS) else x.astype(jnp.float32) for name, x in observation.items()}

@@ -1,0 +1,206 @@
+"""A batched environment and a config in, a policy trained by SAC out; Brax's losses, our loop and replay.
+
+Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with Brax's losses, optimisers and order of steps: a test
+compares the parameters after a gradient step with Brax's arithmetic. What differs is in `train.learners.offpolicy`: one
+device, a compact replay, images, resuming.
+
+Time limits: Brax's critic loss leaves out a step with `truncation` = 1, for what comes after it is not known (the
+environment shows a new episode's observation); it says nothing about the step's value, so nothing is learned from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from brax.envs import Env
+from brax.training import distribution, gradients, types
+from brax.training.acme import running_statistics
+from brax.training.agents.sac import losses as sac_losses
+from brax.training.agents.sac import networks as sac_networks
+
+from train.config import SACConfig, TrainConfig
+from train.learners import networks, offpolicy
+from train.learners.learner import Callbacks, TrainResult
+
+
+@flax.struct.dataclass
+class SACState:
+    """All that learning changes."""
+
+    policy_optimizer_state: optax.OptState
+    policy_params: Any
+    q_optimizer_state: optax.OptState
+    q_params: Any
+    target_q_params: Any
+    alpha_optimizer_state: optax.OptState
+    alpha_params: jax.Array
+    """() logarithm of the temperature."""
+    normalizer_params: running_statistics.RunningStatisticsState
+    gradient_steps: jax.Array
+    key: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class SAC:
+    """All that learning does not change; an `offpolicy.Agent`."""
+
+    config: SACConfig
+    networks: sac_networks.SACNetworks
+    size: networks.ObservationSize
+    action_size: int
+    shared: bool
+    """The policy looks through the critics' encoder."""
+
+    @property
+    def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+        """Of policy, critics and temperature."""
+        c = self.config
+        return tuple(map(optax.adam, (c.actor_learning_rate, c.critic_learning_rate, c.alpha_learning_rate)))
+
+    def init(self, key_networks: jax.Array, key: jax.Array) -> SACState:
+        """A learner that has learned nothing."""
+        key_policy, key_q = jax.random.split(key_networks)
+        policy_params = offpolicy.own_params(self.networks.policy_network.init(key_policy), self.shared)
+        q_params = self.networks.q_network.init(key_q)
+        log_alpha = jnp.log(jnp.float32(self.config.initial_alpha))
+        policy_optimizer, q_optimizer, alpha_optimizer = self._optimizers
+        return SACState(
+            policy_optimizer_state=policy_optimizer.init(policy_params),
+            policy_params=policy_params,
+            q_optimizer_state=q_optimizer.init(q_params),
+            q_params=q_params,
+            target_q_params=q_params,
+            alpha_optimizer_state=alpha_optimizer.init(log_alpha),
+            alpha_params=log_alpha,
+            normalizer_params=networks.init_normalizer(self.size),
+            gradient_steps=jnp.zeros((), jnp.int32),
+            key=key,
+        )
+
+    def policy(self, learner: SACState, deterministic: bool) -> types.Policy:
+        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+        params = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
+        return sac_networks.make_inference_fn(self.networks)((learner.normalizer_params, params), deterministic)
+
+    def init_noise(self) -> tuple[()]:
+        """None: the policy is random itself."""
+        return ()
+
+    def explore(
+        self, learner: SACState, observation: Any, noise: tuple[()], key: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
+        """Actions drawn from the policy."""
+        return self.policy(learner, deterministic=False)(observation, key)[0], noise
+
+    def gradient_step(
+        self, learner: SACState, transitions: types.Transition, key: jax.Array
+    ) -> tuple[SACState, dict[str, jax.Array]]:
+        """Temperature, critics, policy, targets: Brax's step with its keys split in the same places."""
+        c = self.config
+        alpha_loss, critic_loss, actor_loss = make_losses(self)
+        alpha_params: Any
+        policy_optimizer, q_optimizer, alpha_optimizer = self._optimizers
+
+        def own_actor_loss(policy_params: Any, q_params: Any, normalizer_params: Any, *rest: Any) -> jax.Array:
+            whole = offpolicy.seeing(policy_params, q_params, self.shared)
+            return actor_loss(whole, normalizer_params, q_params, *rest)
+
+        # No axis to average gradients over: one device.
+        alpha_update = gradients.gradient_update_fn(alpha_loss, alpha_optimizer, None)  # type: ignore[arg-type]
+        critic_update = gradients.gradient_update_fn(critic_loss, q_optimizer, None)  # type: ignore[arg-type]
+        actor_update = gradients.gradient_update_fn(own_actor_loss, policy_optimizer, None)  # type: ignore[arg-type]
+
+        _, key_alpha, key_critic, key_actor = jax.random.split(key, 4)
+        seen_policy = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
+        normalizer = learner.normalizer_params
+        alpha_loss_value, alpha_params, alpha_optimizer_state = alpha_update(
+            learner.alpha_params,
+            seen_policy,
+            normalizer,
+            transitions,
+            key_alpha,
+            optimizer_state=learner.alpha_optimizer_state,
+        )
+        alpha = jnp.exp(learner.alpha_params)
+        critic_loss_value, q_params, q_optimizer_state = critic_update(
+            learner.q_params,
+            seen_policy,
+            normalizer,
+            learner.target_q_params,
+            alpha,
+            transitions,
+            key_critic,
+            optimizer_state=learner.q_optimizer_state,
+        )
+        actor_loss_value, policy_params, policy_optimizer_state = actor_update(
+            learner.policy_params,
+            learner.q_params,
+            normalizer,
+            alpha,
+            transitions,
+            key_actor,
+            optimizer_state=learner.policy_optimizer_state,
+        )
+        q = self.networks.q_network.apply(normalizer, learner.q_params, transitions.observation, transitions.action)
+        metrics = {
+            "critic_loss": critic_loss_value,
+            "actor_loss": actor_loss_value,
+            "alpha_loss": alpha_loss_value,
+            "alpha": jnp.exp(alpha_params),
+            "q_mean": jnp.mean(q),
+        }
+        return SACState(
+            policy_optimizer_state=policy_optimizer_state,
+            policy_params=policy_params,
+            q_optimizer_state=q_optimizer_state,
+            q_params=q_params,
+            target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, c.tau),
+            alpha_optimizer_state=alpha_optimizer_state,
+            alpha_params=alpha_params,
+            normalizer_params=normalizer,
+            gradient_steps=learner.gradient_steps + 1,
+            key=learner.key,
+        ), metrics
+
+
+def make_losses(agent: SAC) -> tuple[Any, Any, Any]:
+    """Brax's losses of temperature, critics and policy."""
+    c = agent.config
+    # Brax aims at the entropy -0.5 * action_size and reads action_size for nothing else.
+    stand_in: Any = -2.0 * c.target_entropy_per_action * agent.action_size
+    return sac_losses.make_losses(agent.networks, c.reward_scaling, c.discounting, action_size=stand_in)
+
+
+def make_agent(env: Env, config: TrainConfig) -> SAC:
+    """The networks and settings for an environment's observations and actions.
+
+    Raises:
+        ValueError: images too small for the convolutions, or nothing for the critics to see.
+    """
+    size: Any = env.observation_size
+    actions = distribution.NormalTanhDistribution(event_size=env.action_size)
+    policy_network = offpolicy.make_policy_network(config.network, config.sac, size, actions.param_size)
+    q_network = offpolicy.make_q_network(config.network, config.sac, size, env.action_size, critics=2)
+    made = sac_networks.SACNetworks(policy_network, q_network, actions)  # type: ignore[call-arg]
+    return SAC(config.sac, made, size, env.action_size, offpolicy.shares_encoder(config.network, size))
+
+
+def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
+    """Trains a policy, see `offpolicy.train`."""
+    return offpolicy.train(make_agent, env, config, callbacks)
+
+
+def template(env: Env, config: TrainConfig) -> SACState:
+    """A learner in the shape of this config's checkpoints."""
+    key = jax.random.PRNGKey(0)
+    return make_agent(env, config).init(key, key)
+
+
+def policy(env: Env, config: TrainConfig, learner: SACState, deterministic: bool) -> types.Policy:
+    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+    return make_agent(env, config).policy(learner, deterministic)

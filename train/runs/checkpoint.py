@@ -1,0 +1,250 @@
+"""Snapshots in, checkpoint folders out, and back: whole or not there at all, whatever happens in between."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav_common.errors import FileError
+from train.runs import policy_file
+from train.errors import CheckpointError
+
+LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckpointMeta:
+    """What a checkpoint is of; `meta.json`."""
+
+    env_steps: int
+    wall_s: float
+    """Training time up to here, over all sittings."""
+    score: float | None
+    """Mean of run.best_metric over the checkpoint interval; None if no episode ended in it, or before every
+    environment has had the time for a whole episode."""
+    algorithm: str
+    robot: str
+    observations: tuple[str, ...]
+    observation_size: int | dict[str, list[int]]
+    """Length of the vector, or with images the shape under each key."""
+    action_size: int
+    began_together: int = 0
+    """Env steps at which all environments last began new episodes."""
+
+
+def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:
+    """Writes `root/<env steps>/` and removes what is no longer kept: the newest `keep` stay, and the best.
+
+    Only the newest holds the environments, and only if they take no more than the limit.
+
+    Raises:
+        FileError: the disk is full or not writable; older checkpoints are untouched.
+    """
+    final = root / f"{meta.env_steps:012d}"
+    partial = root / f".partial-{meta.env_steps:012d}"
+    try:
+        remove_partial(root)
+        partial.mkdir(parents=True)
+        _write(partial / LEARNER, flax.serialization.to_bytes(jax.device_get(snapshot.learner)))
+        if snapshot.env_state is not None and megabytes(snapshot.env_state) <= env_state_limit_mb:
+            leaves = [np.asarray(raw) for raw in map(_raw, jax.tree.leaves(snapshot.env_state))]
+            with open(partial / ENV_STATE, "wb") as file:
+                np.savez(file, *leaves)
+                _flush(file)
+        _write(partial / META, json.dumps(dataclasses.asdict(meta), indent=1).encode())
+        if final.exists():
+            _remove(final)
+        os.replace(partial, final)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise FileError(
+            f"{final}: cannot write the checkpoint ({error.strerror or error}); make room and start again: "
+            f"the run continues from its last checkpoint"
+        ) from None
+    kept = list_checkpoints(root)
+    best = best_checkpoint(kept)
+    for old in kept[:-keep]:
+        if old != best:
+            _remove(root / f"{old.env_steps:012d}")
+    for old in kept[:-1]:
+        (root / f"{old.env_steps:012d}" / ENV_STATE).unlink(missing_ok=True)
+    return final
+
+
+def list_checkpoints(root: Path) -> list[CheckpointMeta]:
+    """All whole checkpoints, oldest first."""
+    return [read_meta(path) for path in sorted(root.glob("[0-9]*")) if (path / META).is_file()]
+
+
+def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
+    """The one with the highest score; of equals the newest, and None before any has a score."""
+    scored = [c for c in checkpoints if c.score is not None]
+    return max(scored, key=lambda c: (c.score, c.env_steps), default=None)
+
+
+def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
+    """A checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best.
+
+    Raises:
+        CheckpointError: there is none such.
+    """
+    every = list_checkpoints(root)
+    if not every:
+        raise CheckpointError(f"{root}: holds no checkpoint; train the run first, until its first checkpoint")
+    if which == "last":
+        chosen = every[-1]
+    elif which == "best":
+        chosen = best_checkpoint(every) or every[-1]
+    else:
+        named = [c for c in every if str(c.env_steps) == which.lstrip("0")]
+        if not named:
+            steps = ", ".join(str(c.env_steps) for c in every)
+            raise CheckpointError(f"{root}: no checkpoint {which!r}; expected best, last or one of {steps}")
+        chosen = named[0]
+    return root / f"{chosen.env_steps:012d}", chosen
+
+
+def read_meta(folder: Path) -> CheckpointMeta:
+    """What a checkpoint is of.
+
+    Raises:
+        CheckpointError: its `meta.json` is damaged.
+    """
+    try:
+        plain = json.loads((folder / META).read_text())
+        return CheckpointMeta(**{**plain, "observations": tuple(plain["observations"])})
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise CheckpointError(f"{folder / META}: not readable ({error}); remove this checkpoint") from None
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether a checkpoint holds all of the learner; one that was exported holds the policy alone."""
+    return (folder / LEARNER).is_file() or not (folder / policy_file.POLICY).is_file()
+
+
+def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> None:
+    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`.
+
+    Args:
+        folder: of the checkpoint.
+        target: made.
+        step: see `policy_file.packed`.
+    """
+    meta = read_meta(folder)
+    target.mkdir(parents=True)
+    policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY, step)
+    shutil.copy2(folder / META, target / META)
+
+
+def weights_digest(folder: Path) -> str:
+    """SHA-256 of a checkpoint's weights."""
+    path = folder / (LEARNER if is_whole(folder) else policy_file.POLICY)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def load_learner(folder: Path, template: Any) -> Any:
+    """The learner of a checkpoint, as arrays in the template's structure; of an exported one only the policy counts.
+
+    Raises:
+        CheckpointError: damaged, or of other networks than the template's.
+    """
+    path = folder / LEARNER
+    if not is_whole(folder):
+        path = folder / policy_file.POLICY
+        learner = policy_file.read(path, template)
+    else:
+        try:
+            learner = flax.serialization.from_bytes(template, path.read_bytes())
+        except Exception as error:  # msgpack and flax raise many kinds for a damaged or foreign file
+            raise CheckpointError(
+                f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
+                "use the run's own config, or another checkpoint"
+            ) from None
+    for name, expected in jax.tree_util.tree_leaves_with_path(template):
+        got = _leaf_at(learner, name)
+        if np.shape(got) != np.shape(expected):
+            raise CheckpointError(
+                f"{path}: {jax.tree_util.keystr(name)} has shape {np.shape(got)}, "
+                f"expected {np.shape(expected)}; use the config that the checkpoint was trained with"
+            )
+    return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
+
+
+def load_env_state(folder: Path, template: Any) -> Any | None:
+    """The environments of a checkpoint in the template's structure; None if it has none that fit it."""
+    path = folder / ENV_STATE
+    if not path.is_file():
+        return None
+    leaves, structure = jax.tree.flatten(template)
+    with np.load(path) as stored:
+        arrays = [stored[f"arr_{i}"] for i in range(len(stored.files))]
+    like = [_raw(leaf) for leaf in leaves]
+    if [(a.shape, a.dtype) for a in arrays] != [(x.shape, x.dtype) for x in like]:
+        return None
+    restored = [
+        jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(leaf) else jnp.asarray(array)
+        for array, leaf in zip(arrays, leaves, strict=True)
+    ]
+    return jax.tree.unflatten(structure, restored)
+
+
+def plain_size(size: int | Mapping[str, tuple[int, ...]]) -> int | dict[str, list[int]]:
+    """An observation's size as JSON holds it."""
+    return {name: list(shape) for name, shape in size.items()} if isinstance(size, Mapping) else int(size)
+
+
+def megabytes(tree: Any) -> float:
+    """Memory of a tree's arrays."""
+    return sum(_raw(x).nbytes for x in jax.tree.leaves(tree)) / 1e6
+
+
+def remove_partial(root: Path) -> None:
+    """Removes what a killed run had begun to write."""
+    for left_over in root.glob(".partial-*"):
+        shutil.rmtree(left_over, ignore_errors=True)
+
+
+def _remove(folder: Path) -> None:
+    """Whole for a reader, or not there at all."""
+    gone = folder.with_name(f".partial-gone-{folder.name}")
+    os.replace(folder, gone)
+    shutil.rmtree(gone)
+
+
+def _write(path: Path, data: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(data)
+        _flush(file)
+
+
+def _flush(file: Any) -> None:
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key)
+
+
+def _raw(leaf: Any) -> jax.Array:
+    return jax.random.key_data(leaf) if _is_key(leaf) else jnp.asarray(leaf)
+
+
+def _leaf_at(tree: Any, path: tuple[Any, ...]) -> Any:
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            tree = getattr(tree, key.name)
+        else:
+            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]  # type: ignore[attr-defined]
+    return tree

@@ -1,0 +1,329 @@
+"""A config in, a run folder with checkpoints and metrics out: environment, learner, files, signals wired."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import flax.serialization
+import jax
+import numpy as np
+from brax.envs import Env
+from rich.console import Console
+from tensorboardX import SummaryWriter
+
+import interactive_nav
+from interactive_nav.physics import resolve_backend
+from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.locks import locked
+from interactive_nav_common.signals import stop_signals
+from train.runs import checkpoint, tracking
+from train import config_io
+from train.learners.algorithms import ALGORITHMS
+from train.runs.checkpoint import CheckpointMeta
+from train.config import EnvConfig, TrainConfig, resolve
+from train.errors import CheckpointError
+from train.learners.learner import Snapshot, TrainResult, Update
+from train.runs.progress import TrainingDisplay, describe
+from train.runs.run_folder import FAILURES, RunFolder, claim
+from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.versions import versions
+
+
+def make_env(config: EnvConfig) -> Any:
+    """The environment that a config describes: one, not batched, not resetting itself.
+
+    Raises:
+        ConfigError: an unknown robot, an unusable scene, or settings that do not fit each other.
+    """
+    try:
+        return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
+    except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
+        raise ConfigError(f"env: {error}") from error
+
+
+def config_to_play(
+    folder: RunFolder, words: Sequence[str], scenes: Sequence[str] | None, console: Console
+) -> TrainConfig:
+    """A run's config with the environment to play in: the run's own, but for what a command line asks for.
+
+    What a run learned on a GPU can be played without one: where its backend is not here, another one is taken.
+
+    Args:
+        folder: of the run.
+        words: `env.key=value`; a backend that they name is taken as it is.
+        scenes: folders; None: those that it was trained on.
+        console: told of another backend.
+
+    Raises:
+        UserError: the folder is no run, or a word is wrong.
+    """
+    config = config_io.apply_overrides(folder.read_config(), words)
+    env = dataclasses.replace(config.env, scenes=tuple(scenes) if scenes else config.env.scenes)
+    if not any(word.startswith("env.backend=") for word in words):
+        try:
+            resolve_backend(env.backend)
+        except ValueError:
+            there = resolve_backend("auto")
+            told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
+            console.print(told, highlight=False, soft_wrap=True)
+            env = dataclasses.replace(env, backend=there)
+    return dataclasses.replace(config, env=env)
+
+
+class FolderCallbacks:
+    """Learner callbacks that write a run folder and show progress."""
+
+    def __init__(self, folder: RunFolder, config: TrainConfig, env: Any, display: TrainingDisplay, stops: list[int]):
+        self._folder, self._config, self._env = folder, config, env
+        self._display, self._stops = display, stops
+        self._wall_before_s = 0.0
+        self._began_together = 0
+        self._began = time.perf_counter()
+        self._events: SummaryWriter | None = None
+        self._tracker: tracking.Tracker | None = None
+
+    def _wall_s(self) -> float:
+        return self._wall_before_s + time.perf_counter() - self._began
+
+    def restore(self, template: Snapshot) -> Snapshot | None:
+        """The newest checkpoint of the folder."""
+        checkpoint.remove_partial(self._folder.checkpoints)
+        if not checkpoint.list_checkpoints(self._folder.checkpoints):
+            return None
+        path, meta = checkpoint.find(self._folder.checkpoints, "last")
+        if not checkpoint.is_whole(path):
+            raise CheckpointError(
+                f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
+                "go on from; train into another folder (run.out_dir, run.name)"
+            )
+        check_fits(meta, path, self._config.env, self._env)
+        self._wall_before_s = meta.wall_s
+        learner = checkpoint.load_learner(path, template.learner)
+        env_state = checkpoint.load_env_state(path, template.env_state)
+        self._began_together = meta.env_steps if env_state is None else meta.began_together
+        return Snapshot(meta.env_steps, learner, env_state)
+
+    def should_stop(self) -> bool:
+        """True once a signal asked for it."""
+        return bool(self._stops)
+
+    def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
+        """Makes room for checkpoints and cuts what a killed run logged after its last one."""
+        known = getattr(snapshot.env_state, "info", {}).get("episode_metrics", {})
+        if self._config.run.best_metric not in known:
+            raise ConfigError(
+                f"run.best_metric is {self._config.run.best_metric!r}, expected one of {', '.join(sorted(known))}"
+            )
+        one_mb = checkpoint.megabytes(snapshot.learner)
+        env_mb = checkpoint.megabytes(snapshot.env_state)
+        env_mb = 2 * env_mb if env_mb <= self._config.run.env_state_limit_mb else 0.0
+        claim(self._folder.path, one_mb * (self._config.run.keep_checkpoints + 2) + env_mb)
+        self._folder.cut_metrics(snapshot.env_steps)
+        if snapshot.env_steps < total_steps:
+            self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
+        if self._config.run.tensorboard:
+            self._events = SummaryWriter(str(self._folder.tensorboard), purge_step=snapshot.env_steps + 1)
+        note = getattr(snapshot.env_state, "note", "")
+        if note:
+            self._display.console.print(note, highlight=False, soft_wrap=True)
+        if self._config.run.wandb:
+            self._tracker = tracking.Tracker(self._folder.path, self._config, versions())
+        self._display.begin(snapshot.env_steps, total_steps)
+
+    def on_update(self, env_steps: int) -> None:
+        """Moves the bar."""
+        self._display.update(env_steps)
+
+    def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
+        """One line of metrics.jsonl, one TensorBoard point a value, one status on the console."""
+        self._folder.append_metrics({"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
+        if self._events:
+            for name, value in metrics.items():
+                self._events.add_scalar(name if "/" in name else f"run/{name}", value, env_steps)
+            self._events.flush()
+        if self._tracker:
+            self._tracker.log(env_steps, metrics)
+        self._display.log(env_steps, metrics)
+
+    def on_checkpoint(self, snapshot: Snapshot) -> None:
+        """Writes a checkpoint; its score is the mean over the episodes of the last checkpoint interval.
+
+        Where all environments began together, the first episodes to end are the short ones, which succeed; until
+        each had the time for a whole episode, scores would flatter.
+        """
+        run = self._config.run
+        fair = self._began_together + num_envs(self._config) * self._config.env.episode_steps
+        since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
+        lines = [line for line in read_metrics(self._folder.metrics) if line["env_steps"] > since]
+        meta = CheckpointMeta(
+            env_steps=snapshot.env_steps,
+            wall_s=self._wall_s(),
+            score=mean_score(lines, run.best_metric),
+            began_together=self._began_together,
+            algorithm=self._config.algorithm,
+            robot=self._config.env.robot,
+            observations=self._config.env.observations,
+            observation_size=checkpoint.plain_size(self._env.observation_size),
+            action_size=int(self._env.action_size),
+        )
+        checkpoint.save(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
+
+    def on_diverged(self, before: Snapshot, update: Update) -> str:
+        """Saves the batch and the learner that met it."""
+        path = self._folder.path / f"diverged-{before.env_steps:012d}"
+        path.mkdir(exist_ok=True)
+        (path / checkpoint.LEARNER).write_bytes(flax.serialization.to_bytes(jax.device_get(before.learner)))
+        named = jax.tree_util.tree_leaves_with_path(update.batch)
+        arrays = {jax.tree_util.keystr(name): np.asarray(leaf) for name, leaf in named}
+        np.savez_compressed(path / "batch.npz", **arrays)  # type: ignore[arg-type]
+        return str(path)
+
+    def close(self) -> None:
+        """Finishes the event file."""
+        if self._events:
+            self._events.close()
+        if self._tracker:
+            self._tracker.close()
+
+
+def mean_score(lines: list[dict[str, Any]], name: str) -> float | None:
+    """Mean of a score over the episodes of some lines of metrics; None where none ended."""
+    scored = [(line[f"episode/{name}"], line["episodes"]) for line in lines if f"episode/{name}" in line]
+    episodes = sum(count for _, count in scored)
+    return sum(score * count for score, count in scored) / episodes if episodes else None
+
+
+def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
+    """Raises `CheckpointError` where a checkpoint was trained on another robot or other observations."""
+    facts = (
+        ("robot", meta.robot, config.robot),
+        ("observations", meta.observations, config.observations),
+        ("observation size", meta.observation_size, checkpoint.plain_size(env.observation_size)),
+        ("action size", meta.action_size, int(env.action_size)),
+    )
+    for name, got, expected in facts:
+        if got != expected:
+            raise CheckpointError(
+                f"{path}: {name} of the checkpoint: {got!r}, of the environment: {expected!r}; "
+                "choose a checkpoint of this robot and these observations, or the run's own env settings"
+            )
+
+
+def train_run(
+    config: TrainConfig,
+    console: Console,
+    build_env: Callable[[EnvConfig], Any] = make_env,
+    wrap_env: Callable[[Any], Env] = AutoResetEnv,
+) -> tuple[TrainResult, RunFolder, int | None]:
+    """Trains as configured, beginning or continuing the run folder.
+
+    Args:
+        config: as loaded; sizes may still be `auto`.
+        console: for progress.
+        build_env: config -> one environment.
+        wrap_env: one environment -> batched and resetting itself.
+
+    Returns:
+        The result, the folder, and the signal that ended it early, if one did.
+
+    Raises:
+        UserError: see `train.errors`.
+    """
+    if config.run.wandb:
+        tracking.import_wandb()
+    folder = RunFolder(Path(config.run.out_dir) / config.run.name)
+    claim(folder.path)
+    try:
+        env = build_env(config.env)
+        config = resolve(config, env.backend)
+    except UserError:
+        # Nothing half-made stays behind: `rmdir` takes only empty folders.
+        with contextlib.suppress(OSError):
+            folder.path.rmdir()
+            folder.path.parent.rmdir()
+        raise
+    busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
+    with locked(folder.lock, busy):
+        return _train_in(folder, config, env, console, wrap_env)
+
+
+def _train_in(
+    folder: RunFolder, config: TrainConfig, env: Any, console: Console, wrap_env: Callable[[Any], Env]
+) -> tuple[TrainResult, RunFolder, int | None]:
+    """Trains in a folder that nobody else writes to."""
+    exists = folder.open(config)
+    console.print(
+        f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
+        f"{len(config.env.scenes)} scene(s), backend {env.backend}, {num_envs(config)} environments",
+        highlight=False,
+        soft_wrap=True,
+    )
+    with stop_signals() as stops, TrainingDisplay(console) as display:
+        callbacks = FolderCallbacks(folder, config, env, display, stops)
+        try:
+            result = ALGORITHMS[config.algorithm].train(wrap_env(env), config, callbacks)
+        finally:
+            callbacks.close()
+        metrics = result.metrics or last_metrics(folder)
+        write_text(folder.summary, json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
+    best = checkpoint.best_checkpoint(checkpoint.list_checkpoints(folder.checkpoints))
+    console.print(
+        f"{folder.path}: {'done' if result.completed else 'stopped'} at {result.snapshot.env_steps:,} steps; "
+        + (describe(metrics) if metrics else "nothing logged")
+        + (f"; best checkpoint at {best.env_steps:,} steps" if best else "")
+        + ("" if result.completed else "; the same command continues"),
+        highlight=False,
+        soft_wrap=True,
+    )
+    lost = failures(folder)
+    if lost:
+        told = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
+        console.print(f"[yellow]what physics lost, summed over ended episodes: {told}[/]", soft_wrap=True)
+    return result, folder, stops[0] if stops else None
+
+
+def num_envs(config: TrainConfig) -> int:
+    """Environments that the config's learner steps together."""
+    return getattr(config, config.algorithm).num_envs
+
+
+def last_metrics(folder: RunFolder) -> dict[str, Any]:
+    """The last logged line, without its step; empty if there is none."""
+    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
+
+
+def failures(folder: RunFolder) -> dict[str, float]:
+    """Steps (episodes for `nonfinite`) in which physics failed, over all logged episodes; those that are not 0."""
+    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    totals = {
+        name: sum(line.get(f"episode/{name}", 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES
+    }
+    return {name: round(total, 3) for name, total in totals.items() if total > 0}
+
+
+def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics: dict[str, Any]) -> dict[str, Any]:
+    """How a run ended, for tables over many runs."""
+    saved = checkpoint.list_checkpoints(folder.checkpoints)
+    best = checkpoint.best_checkpoint(saved)
+    return {
+        "run": config.run.name,
+        "algorithm": config.algorithm,
+        "robot": config.env.robot,
+        "k_int": config.env.k_int,
+        "seed": config.run.seed,
+        "completed": result.completed,
+        "env_steps": result.snapshot.env_steps,
+        "wall_s": saved[-1].wall_s if saved else None,
+        "failures": failures(folder),
+        "best": dataclasses.asdict(best) if best else None,
+        "metrics": metrics,
+    }

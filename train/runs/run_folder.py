@@ -1,0 +1,162 @@
+"""One run's folder: config, versions, metrics, TensorBoard events, summary; nothing else writes there.
+
+<out_dir>/<name>/config.yaml       what was run, every value resolved
+                 versions.json     packages, device, commit
+                 metrics.jsonl     one line a log interval
+                 tensorboard/      the same as events
+                 checkpoints/      see `checkpoint`
+                 summary.json      how it ended
+                 lock              held by the process that trains it
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.metrics_file import METRICS, read_metrics, write_metrics
+from interactive_nav_common.versions import versions
+from train.config import TrainConfig
+from train.config_io import flatten, from_yaml, to_yaml
+
+MAY_CHANGE = (
+    *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),
+    *("run.wandb", "run.wandb_project"),
+    *("run.env_state_limit_mb", "env.threads"),
+)
+"""Settings that a run may be continued with at other values: they do not change what an update does."""
+HEADROOM_MB = 64.0
+
+FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
+"""Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
+
+
+class RunFolder:
+    """Paths of a run, and the small files in it."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.config = path / "config.yaml"
+        self.metrics = path / METRICS
+        self.checkpoints = path / "checkpoints"
+        self.tensorboard = path / "tensorboard"
+        self.summary = path / "summary.json"
+        self.lock = path / "lock"
+
+    def read_config(self) -> TrainConfig:
+        """The resolved config of the run.
+
+        Raises:
+            FileError: the folder is no run.
+            ConfigError: its config does not fit this version.
+        """
+        if not self.config.is_file():
+            raise FileError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
+        try:
+            text = self.config.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not a text file"
+            raise FileError(f"{self.config}: cannot be read ({reason}); expected the config of a run") from None
+        return from_yaml(text, where=str(self.config))
+
+    def open(self, config: TrainConfig) -> bool:
+        """Writes config and versions of a new run, or checks that an existing one is continued as it began.
+
+        Returns:
+            True where the run exists already.
+
+        Raises:
+            FileError: the run exists with another value of a setting that decides its meaning.
+        """
+        exists = self.config.is_file()
+        if exists:
+            old, new = flatten(self.read_config()), flatten(config)
+            for name, value in new.items():
+                if old[name] != value and name not in MAY_CHANGE:
+                    raise FileError(
+                        f"{self.path}: the run there has {name} = {old[name]!r}, this one {value!r}; "
+                        "set run.name to begin another run, or remove the folder"
+                    )
+        write_text(self.config, to_yaml(config))
+        write_text(self.path / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        return exists
+
+    def origin(self) -> dict[str, Any]:
+        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known."""
+        kept = {}
+        for name in ("summary.json", "versions.json"):
+            try:
+                found = json.loads((self.path / name).read_text())
+            except (OSError, ValueError):
+                found = {}
+            kept[name] = found if isinstance(found, dict) else {}
+        summary, versions = kept.values()
+        return {
+            "completed": summary.get("completed", False),
+            "env_steps": summary.get("env_steps"),
+            "wall_s": summary.get("wall_s"),
+            "device": versions.get("device", {}).get("kind"),
+            "commit": versions.get("commit"),
+        }
+
+    def append_metrics(self, line: dict[str, Any]) -> None:
+        """Adds one line to metrics.jsonl.
+
+        Raises:
+            FileError: the disk is full or no longer writable.
+        """
+        try:
+            with open(self.metrics, "a") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise FileError(
+                f"{self.metrics}: cannot be written ({error.strerror or error}); make room and start again: "
+                "the run continues from its last checkpoint"
+            ) from None
+
+    def cut_metrics(self, env_steps: int) -> None:
+        """Drops the lines after a checkpoint that a run continues from: their steps are taken again."""
+        if self.metrics.is_file():
+            write_metrics(self.metrics, [line for line in read_metrics(self.metrics) if line["env_steps"] <= env_steps])
+
+
+
+
+
+
+def claim(path: Path, needed_mb: float = 0.0) -> None:
+    """Makes a folder and makes sure that it can be written to.
+
+    Args:
+        path: made with its parents.
+        needed_mb: room that the run will need, beside some head room.
+
+    Raises:
+        FileError: it cannot be made or written, or the disk is too full.
+    """
+    needed_mb += HEADROOM_MB
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".write-probe"
+        probe.write_bytes(bytes(1 << 16))
+        probe.unlink()
+        free_mb = shutil.disk_usage(path).free / 1e6
+    except OSError as error:
+        raise FileError(
+            f"{path}: cannot be written ({error.strerror or error}); expected a writable folder (run.out_dir)"
+        ) from None
+    if free_mb < needed_mb:
+        raise FileError(
+            f"{path}: {free_mb:.0f} MB free on its disk, expected {needed_mb:.0f} MB for checkpoints; "
+            "make room, or set run.out_dir or run.env_state_limit_mb"
+        )
+
+
+
+
+
+

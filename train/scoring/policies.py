@@ -1,0 +1,118 @@
+"""Observation and key in, action out: the learned policy and two yardsticks that never learned.
+
+Every policy is a pure function (observation, key) -> action (A,) in [-1, 1] of one environment, its observation
+a vector (O,) or a dict with images; batch it with `jax.vmap` and a key for each, so that an episode does not
+depend on which others run beside it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from interactive_nav.robots import RobotSpec
+from interactive_nav_common.errors import UserError
+from train.scoring.planners import Planner
+
+Observation = jax.Array | Mapping[str, jax.Array]
+PolicyFn = Callable[[Observation, jax.Array], jax.Array]
+
+LOOK_AHEAD_M = 0.4
+CRUISE_M_S = 0.5
+TURN_GAIN_PER_S = 4.0
+MAX_TURN_RAD_S = 2.0
+ALIGNED_RAD = jnp.pi / 3
+"""Beyond this bearing the follower turns on the spot."""
+
+
+def random_policy(action_size: int, observation: Observation, key: jax.Array) -> jax.Array:
+    """Uniform over all actions."""
+    del observation
+    return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
+
+
+def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
+    """Actions that lead to a point: turn towards it, and drive the faster the better aligned.
+
+    Args:
+        robot: in a control mode with a twist map.
+        target_b: (2,) x forward, y left, m, robot frame.
+
+    Returns:
+        (A,) in [-1, 1].
+    """
+    assert robot.twist is not None
+    bearing = jnp.arctan2(target_b[1], target_b[0])
+    most = min(MAX_TURN_RAD_S, robot.twist.max_angular_rad_s)
+    cruise = min(CRUISE_M_S, robot.twist.max_linear_m_s)
+    turn_rad_s = jnp.clip(TURN_GAIN_PER_S * bearing, -most, most)
+    speed_m_s = jnp.where(jnp.abs(bearing) < ALIGNED_RAD, cruise * jnp.cos(bearing), 0.0)
+    return robot.drive(speed_m_s, turn_rad_s, jnp)
+
+
+def waypoint_follower(robot: RobotSpec, waypoint: int, observation: Observation, key: jax.Array) -> jax.Array:
+    """Steers to one of the waypoints that lead the observation (numbers 2i and 2i + 1); sees no object."""
+    del key
+    vector = observation["state"] if isinstance(observation, Mapping) else observation
+    return steer(robot, vector[2 * waypoint : 2 * waypoint + 2])
+
+
+def make_random(env: Any) -> PolicyFn:
+    """The random yardstick."""
+    return functools.partial(random_policy, env.action_size)
+
+
+def make_follower(env: Any) -> PolicyFn:
+    """The yardstick that follows the shortest path.
+
+    Raises:
+        UserError: the observation has no waypoints, or the robot's control mode takes no base velocity.
+    """
+    config = env.config
+    if env.robot.twist is None:
+        raise UserError(
+            f"policy follower: robot '{env.robot.name}' takes no base velocity in control mode "
+            f"'{env.robot.control_mode}', expected one of its modes that does; leave it out of --policies"
+        )
+    if "waypoints" not in config.observations:
+        raise UserError(
+            f"policy follower: observations are {', '.join(config.observations)}, "
+            "expected waypoints among them; leave it out of --policies"
+        )
+    waypoint = min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 1
+    return functools.partial(waypoint_follower, env.robot, waypoint)
+
+
+def make_learned(act: Any) -> PolicyFn:
+    """A Brax policy (observation, key) -> (action, extras) without its extras."""
+    return lambda observation, key: act(observation, key)[0]
+
+
+YARDSTICKS: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
+PLANNERS = ("avoider", "namo:W")
+"""Planners on the host; W is the weight of pushing against detour, 0 to 1."""
+
+
+def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
+    """A policy or planner that never learns, by name: random, follower, avoider or namo:W.
+
+    Raises:
+        UserError: unknown name or weight, or a robot or observations that it cannot use.
+    """
+    if name in YARDSTICKS:
+        return YARDSTICKS[name](env)
+    if name == "avoider":
+        return Planner(env, None)
+    kind, _, weight = name.partition(":")
+    if kind == "namo":
+        try:
+            share = float(weight)
+        except ValueError:
+            raise UserError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
+        return Planner(env, share)
+    known = ", ".join(("learned", *YARDSTICKS, *PLANNERS))
+    raise UserError(f"--policies: got {name!r}, expected a choice from {known}")

@@ -1,0 +1,273 @@
+"""An environment, a policy and one key an episode in; every episode's scores, and some of the paths, out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from train.scoring.planners import Planner
+from train.scoring.policies import PolicyFn
+
+CHUNK_STEPS = 50
+"""Steps between two looks at which episodes are over."""
+SHRINK = 4
+"""On the CPU, once only one episode in so many still runs, those go on in a batch of their own: it costs a
+compilation and saves stepping the rest. On an accelerator a step costs about the same for fewer."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Paths:
+    """Where the robot went and what it moved, in the first E episodes; world frame, m."""
+
+    scene_index: np.ndarray
+    """[E] i32."""
+    start_xy_w: np.ndarray
+    """[E, 2]."""
+    goal_xy_w: np.ndarray
+    """[E, 2]."""
+    robot_xy_w: np.ndarray
+    """[E, T + 1, 2], NaN after the episode's end."""
+    object_start_w: np.ndarray
+    """[E, M, 3]."""
+    object_end_w: np.ndarray
+    """[E, M, 3]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """N finished episodes."""
+
+    scene_index: np.ndarray
+    """[N] i32."""
+    metrics: dict[str, np.ndarray]
+    """name -> [N], the environment's metrics at the step that ended the episode."""
+    paths: Paths
+
+
+def episode_keys(seed: int, episodes: int) -> jax.Array:
+    """[N, 2] keys of fixed episodes: number i is the same whatever their number and whoever plays them."""
+    return jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
+
+
+def run_episodes(
+    env: Any,
+    policy: PolicyFn | Planner,
+    keys: jax.Array,
+    record: int = 0,
+    on_progress: Callable[[int, int], None] = lambda finished, step: None,
+    starts: Any = None,
+) -> Episodes:
+    """Plays every episode to its end, all in one batch; see `Player.play`."""
+    return Player(env).play(policy, keys, record, on_progress, starts)
+
+
+class Player:
+    """Plays episodes of one environment.
+
+    What is compiled is kept: policies that are `jax.tree_util.Partial`s of one function share it, whatever their
+    numbers, as do chunks of one size.
+
+    Args:
+        env: one environment, not batched, not resetting itself.
+    """
+
+    def __init__(self, env: Any):
+        self.env = env
+        self._reset = jax.jit(jax.vmap(env.reset))
+        self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
+        self._chunk = jax.jit(functools.partial(_play_chunk, env))
+        self._step = jax.jit(functools.partial(_play_step, env))
+        self.known: dict[Any, Any] = {}
+        """Functions of learned policies, by kind: see `train.evaluate.load_policy`."""
+
+    def play(
+        self,
+        policy: PolicyFn | Planner,
+        keys: jax.Array,
+        record: int = 0,
+        on_progress: Callable[[int, int], None] = lambda finished, step: None,
+        starts: Any = None,
+        scene_index: np.ndarray | None = None,
+        batch: int | None = None,
+        on_note: Callable[[str], None] = lambda note: None,
+    ) -> Episodes:
+        """Plays every episode to its end.
+
+        Args:
+            policy: see `train.scoring.policies`, or a planner.
+            keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
+            record: for how many of the first episodes to return paths.
+            on_progress: told (episodes finished, steps taken in their batch) now and then.
+            starts: of `interactive_nav.episodes.starts_of`, leaves [N, ...]: these episodes instead of drawn ones.
+            scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
+            batch: episodes played at a time; None: all. Where the device's memory does not hold so many, half as
+                many are tried.
+            on_note: told when it does not.
+
+        Returns:
+            The episodes in the order of their keys, whatever the batch.
+        """
+        count = len(keys)
+        size = min(batch or count, count)
+        parts: list[Episodes] = []
+        done = 0
+        while done < count:
+            chosen = np.minimum(np.arange(done, done + size), count - 1)  # the last batch is as large as the others
+            take = functools.partial(jax.tree.map, operator.itemgetter(chosen))
+            try:
+                parts.append(
+                    self._play_batch(
+                        policy,
+                        take(keys),
+                        min(size, count - done),
+                        max(0, min(record - done, size)),
+                        lambda finished, step, before=done: on_progress(before + finished, step),
+                        None if starts is None else take(starts),
+                        None if scene_index is None else np.asarray(scene_index)[chosen],
+                        done,
+                    )
+                )
+            except jax.errors.JaxRuntimeError as error:
+                if "RESOURCE_EXHAUSTED" not in str(error) or size == 1:
+                    raise
+                on_note(f"{size} episodes at a time do not fit into the device's memory, going on with {size // 2}")
+                size //= 2
+                continue
+            done += size
+        return _joined(parts)
+
+    def _play_batch(
+        self,
+        policy: PolicyFn | Planner,
+        keys: jax.Array,
+        count: int,
+        record: int,
+        on_progress: Callable[[int, int], None],
+        starts: Any,
+        scene_index: np.ndarray | None,
+        first_episode: int,
+    ) -> Episodes:
+        """Plays the first `count` of the keys' episodes; the rest fill the batch and are over from the start."""
+        env, size, record = self.env, len(keys), min(record, count)
+        if starts is not None:
+            assert self._reset_to is not None
+            state = self._reset_to(starts, keys)
+        else:
+            state = self._reset(keys) if scene_index is None else self._reset(keys, jnp.asarray(scene_index))
+        policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
+        first = jax.tree.map(np.asarray, state.info["nav"])
+        metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
+        object_end = first.object_pos_w.copy()
+        tracks = [[first.robot_pos_w[:record, :2]]]
+
+        episode_of = np.arange(size)  # episode played by each place in the batch
+        finished = episode_of >= count
+        planner = policy if isinstance(policy, Planner) else None
+        act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
+        if not isinstance(policy, jax.tree_util.Partial):
+            act = None if isinstance(policy, Planner) else jax.tree_util.Partial(policy)
+        step = 0
+        while not finished.all():
+            ended_here = jnp.asarray(finished[episode_of])
+            if act is None:
+                played = _play_planned(self._step, planner, state, first_episode + episode_of, ended_here, step)
+            else:
+                played = self._chunk(act, state, policy_keys[episode_of], ended_here, step)
+            state, ended, final, moved, track = played
+            step += CHUNK_STEPS
+            new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
+            for name, values in final.items():
+                metrics[name][episode_of[new]] = np.asarray(values)[new]
+            object_end[episode_of[new]] = np.asarray(moved)[new]
+            finished[episode_of[new]] = True
+            places = np.full((CHUNK_STEPS, record, 2), np.nan, np.float32)
+            seen = episode_of < record
+            places[:, episode_of[seen]] = np.asarray(track)[:, seen]
+            tracks.append(list(places))
+            on_progress(int(finished[:count].sum()), step)
+            running = np.flatnonzero(~finished[episode_of])
+            if env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
+                state = jax.tree.map(operator.itemgetter(running), state)
+                episode_of = episode_of[running]
+        robot_xy = np.stack([place for part in tracks for place in part], 1)
+        longest = np.isfinite(robot_xy[..., 0]).any(0).sum() if record else 0
+        paths = Paths(
+            scene_index=first.scene_index[:record],
+            start_xy_w=first.start_xy_w[:record],
+            goal_xy_w=first.goal_xy_w[:record],
+            robot_xy_w=robot_xy[:, :longest],
+            object_start_w=first.object_pos_w[:record],
+            object_end_w=object_end[:record],
+        )
+        return Episodes(first.scene_index[:count], {name: x[:count] for name, x in metrics.items()}, paths)
+
+
+def _joined(parts: list[Episodes]) -> Episodes:
+    """Batches one after the other; recorded paths as long as the longest."""
+    if len(parts) == 1:
+        return parts[0]
+    longest = max(part.paths.robot_xy_w.shape[1] for part in parts)
+
+    def along(name: str) -> np.ndarray:
+        arrays = [getattr(part.paths, name) for part in parts]
+        if name == "robot_xy_w":
+            pads = [((0, 0), (0, longest - a.shape[1]), (0, 0)) for a in arrays]
+            arrays = [np.pad(a, pad, constant_values=np.nan) for a, pad in zip(arrays, pads, strict=True)]
+        return np.concatenate(arrays)
+
+    return Episodes(
+        np.concatenate([part.scene_index for part in parts]),
+        {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
+        Paths(**{field.name: along(field.name) for field in dataclasses.fields(Paths)}),
+    )
+
+
+def _play_step(env: Any, carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+    """Steps all environments; what belongs to an episode is frozen at the step that ended it."""
+    state, ended, final, moved = carry
+    state = jax.vmap(env.step)(state, action)
+    ends = (state.done > 0) & ~ended
+    nav = state.info["nav"]
+    final = {name: jnp.where(ends, state.metrics[name], value) for name, value in final.items()}
+    moved = jnp.where(ends[:, None, None], nav.object_pos_w, moved)
+    track = jnp.where(ended[:, None], jnp.nan, nav.robot_pos_w[:, :2])
+    return (state, ended | ends, final, moved), track
+
+
+def _play_planned(one_step: Any, planner: Any, state: Any, episode_of: np.ndarray, ended: jax.Array, step: int) -> Any:
+    """`_play_chunk` for a planner on the host."""
+    carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
+    tracks = []
+    for t in range(CHUNK_STEPS):
+        running = ~np.asarray(carry[1])
+        if not running.any():
+            break
+        carry, track = one_step(carry, planner.act(carry[0], episode_of, running, step + t))
+        tracks.append(np.asarray(track))
+    state, ended, final, moved = carry
+    tracks += [np.full_like(tracks[0], np.nan)] * (CHUNK_STEPS - len(tracks))
+    return state, ended, final, moved, np.stack(tracks)
+
+
+def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: jax.Array, step: int) -> Any:
+    """Steps all environments by `CHUNK_STEPS`.
+
+    Returns:
+        state, ended [N], metrics at the end {name: [N]}, objects at the end [N, M, 3],
+        robot positions [T, N, 2] (NaN after the end).
+    """
+
+    def one_step(carry: Any, t: jax.Array) -> tuple[Any, jax.Array]:
+        action = jax.vmap(policy)(carry[0].obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
+        return _play_step(env, carry, action)
+
+    carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
+    (state, ended, final, moved), track = jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))
+    return state, ended, final, moved, track

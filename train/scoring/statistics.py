@@ -1,0 +1,264 @@
+"""Rows of episodes in; means of runs, intervals over seeds, and the tests behind the paper's claims out.
+
+A run is the unit: its score is the mean over its fixed episodes, and intervals and tests are over runs that differ in
+their seed. Episodes of one run share a policy and are no independent trials of an algorithm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from scipy import stats
+
+from interactive_nav_common.statistics import LEVEL, Contrast, _constant, estimate, p_text, welch
+
+CONFIDENCE = 0.95
+SCORES = ("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunMean:
+    """A run's means over its episodes in one part of the scenes."""
+
+    run: str
+    robot: str
+    algorithm: str
+    k_int: float
+    seed: int
+    episodes: int
+    scores: Mapping[str, float]
+
+    @property
+    def cell(self) -> tuple[str, str, float]:
+        """All but the seed."""
+        return self.robot, self.algorithm, self.k_int
+
+    def ins(self, alpha: float) -> float:
+        """Interactive navigation score: alpha P_eff + (1 - alpha) E_eff."""
+        return alpha * self.scores["path_efficiency"] + (1.0 - alpha) * self.scores["effort_efficiency"]
+
+
+def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
+    """Means of each learned run over its episodes.
+
+    Args:
+        rows: of `train.evaluate`.
+        split: train or test scenes; None: all.
+    """
+    learned = np.array([policy == "learned" for policy in rows["policy"].to_pylist()], bool)
+    if split is not None:
+        learned &= np.array([s == split for s in rows["split"].to_pylist()], bool)
+    chosen = rows.filter(pa.array(learned))
+    names = [name for name in SCORES if name in chosen.column_names]
+    keys = ["run", "robot", "algorithm", "k_int", "seed"]
+    means = chosen.group_by(keys).aggregate([(name, "mean") for name in names] + [("episode", "count")]).to_pylist()
+    found = [
+        RunMean(
+            *(row[key] for key in keys),
+            episodes=row["episode_count"],
+            scores={name: row[f"{name}_mean"] for name in names},
+        )
+        for row in means
+    ]
+    return sorted(found, key=lambda run: (run.robot, run.algorithm, run.k_int, run.seed, run.run))
+
+
+def cells(means: Sequence[RunMean]) -> dict[tuple[str, str, float], list[RunMean]]:
+    """Runs by robot, algorithm and k_int."""
+    found: dict[tuple[str, str, float], list[RunMean]] = {}
+    for run in means:
+        found.setdefault(run.cell, []).append(run)
+    return found
+
+
+def contrast(
+    means: Sequence[RunMean],
+    axis: str,
+    left: Any,
+    right: Any,
+    score: Callable[[RunMean], float],
+    **where: Any,
+) -> Contrast | None:
+    """Compares two values of an axis.
+
+    Each seed counts once: its score is the mean over the settings of the other axes that both sides have.
+
+    Args:
+        means: of runs.
+        axis: robot, algorithm or k_int.
+        left: value on the axis.
+        right: value to subtract.
+        score: of a run.
+        **where: only runs with these values.
+
+    Returns:
+        None where a side has no runs.
+    """
+    chosen = [run for run in means if all(getattr(run, name) == value for name, value in where.items())]
+    others = [name for name in ("robot", "algorithm", "k_int") if name != axis]
+
+    def by_setting(value: Any) -> dict[tuple[Any, ...], dict[int, float]]:
+        found: dict[tuple[Any, ...], dict[int, float]] = {}
+        for run in chosen:
+            if getattr(run, axis) == value:
+                found.setdefault(tuple(getattr(run, name) for name in others), {})[run.seed] = score(run)
+        return found
+
+    sides = [by_setting(left), by_setting(right)]
+    common = set(sides[0]) & set(sides[1])
+    if not common:
+        return None
+
+    def per_seed(side: dict[tuple[Any, ...], dict[int, float]]) -> np.ndarray:
+        seeds = set.intersection(*(set(side[setting]) for setting in common))
+        return np.array([np.mean([side[setting][seed] for setting in common]) for seed in sorted(seeds)])
+
+    a, b = per_seed(sides[0]), per_seed(sides[1])
+    if not len(a) or not len(b):
+        return None
+    return welch(a, b)
+
+
+def seen_unseen(rows: pa.Table) -> tuple[list[tuple[RunMean, RunMean]], Contrast | None]:
+    """Each run's means on the train and on the test scenes, and the paper's one-sample t test that INS_0.5 of a run is
+    the same on both (difference unseen minus seen, over runs)."""
+    unseen = {run.run: run for run in run_means(rows, "test")}
+    pairs = [(run, unseen[run.run]) for run in run_means(rows, "train") if run.run in unseen]
+    if not pairs:
+        return [], None
+    differences = np.array([test.ins(0.5) - train.ins(0.5) for train, test in pairs])
+    mean = float(differences.mean())
+    if len(differences) < 2 or _constant(differences):
+        return pairs, Contrast(mean, math.nan, math.nan, math.nan, len(pairs), len(pairs))
+    test = stats.ttest_1samp(differences, 0.0)
+    interval = test.confidence_interval(CONFIDENCE)
+    return pairs, Contrast(mean, float(interval.low), float(interval.high), float(test.pvalue), len(pairs), len(pairs))
+
+
+@dataclasses.dataclass(frozen=True)
+class Correlation:
+    """Pearson's r with its 95 % interval (Fisher's z) and p-value."""
+
+    r: float
+    low: float
+    high: float
+    p_value: float
+    count: int
+
+    @property
+    def verdict(self) -> str:
+        """Whether they are correlated, at the 5 % level."""
+        if math.isnan(self.r):
+            return "too few runs to test"
+        if self.p_value >= LEVEL:
+            return "undecided"
+        return "holds" if self.r > 0 else "does not hold: negative"
+
+    def __str__(self) -> str:
+        if math.isnan(self.r):
+            return f"not defined ({self.count} points)"
+        return f"{self.r:.2f} [{self.low:.2f}, {self.high:.2f}], p {p_text(self.p_value)}, n = {self.count:,}"
+
+
+def correlation(x: Iterable[float], y: Iterable[float]) -> Correlation:
+    """Pearson's correlation; NaN for fewer than four points or where one does not vary."""
+    a, b = np.asarray(list(x), float), np.asarray(list(y), float)
+    if len(a) < 4 or _constant(a) or _constant(b):
+        return Correlation(math.nan, math.nan, math.nan, math.nan, len(a))
+    test = stats.pearsonr(a, b)
+    interval = test.confidence_interval(CONFIDENCE)
+    return Correlation(float(test.statistic), float(interval.low), float(interval.high), float(test.pvalue), len(a))
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What our runs say to one comparison behind a claim."""
+
+    claim: str
+    compared: str
+    result: str
+    verdict: str
+
+
+def claims(rows: pa.Table, split: str | None) -> list[Finding]:
+    """The paper's claims (section V), one comparison a line; those whose runs are missing say so.
+
+    Args:
+        rows: of `train.evaluate`.
+        split: of the scenes for all but the train/test claim; None: all.
+    """
+    means = run_means(rows, split)
+    found: list[Finding] = []
+
+    def p_eff(run: RunMean) -> float:
+        return run.scores["path_efficiency"]
+
+    def e_eff(run: RunMean) -> float:
+        return run.scores["effort_efficiency"]
+
+    def compare(claim: str, what: str, expected: str, score: Any, axis: str, left: Any, right: Any, **where: Any):
+        test = contrast(means, axis, left, right, score, **where)
+        if test is None:
+            found.append(Finding(claim, what, "-", f"no runs of {left} and {right} to compare"))
+            return
+        if expected == "same":
+            verdict = "no significant difference" if test.verdict == "undecided" else f"does not hold: {test.verdict}"
+        elif math.isnan(test.p_value):
+            verdict = "too few runs to test"
+        else:
+            names = {expected: "holds", "undecided": "undecided"}
+            verdict = names.get(test.verdict, f"does not hold: {test.verdict}")
+        found.append(Finding(claim, what, str(test), verdict))
+
+    robots = sorted({run.robot for run in means})
+    algorithms = sorted({run.algorithm for run in means})
+    for robot in robots:
+        for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
+            what = f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
+            compare("SAC is best overall", what, "higher", lambda r: r.ins(0.5), "algorithm", "sac", other, robot=robot)
+    for robot in robots:
+        by_cell = {
+            cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
+        }
+        best = max(by_cell, key=lambda cell: by_cell[cell])
+        found.append(
+            Finding(
+                "k_int = 1 is best at alpha = 0",
+                f"{robot}: cell of the highest mean INS_0",
+                f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
+                "holds" if best[2] == 1.0 else "does not hold",
+            )
+        )
+        for k, claim, expectations in (
+            (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
+            (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
+        ):
+            for score, name, expected in ((e_eff, "E_eff", expectations[0]), (p_eff, "P_eff", expectations[1])):
+                what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
+                compare(claim, what, expected, score, "k_int", k, 0.0, robot=robot)
+    if len(robots) > 1:
+        claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
+        for score, name, expected in ((e_eff, "E_eff", "higher"), (p_eff, "P_eff", "same")):
+            what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
+            compare(claim, what, expected, score, "robot", "fetch", "turtlebot")
+    for robot in robots:
+        chosen = [run.scores for run in means if run.robot == robot]
+        r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
+        what = f"{robot}: Pearson's r over runs"
+        found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
+    pairs, test = seen_unseen(rows)
+    if test is None:
+        result, verdict = "-", "no runs with rows of train and of test scenes"
+    else:
+        result = str(test)
+        verdict = "no significant difference" if test.verdict == "undecided" else f"does not hold: {test.verdict}"
+        if math.isnan(test.p_value):
+            verdict = "too few runs to test"
+    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
+    found.append(Finding("Seen and unseen scenes do not differ", what, result, verdict))
+    return found
