@@ -1,6 +1,7 @@
 """Source files in, a drawn map of the rooms and of who imports whom out: `python docs/package_map.py`.
 
-A room is a sub-package (`converters.read`) or a module that lies directly in a package (`train.config`). Programs (`__main__`) are left out: nothing imports them.
+A room is a sub-package (`converters.read`) or a module that lies directly in a package (`train.config`). Programs
+(`__main__`) are left out: nothing imports them.
 """
 
 from __future__ import annotations
