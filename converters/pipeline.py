@@ -22,7 +22,7 @@ from converters.bodies.physical import Physical, physical_properties
 from converters.check.gates import evaluate
 from converters.check.settle import Settled, settle
 from converters.fill.holes import fill_holes
-from converters.geometry.boxes import Hull, rotation_of
+from converters.geometry.boxes import Hull
 from converters.geometry.faces import face_areas
 from converters.propose.proposals import propose_instances
 from converters.propose.report import floor_of
@@ -42,6 +42,7 @@ from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest
 from converters.write.texture import bake_object, bake_structure, colour_cloud
 from interactive_nav_common.files import part_folder, publish
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
 STAGES = {
@@ -190,7 +191,7 @@ def _object_visual(cloud: ColourCloud, annotated: PlacedObject, max_faces: int, 
         max_faces,
         size,
     )
-    back = (visual.vertices - annotated.position_w) @ rotation_of(annotated.quaternion_w)
+    back = (visual.vertices - annotated.position_w) @ matrix_from_quat(annotated.quaternion_w)
     return dataclasses.replace(visual, vertices=back), seen
 
 

@@ -24,7 +24,7 @@ from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import MATERIALS, Physical
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
-from converters.geometry.boxes import Hull, convex_hull, fit_box, rotation_of
+from converters.geometry.boxes import Hull, convex_hull, fit_box
 from converters.geometry.faces import merge_vertices
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.cad import clean_surface
@@ -39,6 +39,7 @@ from converters.write.emit import SceneParts, build_spec, write_scene
 from converters.write.manifest import PACKAGES
 from converters.write.texture import bake_object, colour_cloud
 from interactive_nav_common.files import whole_folder
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import CATEGORIES
 
 WORDS = {
@@ -304,7 +305,7 @@ def _friction(item: RigidObject, category: str, config: ObjectConfig) -> tuple[f
 def _rest(parts: SceneParts) -> dict[str, Any]:
     """Pose at rest on a level floor, and how far hulls and boxes drift from it in the gates' time."""
     (placed,) = parts.objects
-    up = rotation_of(placed.quaternion_w)[:, 2]
+    up = matrix_from_quat(placed.quaternion_w)[:, 2]
     result: dict[str, Any] = {
         "position_m": [round(float(v), 6) + 0.0 for v in placed.position_w],
         "quaternion_wxyz": [round(float(v), 9) + 0.0 for v in placed.quaternion_w],

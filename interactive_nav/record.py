@@ -31,11 +31,11 @@ from interactive_nav.pictures.views import (
     depth_picture,
     mask_picture,
     robot_camera,
-    yaw_of,
 )
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.rotations import yaw_from_quat
 
 FORMATS = (".mp4", ".gif")
 CAMERA_PIXELS = 68
@@ -67,7 +67,7 @@ class Compositor:
         robot = get_robot(replay.robot)
         self._goal_radius_m = replay.success_distance_m or robot.body_width_m
         self._view = SceneView(robot, scene, replay.small, replay.segmentation_classes)
-        yaw = np.unwrap(yaw_of(replay.body_quat_w[:, 0]))
+        yaw = np.unwrap(yaw_from_quat(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
         self._font = ImageFont.load_default(size=height / 24)

@@ -25,10 +25,11 @@ from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path as Outline
 
 from interactive_nav.pictures.replay import Replay, ReplayError, load
-from interactive_nav.pictures.views import COLOURS, yaw_of
+from interactive_nav.pictures.views import COLOURS
 from interactive_nav.record import check_scene
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
 
 COLOUR_BY = ("time", "contact")
 TOUCH_COLOURS = {"nothing": "#0072b2", "an object": "#d55e00", "a wall": "#555555"}
@@ -53,10 +54,10 @@ def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
         quat_w: (4,) of the body.
     """
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    body = _rotation(quat_w)
+    body = matrix_from_quat(quat_w)
     hulls = []
     for row in boxes:
-        points = row[:3] + (corners * row[7:10]) @ _rotation(row[3:7]).T
+        points = row[:3] + (corners * row[7:10]) @ matrix_from_quat(row[3:7]).T
         hulls.append(shapely.MultiPoint((points @ body.T + pos_w)[:, :2]).convex_hull)
     return shapely.union_all(hulls)
 
@@ -91,7 +92,7 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
     _draw_path(axis, replay, colour_by)
     robot = get_robot(replay.robot)
     for step, style in ((0, "--"), (-1, "-")):
-        place, yaw = replay.robot_xy_w[step], yaw_of(replay.body_quat_w[step, 0])
+        place, yaw = replay.robot_xy_w[step], yaw_from_quat(replay.body_quat_w[step, 0])
         axis.add_patch(
             Circle((float(place[0]), float(place[1])), robot.footprint_radius_m, fill=False, linestyle=style, zorder=6)
         )
@@ -197,17 +198,6 @@ def _patch(shape: Any, **style: Any) -> PathPatch:
     polygons = shape.geoms if hasattr(shape, "geoms") else [shape]
     rings = [np.asarray(ring.coords) for p in polygons for ring in (p.exterior, *p.interiors)]
     return PathPatch(Outline.make_compound_path(*(Outline(r, closed=True) for r in rings)), zorder=3, **style)
-
-
-def _rotation(quat: np.ndarray) -> np.ndarray:
-    w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _files(sources: Sequence[str]) -> list[Path]:

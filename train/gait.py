@@ -36,13 +36,13 @@ from interactive_nav.robots.gait import (
     load_network,
     observe,
     phase_at,
-    rotate_to_body,
     save_network,
     targets,
 )
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import build_world
+from interactive_nav_common.rotations import rotate_back
 from scenes_mjcf.schema import SceneManifest, SceneMaps
 from train.config import AUTO_PPO, PPOConfig, RunConfig, TrainConfig
 from train.learners import ppo
@@ -193,7 +193,7 @@ class GaitEnv(Env):
         warm = jnp.where(broken[:, None], 0.0, after.qacc_warmstart)
         time_s = info["time_s"] + self._dt
 
-        down_b = rotate_to_body(qpos[:, 3:7], jnp.array([0.0, 0.0, -1.0]) + jnp.zeros((n, 3)), jnp)
+        down_b = rotate_back(qpos[:, 3:7], jnp.array([0.0, 0.0, -1.0]) + jnp.zeros((n, 3)))
         fallen = broken | (qpos[:, 2] < gait.fall_height_m) | (down_b[:, 2] > -0.5)
         now = RobotState(qpos, qvel, time_s)
         base = base_motion(now, jnp)

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import f as f_distribution
 
-from converters.geometry.rotations import wrap_angle, yaw_matrix
 from converters.records.raw import Annotation
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
 MIN_POINTS = 6
 """The annotators' rule (section III-B): eighteen equations for seven unknowns, so that one can be thrown out."""

@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from converters.bodies.alignment import Alignment
-from converters.geometry.boxes import Box, Hull, convex_hull, fit_box, rotation_of
-from converters.geometry.rotations import yaw_matrix
+from converters.geometry.boxes import Box, Hull, convex_hull, fit_box
 from converters.records.raw import Annotation, CadModel
+from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
 
 FOOT_M = 0.02
 
@@ -49,7 +49,7 @@ class PlacedObject:
 
 def to_world(placed: PlacedObject, points_b: np.ndarray) -> np.ndarray:
     """Moves (n, 3) points from the body frame to the world."""
-    return points_b @ rotation_of(placed.quaternion_w).T + placed.position_w
+    return points_b @ matrix_from_quat(placed.quaternion_w).T + placed.position_w
 
 
 def flatten_feet(hull: Hull) -> Hull:

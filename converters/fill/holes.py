@@ -24,11 +24,11 @@ from converters.fill.patches import (
     wall_planes,
 )
 from converters.geometry.faces import sample_faces
-from converters.geometry.rotations import yaw_matrix
 from converters.records.visual import ColourCloud
 from converters.structure.floor import LIFT_M
 from converters.structure.maps import FloorPlan
 from converters.structure.walls import cover_rectangles
+from interactive_nav_common.rotations import yaw_matrix
 
 FLOOR_TOLERANCE_M = 0.05
 PATCH_SPACING_M = 0.03

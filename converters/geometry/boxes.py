@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from converters.geometry.rotations import yaw_matrix
+from interactive_nav_common.rotations import yaw_matrix
 
 MIN_THICKNESS_M = 0.01
 """Hulls and boxes thinner than this make contacts that a simulation step can tunnel through."""
@@ -42,11 +42,6 @@ class Box:
     """(3, 3) columns are the box's axes."""
     half: np.ndarray
     """(3,) half sizes, m."""
-
-
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of a unit quaternion w x y z."""
-    return np.asarray(trimesh.transformations.quaternion_matrix(quaternion))[:3, :3]
 
 
 def convex_hull(points: np.ndarray) -> Hull:

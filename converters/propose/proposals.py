@@ -19,8 +19,9 @@ from scipy.spatial import ConvexHull, KDTree
 
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import face_labels, sample_faces
-from converters.geometry.rotations import Y_UP_TO_Z_UP, yaw_matrix
+from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.records.raw import FLOOR, SYNSETS, UNLABELLED, WALL, ScanMesh
+from interactive_nav_common.rotations import yaw_matrix
 
 VOXEL_M = 0.03
 """Chairs that touch at 0.05 m stay apart at 0.03 m in the sample scan."""

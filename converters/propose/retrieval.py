@@ -25,12 +25,12 @@ from converters.bodies.alignment import (
     pose_difference,
     upright,
 )
-from converters.geometry.rotations import wrap_angle, yaw_matrix
 from converters.propose.proposals import Proposal, bounds, box_iou
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder
 from converters.records.errors import SceneRejected
 from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel
+from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
 N_YAWS = 24
 """Starting yaws, even steps over the circle from the box's own."""

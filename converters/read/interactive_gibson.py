@@ -16,7 +16,6 @@ import numpy as np
 
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import merge_vertices, sample_faces
-from converters.geometry.rotations import yaw_matrix
 from converters.read.annotations import inside_scan
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
@@ -28,6 +27,7 @@ from converters.read.surfaces import check_upright
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, Hinge, RawScene
+from interactive_nav_common.rotations import yaw_matrix
 
 MESH = "mesh_z_up_cleaned.obj"
 PREFIX = "alignment_centered"

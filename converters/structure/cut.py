@@ -11,9 +11,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.boxes import Hull, rotation_of
+from converters.geometry.boxes import Hull
 from converters.geometry.faces import face_areas, face_labels
 from converters.records.raw import CATEGORY_LABELS, FLOOR, SMALL_LABELS, STRUCTURE_LABELS
+from interactive_nav_common.rotations import matrix_from_quat
 
 NEAR_OWN_M = 0.15
 """Own-label faces this close to the model are the object's: alignments are off by several centimetres."""
@@ -69,7 +70,7 @@ def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, seed: i
 
 def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> np.ndarray:
     """(m,) bool: faces that show this object, by place and label."""
-    local = (centres - placed.position_w) @ rotation_of(placed.quaternion_w)
+    local = (centres - placed.position_w) @ matrix_from_quat(placed.quaternion_w)
     low, high = placed.vertices_b.min(axis=0), placed.vertices_b.max(axis=0)
     around = ((local > low - NEAR_OWN_M) & (local < high + [NEAR_OWN_M, NEAR_OWN_M, LYING_ABOVE_M])).all(axis=1)
     index = np.flatnonzero(around)

@@ -16,9 +16,9 @@ from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
 from converters.geometry.faces import face_labels, sample_faces
-from converters.geometry.rotations import yaw_matrix
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
+from interactive_nav_common.rotations import yaw_matrix
 
 RESOLUTION_M = 0.05
 BAND_M = (0.02, 1.2)

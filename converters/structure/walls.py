@@ -6,8 +6,8 @@ import numpy as np
 from scipy import ndimage
 
 from converters.geometry.boxes import Box
-from converters.geometry.rotations import yaw_matrix
 from converters.structure.maps import FloorPlan
+from interactive_nav_common.rotations import yaw_matrix
 
 DEPTH_CELLS = 4
 """How far a box may reach into what is not traversable: thick boxes merge ragged walls and are hard to

@@ -18,6 +18,7 @@ from interactive_nav.navigation.placement import CLEARANCE_M
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
 from interactive_nav.types import SceneTables
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneError
 
 FINE_CELLS = 2
@@ -27,18 +28,6 @@ GOALS_TRIED = 256
 SIGHT_STEP_CELLS = 2.0
 """Fine cells between samples of a line of sight inside jit. What is blocked for the robot's centre is at least a
 robot wide, so nothing is stepped over; a corner clipped between two samples is cut by centimetres at most."""
-
-
-def _rotation(quat: np.ndarray) -> np.ndarray:
-    """[3, 3] from w x y z."""
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
@@ -60,9 +49,9 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
     covered = np.zeros((rows, columns), bool)
     for movable in scene.movables:
         pos, quat = poses[movable.name]
-        body = _rotation(quat)
+        body = matrix_from_quat(quat)
         for row in movable.boxes:
-            centre, axes, half = pos + body @ row[:3], body @ _rotation(row[3:7]), row[7:10]
+            centre, axes, half = pos + body @ row[:3], body @ matrix_from_quat(row[3:7]), row[7:10]
             reach = np.abs(axes) @ half
             cs = np.flatnonzero(np.abs(x - centre[0]) <= reach[0] + maps.resolution_m)
             rs = np.flatnonzero(np.abs(y - centre[1]) <= reach[1] + maps.resolution_m)

@@ -12,7 +12,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,6 +22,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.env import InteractiveNav
+from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
 from scenes_mjcf.categories import CLASS_COLOURS, CLASSES, TABLE, class_id
 
 COLOURS = {category.name: category.colour for category in TABLE}
@@ -136,10 +136,10 @@ class SceneView:
             data.xpos[body], data.xquat[body], data.xmat[body] = pos, quat, rotation
             axes = rotation.reshape(3, 3)
             data.xipos[body] = pos + axes @ model.body_ipos[body]
-            data.ximat[body] = (axes @ _matrix(model.body_iquat[body])).ravel()
+            data.ximat[body] = (axes @ matrix_from_quat(model.body_iquat[body])).ravel()
             for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
                 data.geom_xpos[g] = pos + axes @ model.geom_pos[g]
-                data.geom_xmat[g] = (axes @ _matrix(model.geom_quat[g])).ravel()
+                data.geom_xmat[g] = (axes @ matrix_from_quat(model.geom_quat[g])).ravel()
 
     def look(self, camera: Camera, groups: tuple[int, ...] = OUTSIDE, paint: FloorPaint | None = None) -> Image:
         """Renders.
@@ -244,7 +244,7 @@ class ThirdPerson:
         view = self._view(scene)
         names, _, pos, quat = world_poses(self.env, scene, np.asarray(qpos)[None])
         view.place(names, pos[0], quat[0])
-        camera = chase_camera(pos[0, 0], yaw_of(quat[0, 0]), self.rows, self.columns)
+        camera = chase_camera(pos[0, 0], yaw_from_quat(quat[0, 0]), self.rows, self.columns)
         paint = FloorPaint(np.asarray(goal_xy_w), self.env.success_distance_m)
         return view.look(camera, OUTSIDE, paint).colour
 
@@ -260,18 +260,6 @@ def mask_picture(classes: np.ndarray) -> np.ndarray:
     table = np.zeros((256, 3), np.uint8)
     table[: len(CLASSES)] = np.array(CLASS_COLOURS) * 255
     return table[classes]
-
-
-def yaw_of(quat: np.ndarray) -> Any:
-    """[..., 4] w x y z to [...] rad."""
-    w, x, y, z = np.moveaxis(np.asarray(quat), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(quat, float))
-    return out.reshape(3, 3)
 
 
 def _varied(colour: np.ndarray, index: int) -> np.ndarray:

@@ -25,6 +25,7 @@ from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.scenes.scene import Movable, Scene
 from interactive_nav.scenes.world import World, build_world
+from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps
 
 GRAVITY_M_S2 = 9.81
@@ -230,11 +231,6 @@ def _run(
     return physics.name, np.stack(poses), np.stack(forces)
 
 
-def _yaw(q: np.ndarray) -> np.ndarray:
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    return np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)), axis=0)
-
-
 def _tilt_deg(q: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1)))
 
@@ -245,7 +241,7 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
     at = world.layout.robot_qpos
     index = {run.name: i for i, run in enumerate(runs)}
     xy = poses[..., at : at + 2] - poses[:1, :, at : at + 2]
-    yaw, tilt = _yaw(poses[..., at + 3 : at + 7]), _tilt_deg(poses[..., at + 3 : at + 7])
+    yaw, tilt = np.unwrap(yaw_from_quat(poses[..., at + 3 : at + 7]), axis=0), _tilt_deg(poses[..., at + 3 : at + 7])
     v, w = robot.twist.max_linear_m_s, robot.twist.max_angular_rad_s
     speed, rate = np.diff(xy[..., 0], axis=0) / _DT_S, np.diff(yaw, axis=0) / _DT_S
     steady = slice(25, 40)
@@ -338,7 +334,7 @@ def measure_walking(name: str, backend: str = "native") -> Evidence:
     used, poses, _ = _run(robot, world, config, runs, steps)
     at = world.layout.robot_qpos
     xyz = poses[..., at : at + 3]
-    yaw, tilt = _yaw(poses[..., at + 3 : at + 7]), _tilt_deg(poses[..., at + 3 : at + 7])
+    yaw, tilt = np.unwrap(yaw_from_quat(poses[..., at + 3 : at + 7]), axis=0), _tilt_deg(poses[..., at + 3 : at + 7])
     stood = xyz[_SETTLE : _SETTLE + 51, 0, :2]
     walked = xyz[:, 1] - xyz[:1, 1]
     stop_k, turn_k = round((start_s + going_s) / _DT_S), round((start_s + turning_s) / _DT_S)

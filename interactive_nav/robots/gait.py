@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.robots.spec import ControlLaw, RobotState
+from interactive_nav_common.rotations import rotate_back
 
 GAITS = Path(__file__).parent / "gaits"
 GRAVITY_M_S2 = 9.81
@@ -169,13 +170,6 @@ class Gait:
         return (-most[0], -most[1]), most
 
 
-def rotate_to_body(quat: Any, vector: Any, xp: Any) -> Any:
-    """World vectors [..., 3] in the frame of a body with quaternion [..., 4] (w x y z)."""
-    w, axis = quat[..., :1], -quat[..., 1:]
-    t = 2.0 * xp.cross(axis, vector)
-    return vector + w * t + xp.cross(axis, t)
-
-
 def phase_at(gait: Gait, time_s: Any) -> Any:
     """The gait's phase [...], rad."""
     return 2.0 * math.pi * gait.frequency_hz * time_s
@@ -195,8 +189,8 @@ def observe(gait: Gait, command: Any, state: RobotState, xp: Any) -> Any:
     most = xp.asarray([gait.max_linear_m_s, gait.max_angular_rad_s], dtype=qpos.dtype)
     return xp.concatenate(
         [
-            rotate_to_body(quat, down, xp),
-            rotate_to_body(quat, qvel[..., :3], xp),
+            rotate_back(quat, down),
+            rotate_back(quat, qvel[..., :3]),
             qvel[..., 3:6],
             qpos[..., 2:3],
             qpos[..., 7 + joints] - xp.asarray(gait.home, dtype=qpos.dtype),

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from interactive_nav_common.rotations import rotate
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 TASK_DIGEST = "task-1:"
@@ -107,12 +108,6 @@ def _hull_sources(scene: Scene) -> dict[str, list]:
             numbers = [_rounded(v) for v in (geom.pos, geom.quat, mesh.scale, mesh.refpos, mesh.refquat)]
             found.setdefault(geom.parent.name, []).append([hashlib.sha256(content).hexdigest(), numbers])
     return found
-
-
-def _quat_rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    out = np.zeros(3)
-    mujoco.mju_rotVecQuat(out, vector, quat)
-    return out
 
 
 def _boxes(model: mujoco.MjModel, geoms: list[int]) -> np.ndarray:
@@ -221,7 +216,7 @@ def load_scene(folder: str | Path) -> Scene:
         movables.append(read_movable(model, xml, obj.name, obj.category, obj.friction))
     walls = _boxes(model, solid)
     for row in walls:
-        row[:3] = model.body_pos[structure] + _quat_rotate(model.body_quat[structure], row[:3])
+        row[:3] = model.body_pos[structure] + rotate(model.body_quat[structure], row[:3])
     if not np.allclose(model.body_quat[structure], [1, 0, 0, 0]):
         raise SceneError(f"{xml}: body 'structure' is rotated, expected the identity")
     return Scene(folder, manifest.name, manifest.split, digest, manifest, maps, walls, tuple(movables))

@@ -11,12 +11,11 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from interactive_nav.scenes.scene import Movable
 from interactive_nav.scenes.world import World, sorted_movables
-from interactive_nav.sensing.observation import rotation_from_quat
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import TABLE, class_id
 
 NUM_CLASSES = max(number for category in TABLE for number in category.segmentation_ids) + 1
@@ -56,12 +55,6 @@ class BoxTables:
         return len(self.body)
 
 
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(quat, float))
-    return out.reshape(3, 3)
-
-
 def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
@@ -97,9 +90,14 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
         for m, (boxes, number, movable) in enumerate(column):
             for i, row in enumerate(boxes):
                 at = first[m] + i
-                pos[s, at], axes[s, at], half[s, at], ids[s, at] = row[:3], _matrix(row[3:7]), row[7:10], number
+                pos[s, at], axes[s, at], half[s, at], ids[s, at] = (
+                    row[:3],
+                    matrix_from_quat(row[3:7]),
+                    row[7:10],
+                    number,
+                )
             if movable is not None and movable.hinge is not None:
-                hinge_pos[s, m], hinge_axes[s, m] = movable.pos_w, _matrix(movable.quat_w)
+                hinge_pos[s, m], hinge_axes[s, m] = movable.pos_w, matrix_from_quat(movable.quat_w)
                 hinge_axis[s, m], anchor[s, m] = movable.hinge.axis, movable.hinge.anchor_m
     f32 = jnp.float32
     return BoxTables(
@@ -145,12 +143,12 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     if len(free):
         pose = qpos[..., tables.slot_qpos[free][:, None] + np.arange(7)]
         pos = pos.at[..., free, :].set(pose[..., :3])
-        axes = axes.at[..., free, :, :].set(rotation_from_quat(pose[..., 3:]))
+        axes = axes.at[..., free, :, :].set(matrix_from_quat(pose[..., 3:]))
     if len(swing):
         half = 0.5 * qpos[..., tables.slot_qpos[swing]]
         axis, anchor = tables.hinge_axis_b[scene][..., swing, :], tables.hinge_anchor_b[scene][..., swing, :]
         quat = jnp.concatenate([jnp.cos(half)[..., None], jnp.sin(half)[..., None] * axis], -1)
-        turned = rotation_from_quat(quat)
+        turned = matrix_from_quat(quat)
         arm = anchor - rotate(turned, anchor)
         rest = tables.hinge_axes_w[scene][..., swing, :, :]
         origin = tables.hinge_pos_w[scene][..., swing, :]

@@ -14,7 +14,7 @@ import numpy as np
 from interactive_nav.robots.spec import Camera
 from interactive_nav.sensing.base import CameraPose, look_along
 from interactive_nav.sensing.boxes import compose, rotate
-from interactive_nav.sensing.observation import rotation_from_quat
+from interactive_nav_common.rotations import matrix_from_quat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Mount:
             qpos: [..., nq].
         """
         at = self.base_qpos
-        pos, axes = qpos[..., at : at + 3], rotation_from_quat(qpos[..., at + 3 : at + 7])
+        pos, axes = qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7])
         for link in self.links:
             pos = pos + rotate(axes, jnp.asarray(link.pos, qpos.dtype))
             axes = compose(axes, jnp.asarray(link.axes, qpos.dtype))
@@ -53,18 +53,12 @@ class Mount:
                     pos = pos + rotate(axes, axis) * value[..., None]
                     continue
                 half = 0.5 * value[..., None]
-                turn = rotation_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
+                turn = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
                 anchor = jnp.asarray(anchor, qpos.dtype)
                 pos = pos + rotate(axes, anchor - rotate(turn, anchor))
                 axes = compose(axes, turn)
         where = pos + rotate(axes, jnp.asarray(self.pos_b, qpos.dtype))
         return look_along(where, rotate(axes, jnp.asarray(self.forward_b, qpos.dtype)))
-
-
-def _axes(quat: np.ndarray) -> np.ndarray:
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, quat)
-    return out.reshape(3, 3)
 
 
 def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:
@@ -93,7 +87,7 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:
             address = int(model.jnt_qposadr[j])
             zero = float(model.qpos0[address])
             joints.append((bool(slides), address, zero, model.jnt_axis[j].copy(), model.jnt_pos[j].copy()))
-        links.append(_Link(model.body_pos[body].copy(), _axes(model.body_quat[body]), tuple(joints)))
+        links.append(_Link(model.body_pos[body].copy(), matrix_from_quat(model.body_quat[body]), tuple(joints)))
         body = model.body_parentid[body]
     return Mount(
         base_qpos=int(model.jnt_qposadr[model.body_jntadr[base]]),

@@ -19,17 +19,6 @@ import jax
 import jax.numpy as jnp
 
 
-def rotation_from_quat(quat: jax.Array) -> jax.Array:
-    """(..., 4) w x y z -> (..., 3, 3), the body's axes as columns."""
-    w, x, y, z = jnp.moveaxis(quat, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
-
-
 def waypoints_in_body(waypoints_w: jax.Array, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
     """World waypoints (W, 2), lifted to the robot's own height, in the robot's frame (W, 2)."""
     offset = jnp.concatenate([waypoints_w - pos_w[:2], jnp.zeros((waypoints_w.shape[0], 1))], -1)
@@ -87,8 +76,3 @@ def advance_odometry(
     return jnp.stack(
         [pose[0] + cos * ahead - sin * left, pose[1] + sin * ahead + cos * left, pose[2] + turned_rad * (1 + noise[1])]
     )
-
-
-def wrap_angle(angle_rad: jax.Array) -> jax.Array:
-    """To [-pi, pi)."""
-    return (angle_rad + jnp.pi) % (2 * jnp.pi) - jnp.pi

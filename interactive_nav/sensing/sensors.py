@@ -29,9 +29,10 @@ from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.boxes import NUM_CLASSES, rotate
 from interactive_nav.sensing.mount import make_mount
-from interactive_nav.sensing.observation import rotation_from_quat, task_parts, wrap_angle
+from interactive_nav.sensing.observation import task_parts
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.types import NavInfo
+from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 
 LIDAR_NEAR_M = 0.05
 """Beams begin this far from the scanner (iGibson)."""
@@ -134,7 +135,7 @@ class Sensors:
 
     def _vector(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array:
         v, q = self._layout.robot_qvel, self._layout.robot_qpos
-        rotation = rotation_from_quat(physics.qpos[q + 3 : q + 7])
+        rotation = matrix_from_quat(physics.qpos[q + 3 : q + 7])
         values = task_parts(
             nav.robot_pos_w,
             rotation,

@@ -22,10 +22,11 @@ from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import build_world, parking_spot
-from interactive_nav.sensing.observation import advance_odometry, rotation_from_quat, waypoints_in_body, wrap_angle
+from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.episode_scores import EPISODE_METRICS, episode_scores, score_mass_kg
 from interactive_nav.types import EpisodeStart, GoalField, NavInfo
+from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
@@ -271,7 +272,7 @@ class InteractiveNav(Env):
 
     def _robot_pose(self, physics: PhysicsState) -> tuple[jax.Array, jax.Array]:
         at = self.world.layout.robot_qpos
-        return physics.qpos[at : at + 3], rotation_from_quat(physics.qpos[at + 3 : at + 7])
+        return physics.qpos[at : at + 3], matrix_from_quat(physics.qpos[at + 3 : at + 7])
 
     def _object_positions(self, scene: jax.Array, physics: PhysicsState) -> jax.Array:
         """(M, 3) centres of mass in the world frame."""
@@ -282,15 +283,15 @@ class InteractiveNav(Env):
         free = np.flatnonzero(~hinged)
         if len(free):
             pose = physics.qpos[layout.slot_qpos[free][:, None] + np.arange(7)]
-            rotated = jnp.einsum("mij,mj->mi", rotation_from_quat(pose[:, 3:]), com[free])
+            rotated = jnp.einsum("mij,mj->mi", matrix_from_quat(pose[:, 3:]), com[free])
             out = out.at[free].set(pose[:, :3] + rotated)
         swing = np.flatnonzero(hinged)
         if len(swing):
             angle = physics.qpos[layout.slot_qpos[swing]]
             axis, anchor = tables.hinge_axis[scene, swing], tables.hinge_anchor_m[scene, swing]
             quat = jnp.concatenate([jnp.cos(angle / 2)[:, None], jnp.sin(angle / 2)[:, None] * axis], -1)
-            arm = jnp.einsum("mij,mj->mi", rotation_from_quat(quat), com[swing] - anchor) + anchor
-            rest = rotation_from_quat(tables.hinge_quat_w[scene, swing])
+            arm = jnp.einsum("mij,mj->mi", matrix_from_quat(quat), com[swing] - anchor) + anchor
+            rest = matrix_from_quat(tables.hinge_quat_w[scene, swing])
             out = out.at[swing].set(tables.hinge_pos_w[scene, swing] + jnp.einsum("mij,mj->mi", rest, arm))
         return out
 

@@ -20,12 +20,12 @@ from PIL import Image
 from converters.__main__ import main
 from converters.check.gates import LIMITS
 from converters.check.settle import settle
-from converters.geometry.boxes import rotation_of
 from converters.pipeline import STAGES, ConvertConfig, convert
 from converters.records.errors import SceneRejected
 from converters.records.gate import Limit
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_stale
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import load_manifest, load_maps
 from tests.converters import tiny_raw
 
@@ -77,7 +77,7 @@ def test_objects_stand_where_they_were_annotated(tiny_scene):
         body = model.body(name)
         np.testing.assert_allclose(body.pos[:2], item.position[:2], atol=0.01)
         assert abs(body.pos[2]) < 0.005
-        forward = rotation_of(body.quat) @ [1, 0, 0]
+        forward = matrix_from_quat(body.quat) @ [1, 0, 0]
         np.testing.assert_allclose(forward, (np.cos(item.yaw), np.sin(item.yaw), 0), atol=0.02)
     assert max(converted.settled.displacement_m) < 0.01
     for row in converted.manifest.alignment:

@@ -21,6 +21,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import dijkstra
 
 from interactive_nav.geodesic import STENCIL, crossed_cells
+from interactive_nav_common.rotations import wrap_angle
 from topological_nav.config import ExpertConfig
 from topological_nav.scenes.space import FreeSpace
 
@@ -224,7 +225,7 @@ def command(
     gap = jnp.minimum(seen, known).min(-1)
     left, end = _left(terrain.to_go_m[goal], origin, resolution, ways_w, linear, config)
     heading = _fall(terrain.to_go_m[goal], origin, resolution, end[:, :2])
-    turn = jnp.abs(wrapped(heading - end[:, 2])) / jnp.pi
+    turn = jnp.abs(wrap_angle(heading - end[:, 2])) / jnp.pi
     cost = (
         config.weigh_progress * left / (config.linear_m_s * config.horizon_s)
         + config.weigh_heading * turn
@@ -262,11 +263,6 @@ def _fall(field: jax.Array, origin: jax.Array, resolution: jax.Array, xy: jax.Ar
     offsets = _SLOPE_M * jnp.asarray([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     values = sample(field, origin, resolution, xy[:, None] + offsets)
     return jnp.arctan2(values[:, 3] - values[:, 2], values[:, 1] - values[:, 0])
-
-
-def wrapped(angle: jax.Array) -> jax.Array:
-    """Angles in [-pi, pi)."""
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
 
 
 def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[float, float]) -> jax.Array:

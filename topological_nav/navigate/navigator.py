@@ -24,6 +24,7 @@ import jax
 import numpy as np
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.rotations import wrap_angle
 from topological_nav.config import NavigatorConfig
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.learn.learning import padded_size
@@ -209,7 +210,7 @@ class Navigator:
         turning = _any_of(state.phase, TURNING)
         # A first target is the heading itself, or near it.
         target = np.where(np.isnan(state.target_rad), self._first_heading(heading), state.target_rad)
-        reached = turning & (np.abs(wrap(target - heading)) <= self._tolerance)
+        reached = turning & (np.abs(wrap_angle(target - heading)) <= self._tolerance)
         ends = np.asarray(time_s) >= state.run_end_s - SLACK_S
         acts = ends | (state.acts % self._period == 0) | self._watches(state, np.asarray(time_s))
         return reached | ((state.phase == DRIVE) & acts)
@@ -253,14 +254,16 @@ class Navigator:
     def _first_heading(self, heading: np.ndarray) -> np.ndarray:
         """The nearest heading along which nodes have images."""
         step = 2 * np.pi / self.map.embeddings.shape[1]
-        return wrap(np.rint(heading / step) * step)
+        return wrap_angle(np.rint(heading / step) * step)
 
     def _no_evidence(self, batch: int) -> np.ndarray:
         return np.full((batch, len(self.map.xy_w)), 0.0 if self.sight.summed else np.inf)
 
     def _reached(self, s: _Work, heading: np.ndarray, *phases: int) -> np.ndarray:
         """Rows in one of the phases whose heading is reached."""
-        return np.flatnonzero(_any_of(s.phase, phases) & (np.abs(wrap(s.target_rad - heading)) <= self._tolerance))
+        return np.flatnonzero(
+            _any_of(s.phase, phases) & (np.abs(wrap_angle(s.target_rad - heading)) <= self._tolerance)
+        )
 
     def _watches(self, s: State | _Work, time: np.ndarray) -> np.ndarray:
         """[B] bool: who looks now, within a run, whether the edge's head is passed."""
@@ -275,7 +278,7 @@ class Navigator:
         away = self.sight.distances(images[rows], heading[rows])
         s.evidence[rows] = s.evidence[rows] + away if self.sight.summed else np.minimum(s.evidence[rows], away)
         s.looks[rows] += 1
-        s.target_rad[rows] = wrap(s.base_rad[rows] + s.looks[rows] * 2 * np.pi / self.config.images)
+        s.target_rad[rows] = wrap_angle(s.base_rad[rows] + s.looks[rows] * 2 * np.pi / self.config.images)
         s.restart_pid(rows)
         done = rows[s.looks[rows] >= self.config.images]
         self._found(s, done, s.evidence[done].argmin(-1).astype(np.int32))
@@ -306,7 +309,7 @@ class Navigator:
             else:
                 s.lost[i] += 1
                 s.lost_now[i] = True
-                s.base_rad[i] = wrap(heading[i] + GOLDEN_RAD)
+                s.base_rad[i] = wrap_angle(heading[i] + GOLDEN_RAD)
         s.phase[rows] = FACE
         s.target_rad[rows] = s.base_rad[rows]
         s.swing[rows], s.best_p[rows] = 0, -1.0
@@ -329,7 +332,7 @@ class Navigator:
         count = s.swing[rows]
         offset = np.where(count % 2 == 1, 1, -1) * ((count + 1) // 2) * np.deg2rad(self.config.swing_deg)
         s.phase[rows] = SWING
-        s.target_rad[rows] = wrap(s.base_rad[rows] + offset)
+        s.target_rad[rows] = wrap_angle(s.base_rad[rows] + offset)
         s.restart_pid(rows)
         blocked = rows[count == 2 * self.config.swings + 1]
         s.blocked[blocked] = True
@@ -413,11 +416,11 @@ class Navigator:
         """PID to the target heading, as `simple_pid.PID` computes it."""
         rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
         config, most = self.config, self.config.max_turn_rad_s
-        error = wrap(s.target_rad[rows] - heading[rows])
+        error = wrap_angle(s.target_rad[rows] - heading[rows])
         dt = np.maximum(np.nan_to_num(time[rows] - s.clock_s[rows], nan=0.0), 0.0)
         last = np.where(np.isnan(s.error_rad[rows]), error, s.error_rad[rows])
         s.integral[rows] = np.clip(s.integral[rows] + config.ki * error * dt, -most, most)
-        rate = np.divide(wrap(error - last), dt, out=np.zeros_like(error), where=dt > 0)
+        rate = np.divide(wrap_angle(error - last), dt, out=np.zeros_like(error), where=dt > 0)
         s.linear[rows] = 0.0
         s.angular[rows] = np.clip(config.kp * error + s.integral[rows] + config.kd * rate, -most, most)
         s.error_rad[rows] = error
@@ -485,8 +488,3 @@ def _asked_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
 def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:
     """[B] bool; many times as fast as `np.isin` for few rows."""
     return np.logical_or.reduce([phase == one for one in phases])
-
-
-def wrap(angle_rad: Any) -> Any:
-    """Angles in [-pi, pi)."""
-    return (np.asarray(angle_rad) + np.pi) % (2 * np.pi) - np.pi

@@ -17,8 +17,9 @@ import math
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.gait import GRAVITY_M_S2, check_mode, rotate_to_body
+from interactive_nav.robots.gait import GRAVITY_M_S2, check_mode
 from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap
+from interactive_nav_common.rotations import rotate_back
 
 MASS_KG = 0.5
 INERTIA = (0.0023, 0.0023, 0.004)
@@ -149,9 +150,9 @@ def _velocity_law(command, state, xp):
     thrust_w = xp.concatenate([across, up], -1)
     size = xp.sqrt((thrust_w**2).sum(-1, keepdims=True))
     # The thrust axis in the body frame is z; turning it onto the wanted direction d takes z x d.
-    d = rotate_to_body(quat, thrust_w / size, xp)
+    d = rotate_back(quat, thrust_w / size)
     yaw_rate_w = xp.stack([0 * w, 0 * w, command[..., 3]], -1)
-    rates = rotate_to_body(quat, yaw_rate_w, xp) + _TILT_GAIN * xp.stack([-d[..., 1], d[..., 0], 0 * w], -1)
+    rates = rotate_back(quat, yaw_rate_w) + _TILT_GAIN * xp.stack([-d[..., 1], d[..., 0], 0 * w], -1)
     thrust = MASS_KG * size[..., 0] * xp.maximum(d[..., 2], 0.0)
     return _fly_rates(xp.clip(rates, -MAX_RATE_RAD_S, MAX_RATE_RAD_S), thrust, state, xp)
 

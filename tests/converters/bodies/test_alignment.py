@@ -18,8 +18,8 @@ from converters.bodies.alignment import (
     solve_alignment,
     upright,
 )
-from converters.geometry.rotations import wrap_angle, yaw_matrix
 from converters.records.raw import Annotation
+from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.3, 0.3) for z in (0.0, 0.8)])
 FLAT = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.3, 0.6, 0], [0.7, 0.1, 0.0]])

@@ -11,8 +11,8 @@ import trimesh
 
 from converters.fill.patches import Plane, border_edges, fill_planes, floor_plane, wall_planes
 from converters.geometry.faces import face_areas
-from converters.geometry.rotations import yaw_matrix
 from converters.structure.cut import face_pieces
+from interactive_nav_common.rotations import yaw_matrix
 
 LEVEL = 0.004
 WALL = Plane(np.array([0.0, 2.0, 0.0]), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))

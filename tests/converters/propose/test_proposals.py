@@ -14,12 +14,12 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.bodies.alignment import apply_alignment
-from converters.geometry.rotations import wrap_angle, yaw_matrix
 from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_iou, propose_instances
 from converters.propose.retrieval import fit_model, read_library, retrieve, without_annotation
 from converters.read.annotations import parse_annotations
 from converters.read.scan2cad import read_scan2cad
 from converters.records.raw import CadModel, ScanMesh
+from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
 
 def scan_of(*parts: tuple[trimesh.Trimesh, int]) -> ScanMesh:

@@ -13,10 +13,10 @@ from hypothesis.extra.numpy import arrays
 from converters.bodies.objects import BodyHinge, PlacedObject
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import sample_faces
-from converters.geometry.rotations import yaw_matrix
 from converters.records.raw import GivenMap
 from converters.structure.maps import Grid, main_direction, make_floor_plan, resample
 from converters.structure.walls import border_cells, cover_rectangles, wall_boxes
+from interactive_nav_common.rotations import yaw_matrix
 from tests.converters import tiny_raw
 
 

@@ -31,11 +31,11 @@ from interactive_nav.pictures.views import (
     depth_picture,
     mask_picture,
     robot_camera,
-    yaw_of,
 )
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.rotations import yaw_from_quat
 
 STEPS = 60
 
@@ -328,6 +328,6 @@ def test_gymnasium_renders_the_view_from_behind(room):
     assert frame is not None and frame.shape == (360, 480, 3) and frame.dtype == np.uint8
     # The robot stands before the camera: its dark body is in the middle column.
     assert frame[150:260, 200:280].min() < 60
-    assert yaw_of(np.array([math.cos(0.4), 0, 0, math.sin(0.4)])) == pytest.approx(0.8)
+    assert yaw_from_quat(np.array([math.cos(0.4), 0, 0, math.sin(0.4)])) == pytest.approx(0.8)
     with pytest.raises(ValueError, match="render_mode is 'human', expected one of rgb_array"):
         gym_env.InteractiveNavEnv("turtlebot", [str(room)], **{**settings, "render_mode": "human"})

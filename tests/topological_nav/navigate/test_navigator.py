@@ -9,6 +9,7 @@ import pytest
 from simple_pid import PID
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.rotations import wrap_angle
 from tests.topological_nav.maps.test_graph import hand_map
 from topological_nav.config import NavigatorConfig
 from topological_nav.navigate import navigator as nav
@@ -235,7 +236,7 @@ def swings(robot, node, p):
     asked, base = [], robot.state.base_rad[0]
     while robot.state.phase[0] in (FACE, SWING):
         target = robot.state.target_rad[0]
-        asked.append(round(math.degrees(nav.wrap(target - base)), 3))
+        asked.append(round(math.degrees(wrap_angle(target - base)), 3))
         robot.step(node, p(asked[-1]))
         if robot.events[-1].blocked[0]:
             break
@@ -378,7 +379,7 @@ def test_where_the_map_has_no_way_it_tries_headings_that_never_repeat():
     robot = Robot(Navigator(made, Told(), Counting(), NavigatorConfig(images=6)), goal=3)
     robot.localise(0)
     assert robot.events[-1].lost[0] and robot.state.edge[0] == -1 and robot.state.phase[0] == FACE
-    assert math.degrees(nav.wrap(robot.state.target_rad[0] - robot.heading)) == pytest.approx(137.508, abs=1e-3)
+    assert math.degrees(wrap_angle(robot.state.target_rad[0] - robot.heading)) == pytest.approx(137.508, abs=1e-3)
     assert robot.step(0, 0.9) == DRIVE
 
 
@@ -414,13 +415,13 @@ def test_turning_is_what_simple_pid_computes():
         dt = 0.1 if k % 3 else 0.15
         time += dt
         state, linear, angular, _ = navigator.step(state, seen((0, 0.0)), np.array([heading]), time)
-        expected = pid(-float(nav.wrap(3.0 - heading)), dt=dt)
+        expected = pid(-float(wrap_angle(3.0 - heading)), dt=dt)
         if state.phase[0] != FACE:  # reached
             break
         assert angular[0] == pytest.approx(expected, abs=1e-9) and linear[0] == 0.0
         heading += 0.9 * angular[0] * dt
-    assert k > 10 and abs(nav.wrap(3.0 - heading)) <= math.radians(3.0)
-    assert nav.wrap(np.array([math.pi, -math.pi, 3 * math.pi / 2])).tolist() == pytest.approx(
+    assert k > 10 and abs(wrap_angle(3.0 - heading)) <= math.radians(3.0)
+    assert wrap_angle(np.array([math.pi, -math.pi, 3 * math.pi / 2])).tolist() == pytest.approx(
         [-math.pi, -math.pi, -math.pi / 2]
     )
 

@@ -1,0 +1,61 @@
+"""Rotations of NumPy or JAX arrays: quaternions w x y z, angles in rad, matrices with the body's axes as columns."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+Array = Any
+"""A NumPy or JAX array, or a number."""
+
+
+def namespace(*values: Array) -> Any:
+    """`jax.numpy` when any value is a JAX array or tracer, else `numpy`."""
+    spaces = {v.__array_namespace__() for v in values if hasattr(v, "__array_namespace__")} - {np}
+    return spaces.pop() if spaces else np
+
+
+def matrix_from_quat(quat: Array) -> Array:
+    """[..., 4] unit quaternions -> [..., 3, 3]."""
+    xp = namespace(quat)
+    w, x, y, z = xp.moveaxis(xp.asarray(quat), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return xp.stack([xp.stack(r, -1) for r in rows], -2)
+
+
+def yaw_from_quat(quat: Array) -> Array:
+    """[..., 4] unit quaternions -> [...] heading of the body's x axis."""
+    xp = namespace(quat)
+    w, x, y, z = xp.moveaxis(xp.asarray(quat), -1, 0)
+    return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def rotate(quat: Array, vector: Array) -> Array:
+    """Vectors [..., 3] of a body with unit quaternion [..., 4], in the world."""
+    xp = namespace(quat, vector)
+    w, axis = quat[..., :1], quat[..., 1:]
+    t = 2.0 * xp.cross(axis, vector)
+    return vector + w * t + xp.cross(axis, t)
+
+
+def rotate_back(quat: Array, vector: Array) -> Array:
+    """World vectors [..., 3] in the frame of a body with unit quaternion [..., 4]."""
+    xp = namespace(quat, vector)
+    return rotate(xp.concatenate([quat[..., :1], -quat[..., 1:]], -1), vector)
+
+
+def yaw_matrix(yaw_rad: float) -> np.ndarray:
+    """[3, 3] rotation about z."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def wrap_angle(angle_rad: Array, period_rad: float = 2 * math.pi) -> Array:
+    """Angles in [-period/2, period/2)."""
+    return (angle_rad + period_rad / 2) % period_rad - period_rad / 2
