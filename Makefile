@@ -16,7 +16,7 @@ help:
 	@echo "make demo    generate and convert a small building, train a TurtleBot, score it, draw it (SEED=$(SEED))"
 	@echo "make test    tests, slow ones included; make test-all: the heaviest too"
 	@echo "make docs    the documentation as HTML, in docs/_build/html"
-	@echo "make lint | types | format | check (lint, types and test) | sync (environment) | lock | clean-demo"
+	@echo "make lint | types | format | check (lint, types, docs and test) | sync (environment) | lock | clean-demo"
 
 # The environment: exact versions from requirements.lock, the project itself as an editable install.
 sync: .venv/.complete
@@ -95,7 +95,7 @@ docs: sync
 	$(say) "Documentation: docs/_build/html/index.html"
 	@$(PY) -m sphinx -W --keep-going -q -b html docs docs/_build/html
 
-check: lint types test
+check: lint types docs test
 
 lock:
 	uv pip compile pyproject.toml --extra dev --extra warp --extra docs --universal --python-version 3.11 --generate-hashes \
