@@ -217,7 +217,8 @@ import matplotlib
 matplotlib.use("svg")
 from matplotlib import pyplot
 import interactive_nav.topdown
-from interactive_nav.robots import get_robot, picture
+from interactive_nav.robot_study import picture
+from interactive_nav.robots import get_robot
 picture._with_matplotlib(*picture.stage(get_robot("turtlebot")))
 print(matplotlib.get_backend(), pyplot.get_fignums())
 """

@@ -26,6 +26,7 @@ from interactive_nav_common.locks import release, take_lock
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import __main__ as program
+from interactive_nav_common import versions
 from train.runs import checkpoint, run, run_folder
 from train.config import resolve
 from train.config_io import from_yaml
@@ -370,13 +371,13 @@ def test_failures_are_summed_over_logged_episodes(tmp_path):
 
 def test_a_run_tells_its_command_without_the_machines_folders(monkeypatch):
     monkeypatch.setattr("sys.argv", ["/somewhere/train/__main__.py", "--config", "demo"])
-    assert run_folder.command() == ["train", "--config", "demo"]
+    assert versions.command() == ["train", "--config", "demo"]
     monkeypatch.setattr("sys.argv", ["/somewhere/my_sweep.py"])
-    assert run_folder.command() == ["my_sweep.py"]
+    assert versions.command() == ["my_sweep.py"]
 
 
 def test_the_environment_may_tell_the_commit(monkeypatch):
     monkeypatch.setenv("GIT_COMMIT", "abc1234")
-    assert run_folder.commit() == "abc1234"
+    assert versions.commit() == "abc1234"
     monkeypatch.delenv("GIT_COMMIT")
-    assert run_folder.commit() != "abc1234"
+    assert versions.commit() != "abc1234"
