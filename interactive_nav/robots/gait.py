@@ -1,25 +1,20 @@
 """What legged robots share: MJCF and actuators in, joint servos by control mode; twist in, joint targets out.
 
-A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step. Its
-targets are `home + reference(phase, command) + scale * tanh(network(observation))`: a scripted stepping motion,
-corrected by a small network where one was trained (`python -m train.gait`); its weights lie in `gaits/`.
+A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
+targets are `home + reference(phase, command, base)`, a scripted stepping motion.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
-import numpy as np
 
 from interactive_nav.robots.spec import ControlLaw, RobotState
 
-GAITS = Path(__file__).parent / "gaits"
 GRAVITY_M_S2 = 9.81
 
 
@@ -127,41 +122,19 @@ def base_motion(state: RobotState, xp: Any) -> BaseMotion:
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """A robot's gait: its scripted motion, and all that training a correction needs to know."""
+    """A robot's gait: its scripted motion and the limits that hold for it."""
 
-    robot: str
-    joints: tuple[str, ...]
-    """Driven joints, in the order of the actuators; J of them."""
     home: tuple[float, ...]
-    """[J] rad."""
+    """[J] rad, of the driven joints in the order of the actuators."""
     ranges: tuple[tuple[float, float], ...]
     """[J] least and largest target, rad."""
-    action_scale: tuple[float, ...]
-    """[J] largest correction of each target by the network, rad."""
     frequency_hz: float
     """Cycles a second."""
     reference: Callable[[Any, Any, BaseMotion, Any], Any]
     """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
-    tracked: tuple[int, ...]
-    """Joints whose reference training rewards following."""
     max_linear_m_s: float
     max_angular_rad_s: float
-    servo: Servo
     torque_nm: tuple[float, ...]
-    fall_height_m: float
-    """Base below this: fallen."""
-    offsets: tuple[int, ...] = ()
-    """Driven joints among the robot's joints after the free one; by default the first J."""
-
-    @property
-    def joint_index(self) -> np.ndarray:
-        """[J] position of each driven joint after the free joint."""
-        return np.asarray(self.offsets or range(len(self.joints)))
-
-    @property
-    def observation_size(self) -> int:
-        """O: 14 numbers of the base, command and clock, and two per joint."""
-        return 14 + 2 * len(self.joints)
 
     def command_range(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """(linear m/s, angular rad/s) at action -1 and +1: symmetric, so that action 0 stands."""
@@ -176,105 +149,13 @@ def rotate_to_body(quat: Any, vector: Any, xp: Any) -> Any:
     return vector + w * t + xp.cross(axis, t)
 
 
-def phase_at(gait: Gait, time_s: Any) -> Any:
-    """The gait's phase [...], rad."""
-    return 2.0 * math.pi * gait.frequency_hz * time_s
-
-
-def observe(gait: Gait, command: Any, state: RobotState, xp: Any) -> Any:
-    """What the network sees, [..., O].
-
-    Gravity's direction (3), linear and angular velocity (6) in the base frame, height of the base; joints from
-    home and their velocities / 10; command over its maximum (2); cosine and sine of the phase.
-    """
-    qpos, qvel = state.qpos, state.qvel
-    quat = qpos[..., 3:7]
-    down = xp.zeros_like(qpos[..., :3]) + xp.asarray([0.0, 0.0, -1.0], dtype=qpos.dtype)
-    joints = gait.joint_index
-    phase = phase_at(gait, state.time_s)[..., None] + xp.zeros_like(qpos[..., :1])
-    most = xp.asarray([gait.max_linear_m_s, gait.max_angular_rad_s], dtype=qpos.dtype)
-    return xp.concatenate(
-        [
-            rotate_to_body(quat, down, xp),
-            rotate_to_body(quat, qvel[..., :3], xp),
-            qvel[..., 3:6],
-            qpos[..., 2:3],
-            qpos[..., 7 + joints] - xp.asarray(gait.home, dtype=qpos.dtype),
-            0.1 * qvel[..., 6 + joints],
-            command / most,
-            xp.cos(phase),
-            xp.sin(phase),
-        ],
-        -1,
-    )
-
-
-def targets(gait: Gait, command: Any, correction: Any, state: RobotState, xp: Any) -> Any:
-    """Joint targets [..., J], rad, within the joints' ranges; `correction` [..., J] is in [-1, 1]."""
-    low, high = xp.asarray(gait.ranges).T
-    wanted = xp.asarray(gait.home) + gait.reference(phase_at(gait, state.time_s), command, base_motion(state, xp), xp)
-    return xp.clip(wanted + xp.asarray(gait.action_scale) * correction, low, high)
-
-
-@dataclasses.dataclass(frozen=True)
-class Network:
-    """A trained correction: a swish network whose tanh is the correction."""
-
-    mean: np.ndarray
-    """[O] of the observations."""
-    deviation: np.ndarray
-    """[O]"""
-    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
-    """Kernels [in, out] and biases [out]; the last layer has J outputs."""
-
-    def __call__(self, observation: Any, xp: Any) -> Any:
-        """[..., O] to corrections [..., J] in [-1, 1]."""
-        x = xp.clip((observation - xp.asarray(self.mean)) / xp.asarray(self.deviation), -10.0, 10.0)
-        for i, (kernel, bias) in enumerate(self.layers):
-            x = x @ xp.asarray(kernel) + xp.asarray(bias)
-            if i + 1 < len(self.layers):
-                x = x * 0.5 * (1.0 + xp.tanh(0.5 * x))
-        return xp.tanh(x)
-
-
-def save_network(network: Network, path: Path) -> None:
-    """Writes weights as float16, statistics as float32."""
-    arrays = {"mean": network.mean.astype(np.float32), "deviation": network.deviation.astype(np.float32)}
-    for i, (kernel, bias) in enumerate(network.layers):
-        arrays |= {f"kernel_{i}": kernel.astype(np.float16), f"bias_{i}": bias.astype(np.float16)}
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
-
-
-@functools.cache
-def load_network(path: Path) -> Network:
-    """Reads what `save_network` wrote."""
-    with np.load(path) as file:
-        count = sum(name.startswith("kernel_") for name in file.files)
-        layers = tuple(
-            (file[f"kernel_{i}"].astype(np.float32), file[f"bias_{i}"].astype(np.float32)) for i in range(count)
-        )
-        return Network(file["mean"], file["deviation"], layers)
-
-
-def scripted_gait(gait: Gait) -> ControlLaw:
-    """Twist to joint targets by the reference motion alone."""
-
-    def law(command, state, xp):
-        return targets(gait, command, 0.0, state, xp)
-
-    return law
-
-
-def learned_gait(gait: Gait, network: Network) -> ControlLaw:
-    """Twist to joint targets with the network's corrections."""
-
-    def law(command, state, xp):
-        return targets(gait, command, network(observe(gait, command, state, xp), xp), state, xp)
-
-    return law
-
-
 def gait_law(gait: Gait) -> ControlLaw:
-    """Twist to joint targets: corrected by the network in `gaits/<robot>.npz` where there is one."""
-    path = GAITS / f"{gait.robot}.npz"
-    return learned_gait(gait, load_network(path)) if path.is_file() else scripted_gait(gait)
+    """Twist to joint targets [..., J], rad, within the joints' ranges."""
+
+    def law(command, state, xp):
+        phase = 2.0 * math.pi * gait.frequency_hz * state.time_s
+        low, high = xp.asarray(gait.ranges).T
+        wanted = xp.asarray(gait.home) + gait.reference(phase, command, base_motion(state, xp), xp)
+        return xp.clip(wanted, low, high)
+
+    return law

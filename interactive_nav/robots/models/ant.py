@@ -119,19 +119,13 @@ def _reference(phase, command, base, xp):
 
 
 GAIT = Gait(
-    robot="ant",
-    joints=JOINTS,
     home=_HOME,
     ranges=_RANGES,
-    action_scale=(0.5,) * 8,
     frequency_hz=_FREQUENCY_HZ,
     reference=_reference,
-    tracked=tuple(range(8)),
     max_linear_m_s=MAX_LINEAR_M_S,
     max_angular_rad_s=MAX_ANGULAR_RAD_S,
-    servo=_SERVO,
     torque_nm=(TORQUE_NM,) * 8,
-    fall_height_m=0.26 * SCALE,
 )
 
 

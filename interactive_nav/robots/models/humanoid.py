@@ -140,7 +140,6 @@ MJCF = f"""
 """
 
 _SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0)
-_LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in name)
 
 
 class Stepping(NamedTuple):
@@ -280,19 +279,13 @@ def _reference(phase, command, base, xp):
 
 
 GAIT = Gait(
-    robot="humanoid",
-    joints=JOINTS,
     home=_HOME,
     ranges=_RANGES,
-    action_scale=tuple(0.4 if i in _LEGS else 0.2 for i in range(17)),
     frequency_hz=WALK.frequency_hz,
     reference=_reference,
-    tracked=tuple(i for i, name in enumerate(_TABLE) if "hip_y" in name or "knee" in name),
     max_linear_m_s=MAX_LINEAR_M_S,
     max_angular_rad_s=MAX_ANGULAR_RAD_S,
-    servo=_SERVO,
     torque_nm=_TORQUE_NM,
-    fall_height_m=0.85,
 )
 
 
