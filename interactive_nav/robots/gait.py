@@ -1,4 +1,4 @@
-"""What legged robots share: MJCF and actuators in, joint servos by control mode; twist in, joint targets out.
+"""A legged robot's MJCF, joints and gait in, one `RobotSpec` per control mode out.
 
 A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
 targets are `home + reference(phase, command, base)`, a scripted stepping motion.
@@ -7,13 +7,14 @@ targets are `home + reference(phase, command, base)`, a scripted stepping motion
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
 
-from interactive_nav.robots.spec import ControlLaw, RobotState
+from interactive_nav.robots.spec import ControlLaw, RobotSpec, RobotState, TwistMap
 
 GRAVITY_M_S2 = 9.81
 
@@ -34,58 +35,6 @@ def check_mode(robot: str, mode: str, known: tuple[str, ...]) -> None:
     """Raises ValueError for a control mode that the robot does not have."""
     if mode not in known:
         raise ValueError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
-
-
-def attach(spec: mujoco.MjSpec, mjcf: str, prefix: str) -> None:
-    """Attaches a robot's MJCF (one body with a free joint) to a world; every name gets the prefix."""
-    robot = mujoco.MjSpec.from_string(mjcf)
-    spec.worldbody.add_frame().attach_body(robot.worldbody.first_body(), prefix, "")
-
-
-def add_servos(
-    spec: mujoco.MjSpec,
-    joints: tuple[str, ...],
-    mode: str,
-    servo: Servo,
-    torque_nm: tuple[float, ...],
-    ranges_rad: tuple[tuple[float, float], ...],
-) -> None:
-    """One actuator per joint, named like it: torque (`native`, `torque`), velocity, or position otherwise."""
-    for joint, torque, limits in zip(joints, torque_nm, ranges_rad, strict=True):
-        gain, bias, control = 1.0, (0.0, 0.0, 0.0), (-torque, torque)
-        if mode == "velocity":
-            gain, bias, control = servo.velocity_gain, (0.0, 0.0, -servo.velocity_gain), (-100.0, 100.0)
-        elif mode not in ("native", "torque"):
-            gain, bias, control = servo.stiffness, (0.0, -servo.stiffness, -servo.damping), limits
-        spec.add_actuator(
-            name=joint,
-            target=joint,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE if any(bias) else mujoco.mjtBias.mjBIAS_NONE,
-            gainprm=[gain] + [0.0] * 9,
-            biasprm=[*bias] + [0.0] * 7,
-            ctrllimited=True,
-            ctrlrange=list(control),
-        )
-
-
-def joint_command_range(
-    mode: str, torque_nm: tuple[float, ...], ranges_rad: tuple[tuple[float, float], ...], speed_rad_s: float
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Commands at action -1 and +1 of a mode that drives joints: torques, positions or velocities."""
-    if mode == "position":
-        return tuple(low for low, _ in ranges_rad), tuple(high for _, high in ranges_rad)
-    most = (speed_rad_s,) * len(torque_nm) if mode == "velocity" else torque_nm
-    return tuple(-m for m in most), most
-
-
-def joint_units(joints: tuple[str, ...], mode: str) -> tuple[str, ...]:
-    """Action names with units."""
-    if mode == "twist":
-        return ("forward m/s", "turn rad/s")
-    unit = {"position": "rad", "velocity": "rad/s"}.get(mode, "N m")
-    return tuple(f"{joint.split('_', 1)[1]} {unit}" for joint in joints)
 
 
 class BaseMotion(NamedTuple):
@@ -121,25 +70,34 @@ def base_motion(state: RobotState, xp: Any) -> BaseMotion:
 
 
 @dataclasses.dataclass(frozen=True)
-class Gait:
-    """A robot's gait: its scripted motion and the limits that hold for it."""
+class Legged:
+    """A legged robot's body, its J driven joints and its gait."""
 
+    name: str
+    mjcf: str
+    """One body with the free joint `free`; names without the robot's in front."""
+    base_body: str
+    """Without the robot's name."""
+    joints: tuple[str, ...]
+    """[J] names in the model; their actuators have the same."""
     home: tuple[float, ...]
-    """[J] rad, of the driven joints in the order of the actuators."""
+    """[J] rad."""
     ranges: tuple[tuple[float, float], ...]
     """[J] least and largest target, rad."""
+    torque_nm: tuple[float, ...]
+    """[J]"""
+    servo: Servo
+    max_speed_rad_s: float
+    """Of a joint in mode `velocity`."""
     frequency_hz: float
-    """Cycles a second."""
+    """Cycles of the gait a second."""
     reference: Callable[[Any, Any, BaseMotion, Any], Any]
     """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
     max_linear_m_s: float
     max_angular_rad_s: float
-    torque_nm: tuple[float, ...]
-
-    def command_range(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """(linear m/s, angular rad/s) at action -1 and +1: symmetric, so that action 0 stands."""
-        most = (self.max_linear_m_s, self.max_angular_rad_s)
-        return (-most[0], -most[1]), most
+    modes: tuple[str, ...] = ("native", "position", "velocity", "twist")
+    native: str = "torque"
+    """What the original's actions are: `torque` or `position` of the joints."""
 
 
 def rotate_to_body(quat: Any, vector: Any, xp: Any) -> Any:
@@ -149,13 +107,95 @@ def rotate_to_body(quat: Any, vector: Any, xp: Any) -> Any:
     return vector + w * t + xp.cross(axis, t)
 
 
-def gait_law(gait: Gait) -> ControlLaw:
+def gait_law(legs: Legged) -> ControlLaw:
     """Twist to joint targets [..., J], rad, within the joints' ranges."""
 
     def law(command, state, xp):
-        phase = 2.0 * math.pi * gait.frequency_hz * state.time_s
-        low, high = xp.asarray(gait.ranges).T
-        wanted = xp.asarray(gait.home) + gait.reference(phase, command, base_motion(state, xp), xp)
+        phase = 2.0 * math.pi * legs.frequency_hz * state.time_s
+        low, high = xp.asarray(legs.ranges).T
+        wanted = xp.asarray(legs.home) + legs.reference(phase, command, base_motion(state, xp), xp)
         return xp.clip(wanted, low, high)
 
     return law
+
+
+def _command_range(legs: Legged, mode: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Commands at action -1 and +1: positions of the joints, or what is symmetric: action 0 stands."""
+    if mode == "position":
+        return tuple(low for low, _ in legs.ranges), tuple(high for _, high in legs.ranges)
+    most = legs.torque_nm
+    if mode == "velocity":
+        most = (legs.max_speed_rad_s,) * len(legs.joints)
+    elif mode == "twist":
+        most = (legs.max_linear_m_s, legs.max_angular_rad_s)
+    return tuple(-m for m in most), most
+
+
+def _action_names(legs: Legged, mode: str) -> tuple[str, ...]:
+    """With units."""
+    if mode == "twist":
+        return ("forward m/s", "turn rad/s")
+    unit = {"position": "rad", "velocity": "rad/s"}.get(mode, "N m")
+    return tuple(f"{joint.split('_', 1)[1]} {unit}" for joint in legs.joints)
+
+
+def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
+    """Attaches the robot to a world, with one actuator per joint: torque, velocity, or position otherwise."""
+    robot = mujoco.MjSpec.from_string(legs.mjcf)
+    world.worldbody.add_frame().attach_body(robot.worldbody.first_body(), f"{legs.name}_", "")
+    servo = legs.servo
+    for joint, torque, limits in zip(legs.joints, legs.torque_nm, legs.ranges, strict=True):
+        gain, bias, control = servo.stiffness, (0.0, -servo.stiffness, -servo.damping), limits
+        if mode == "velocity":
+            gain, bias, control = servo.velocity_gain, (0.0, 0.0, -servo.velocity_gain), (-100.0, 100.0)
+        elif mode == "torque":
+            gain, bias, control = 1.0, (0.0, 0.0, 0.0), (-torque, torque)
+        world.add_actuator(
+            name=joint,
+            target=joint,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE if any(bias) else mujoco.mjtBias.mjBIAS_NONE,
+            gainprm=[gain] + [0.0] * 9,
+            biasprm=[*bias] + [0.0] * 7,
+            ctrllimited=True,
+            ctrlrange=list(control),
+        )
+
+
+def legged_robot(legs: Legged, control_mode: str, **figures: Any) -> RobotSpec:
+    """The spec of a legged robot in a control mode.
+
+    Args:
+        legs: its body, joints and gait.
+        control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and
+            angular velocity through the gait.
+        **figures: other fields of `RobotSpec`, or other values of those set here.
+
+    Raises:
+        ValueError: unknown mode.
+    """
+    check_mode(legs.name, control_mode, legs.modes)
+    joint_mode = legs.native if control_mode == "native" else control_mode
+    twist = control_mode == "twist"
+    low, high = _command_range(legs, joint_mode)
+    fields: dict[str, Any] = {
+        "action_low": low,
+        "action_high": high,
+        "action_names": _action_names(legs, joint_mode),
+        "home_qpos": tuple(zip(legs.joints, legs.home, strict=True)),
+        "control": gait_law(legs) if twist else None,
+    }
+    return RobotSpec(
+        name=legs.name,
+        add_to=functools.partial(_add_to, legs, joint_mode),
+        base_body=f"{legs.name}_{legs.base_body}",
+        base_joint=f"{legs.name}_free",
+        actuators=legs.joints,
+        kind="legged",
+        control_mode=control_mode,
+        control_modes=legs.modes,
+        control_every_substep=twist,
+        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), legs.max_linear_m_s, legs.max_angular_rad_s) if twist else None,
+        **(fields | figures),
+    )

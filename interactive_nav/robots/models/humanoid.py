@@ -8,43 +8,27 @@ limbs do not collide with each other.
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import NamedTuple
 
-import mujoco
+from interactive_nav.robots.gait import Legged, Servo, legged_robot
+from interactive_nav.robots.spec import Camera, RobotSpec
 
-from interactive_nav.robots.gait import (
-    Gait,
-    Servo,
-    add_servos,
-    attach,
-    check_mode,
-    gait_law,
-    joint_command_range,
-    joint_units,
-)
-from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
-
-_MODES = ("native", "position", "velocity", "twist")
-MAX_LINEAR_M_S = 0.35
-MAX_ANGULAR_RAD_S = 0.5
 _THIGH_RAD, _SHIN_RAD = 0.2, 0.24
 """Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
 
 # name: (range in degrees, torque in N m, home in rad)
+_LEG: dict[str, tuple[tuple[float, float], float, float]] = {
+    "hip_x": ((-25, 5), 41.0, 0.0),
+    "hip_z": ((-60, 35), 41.0, 0.0),
+    "hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
+    "knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+}
 _TABLE: dict[str, tuple[tuple[float, float], float, float]] = {
     "abdomen_z": ((-45, 45), 41.0, 0.0),
     "abdomen_y": ((-75, 30), 41.0, 0.0),
     "abdomen_x": ((-35, 35), 41.0, 0.0),
-    "right_hip_x": ((-25, 5), 41.0, 0.0),
-    "right_hip_z": ((-60, 35), 41.0, 0.0),
-    "right_hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
-    "right_knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
-    "left_hip_x": ((-25, 5), 41.0, 0.0),
-    "left_hip_z": ((-60, 35), 41.0, 0.0),
-    "left_hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
-    "left_knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+    **{f"{side}_{joint}": facts for side in ("right", "left") for joint, facts in _LEG.items()},
     "right_shoulder1": ((-85, 60), 30.75, 0.67),
     "right_shoulder2": ((-85, 60), 30.75, -0.51),
     "right_elbow": ((-90, 50), 30.75, -1.47),
@@ -53,9 +37,6 @@ _TABLE: dict[str, tuple[tuple[float, float], float, float]] = {
     "left_elbow": ((-90, 50), 30.75, -1.47),
 }
 JOINTS = tuple(f"humanoid_{name}" for name in _TABLE)
-_RANGES = tuple((math.radians(low), math.radians(high)) for (low, high), _, _ in _TABLE.values())
-_TORQUE_NM = tuple(torque for _, torque, _ in _TABLE.values())
-_HOME = tuple(home for _, _, home in _TABLE.values())
 
 
 def _joint(name: str, axis: str, pos: str = "0 0 0", kind: str = "humanoid") -> str:
@@ -138,8 +119,6 @@ MJCF = f"""
   </worldbody>
 </mujoco>
 """
-
-_SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0)
 
 
 class Stepping(NamedTuple):
@@ -278,25 +257,26 @@ def _reference(phase, command, base, xp):
     return step_targets(WALK, STAND, phase, command, base, xp)
 
 
-GAIT = Gait(
-    home=_HOME,
-    ranges=_RANGES,
+LEGS = Legged(
+    name="humanoid",
+    mjcf=MJCF,
+    base_body="torso",
+    joints=JOINTS,
+    home=tuple(home for _, _, home in _TABLE.values()),
+    ranges=tuple((math.radians(low), math.radians(high)) for (low, high), _, _ in _TABLE.values()),
+    torque_nm=tuple(torque for _, torque, _ in _TABLE.values()),
+    servo=Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0),
+    max_speed_rad_s=8.0,
     frequency_hz=WALK.frequency_hz,
     reference=_reference,
-    max_linear_m_s=MAX_LINEAR_M_S,
-    max_angular_rad_s=MAX_ANGULAR_RAD_S,
-    torque_nm=_TORQUE_NM,
+    max_linear_m_s=0.35,
+    max_angular_rad_s=0.5,
 )
 
 
 def _spawn_height_m() -> float:
     thigh, shin = 0.383, 0.02 + 0.35
     return 0.26 + 0.165 + 0.04 + thigh * math.cos(_THIGH_RAD) + shin * math.cos(_SHIN_RAD) + 0.075
-
-
-def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
-    attach(spec, MJCF, "humanoid_")
-    add_servos(spec, JOINTS, mode, _SERVO, _TORQUE_NM, _RANGES)
 
 
 def humanoid(control_mode: str = "native") -> RobotSpec:
@@ -309,35 +289,17 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
     Raises:
         ValueError: unknown mode.
     """
-    check_mode("humanoid", control_mode, _MODES)
-    twist = control_mode == "twist"
-    low, high = joint_command_range(control_mode, _TORQUE_NM, _RANGES, 8.0)
-    if twist:
-        low, high = GAIT.command_range()
-    return RobotSpec(
-        name="humanoid",
-        add_to=functools.partial(_add_to, mode=control_mode),
-        base_body="humanoid_torso",
-        base_joint="humanoid_free",
-        actuators=JOINTS,
-        action_low=low,
-        action_high=high,
-        action_names=joint_units(JOINTS, control_mode),
+    return legged_robot(
+        LEGS,
+        control_mode,
         body_width_m=0.42,
         footprint_radius_m=0.35,
         height_m=1.57,
         spawn_height_m=_spawn_height_m(),
         camera=Camera("humanoid_torso", (0.0, 0.0, 0.19)),
-        home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
-        kind="legged",
         mass_kg=42.116,
         size_m=(0.28, 0.58, 1.56),
         drive_type="2 legs, 17 hinges",
         source="MuJoCo and GibsonEnv humanoid.xml; feet are ours",
-        control_mode=control_mode,
-        control_modes=_MODES,
-        control=gait_law(GAIT) if twist else None,
-        control_every_substep=twist,
         contact_time_constant_s=0.04,
-        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

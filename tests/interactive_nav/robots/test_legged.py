@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.robots import get_robot
-from interactive_nav.robots.gait import Gait, base_motion, gait_law
+from interactive_nav.robots.gait import Legged, base_motion, gait_law
 from interactive_nav.robots.spec import RobotState
 from tests.interactive_nav.robots.motion import extents, hall_world, home_data, move, plain_model, schedule
 
@@ -19,8 +19,8 @@ LEGGED = ("ant", "humanoid", "minitaur")
 NOTHING = RobotState(None, None, None)
 
 
-def gait_of(name: str) -> Gait:
-    return importlib.import_module(f"interactive_nav.robots.models.{name}").GAIT
+def legs_of(name: str) -> Legged:
+    return importlib.import_module(f"interactive_nav.robots.models.{name}").LEGS
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_humanoid_masses_by_body():
 @pytest.mark.parametrize("name", LEGGED)
 def test_joint_limits_and_torque_limits_hold_under_full_torque(name):
     mode = "torque" if name == "minitaur" else "native"
-    robot, gait = get_robot(name, mode), gait_of(name)
+    robot, legs = get_robot(name, mode), legs_of(name)
     model = plain_model(name, mode, gravity=False)
     address = [model.joint(j).qposadr[0] for j in robot.actuators]
     dofs = [model.joint(j).dofadr[0] for j in robot.actuators]
@@ -90,7 +90,7 @@ def test_joint_limits_and_torque_limits_hold_under_full_torque(name):
         for _ in range(100):
             data.ctrl[:] = 10.0 * robot.command(action)  # ten times too much: the limits are physical
             mujoco.mj_step(model, data)
-            assert (np.abs(data.qfrc_actuator[dofs]) <= np.array(gait.torque_nm) * (1 + 1e-6)).all()
+            assert (np.abs(data.qfrc_actuator[dofs]) <= np.array(legs.torque_nm) * (1 + 1e-6)).all()
             reached.append(data.qpos[address].copy())
         # MuJoCo's limits are soft: a joint that runs into one at full speed overshoots, and is then held.
         over = np.maximum(ranges[:, 0] - reached, reached - ranges[:, 1])[-20:]
@@ -250,17 +250,17 @@ def test_base_motion_by_hand():
 
 @pytest.mark.parametrize("name", LEGGED)
 def test_a_gait_asks_alike_on_host_and_device_and_within_the_ranges(name):
-    gait, rng = gait_of(name), np.random.default_rng(0)
+    legs, rng = legs_of(name), np.random.default_rng(0)
     data = home_data(plain_model(name, "twist"), get_robot(name, "twist"))
     qpos = data.qpos + 0.05 * rng.normal(size=(3, len(data.qpos)))
     state = RobotState(qpos, rng.normal(size=(3, len(data.qvel))), np.array([0.0, 0.13, 2.0]))
     command = rng.uniform(-0.2, 0.2, (3, 2))
-    targets = gait_law(gait)(command, state, np)
-    low, high = np.array(gait.ranges).T
-    assert targets.shape == (3, len(gait.home))
+    targets = gait_law(legs)(command, state, np)
+    low, high = np.array(legs.ranges).T
+    assert targets.shape == (3, len(legs.home))
     assert (targets >= low).all() and (targets <= high).all()
-    assert np.abs(targets - gait.home).max() > 0.01
-    on_device = gait_law(gait)(jnp.asarray(command), RobotState(*map(jnp.asarray, state)), jnp)
+    assert np.abs(targets - legs.home).max() > 0.01
+    on_device = gait_law(legs)(jnp.asarray(command), RobotState(*map(jnp.asarray, state)), jnp)
     np.testing.assert_allclose(on_device, targets, atol=2e-4)
 
 
