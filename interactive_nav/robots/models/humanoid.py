@@ -163,66 +163,40 @@ class Stepping(NamedTuple):
     """Untold, it steps in so far as step_speed * speed + step_lean * (|pitch| + |roll|) exceeds the threshold."""
 
 
-WALK = Stepping(
-    frequency_hz=2.15,
-    hip_lift=0.179,
-    knee_lift=0.414,
-    sway=0.141,
-    sway_phase=0.326,
-    waist=-0.16,
-    stride=0.624,
-    lean=0.401,
-    width=0.034,
-    bend=0.145,
-    place_forward=0.427,
-    place_side=0.935,
-    pitch=0.705,
-    pitch_rate=0.067,
-    roll=0.937,
-    roll_rate=0.23,
-    swing_pitch=1.385,
-    waist_roll=-0.357,
-    turn=0.696,
-    slip=0.333,
-    step_speed=4.0,
-    step_lean=6.0,
-    step_threshold=0.6,
-)
-"""Told to go."""
-
-STAND = Stepping(
-    frequency_hz=2.15,
-    hip_lift=0.273,
-    knee_lift=0.478,
-    sway=0.201,
-    sway_phase=0.226,
-    waist=-0.18,
-    stride=0.778,
-    lean=0.305,
-    width=0.021,
-    bend=-0.018,
-    place_forward=0.639,
-    place_side=0.77,
-    pitch=0.562,
-    pitch_rate=0.094,
-    roll=1.057,
-    roll_rate=0.194,
-    swing_pitch=1.039,
-    waist_roll=-0.549,
-    turn=0.764,
-    slip=0.224,
-    step_speed=8.327,
-    step_lean=10.492,
-    step_threshold=0.8,
-)
-"""Told to stand: it steps only where it must."""
+_FIGURES = {
+    # Told to go; told to stand: it steps only where it must.
+    "frequency_hz": (2.15, 2.15),
+    "hip_lift": (0.179, 0.273),
+    "knee_lift": (0.414, 0.478),
+    "sway": (0.141, 0.201),
+    "sway_phase": (0.326, 0.226),
+    "waist": (-0.16, -0.18),
+    "stride": (0.624, 0.778),
+    "lean": (0.401, 0.305),
+    "width": (0.034, 0.021),
+    "bend": (0.145, -0.018),
+    "place_forward": (0.427, 0.639),
+    "place_side": (0.935, 0.77),
+    "pitch": (0.705, 0.562),
+    "pitch_rate": (0.067, 0.094),
+    "roll": (0.937, 1.057),
+    "roll_rate": (0.23, 0.194),
+    "swing_pitch": (1.385, 1.039),
+    "waist_roll": (-0.357, -0.549),
+    "turn": (0.696, 0.764),
+    "slip": (0.333, 0.224),
+    "step_speed": (4.0, 8.327),
+    "step_lean": (6.0, 10.492),
+    "step_threshold": (0.6, 0.8),
+}
+WALK, STAND = (Stepping(**dict(zip(_FIGURES, own, strict=True))) for own in zip(*_FIGURES.values(), strict=True))
 
 
-def step_targets(walk, stand, phase, command, base, xp):
+def _reference(phase, command, base, xp):
     """The walk of `Stepping` p as offsets from home, [..., 17]; it stands when neither told nor forced to step."""
     forward, turn = command[..., 0], command[..., 1]
     told = xp.clip(10.0 * xp.abs(forward) + 5.0 * xp.abs(turn), 0.0, 1.0)
-    p = Stepping(*(told * a + (1.0 - told) * b for a, b in zip(walk, stand, strict=True)))
+    p = Stepping(*(told * a + (1.0 - told) * b for a, b in zip(WALK, STAND, strict=True)))
     speed = xp.sqrt(base.forward**2 + base.left**2 + 1e-6)
     forced = p.step_speed * speed + p.step_lean * (xp.abs(base.pitch) + xp.abs(base.roll)) - p.step_threshold
     going = xp.clip(xp.maximum(told, forced), 0.0, 1.0)
@@ -251,10 +225,6 @@ def step_targets(walk, stand, phase, command, base, xp):
     out["abdomen_x"] = p.waist * sway + p.waist_roll * base.roll
     out["abdomen_y"] = p.bend * forward
     return xp.stack([out[name] for name in _TABLE], -1)
-
-
-def _reference(phase, command, base, xp):
-    return step_targets(WALK, STAND, phase, command, base, xp)
 
 
 LEGS = Legged(
