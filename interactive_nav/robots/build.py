@@ -136,6 +136,20 @@ def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
         )
 
 
+def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot alone in a world, on the floor in its home pose; its frames are computed."""
+    world.compiler.degree = False
+    robot.add_to(world)
+    model = world.compile()
+    data = mujoco.MjData(model)
+    at = int(model.joint(robot.base_joint).qposadr[0])
+    data.qpos[at : at + 7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]
+    for name, value in robot.home_qpos:
+        data.qpos[model.joint(name).qposadr[0]] = value
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """(3,) half sizes of a primitive's bounding box in its own frame, m."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]

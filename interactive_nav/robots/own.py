@@ -15,7 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.build import Joint, WheeledBase, half_extents, read_file, wheeled_robot
+from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, read_file, stand, wheeled_robot
 from interactive_nav.robots.repair import Facts, Wheel, complete, find, strip
 from interactive_nav.robots.spec import Camera, RobotSpec
 
@@ -60,16 +60,9 @@ def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mappin
 
 def _outline(robot: RobotSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Lower and upper corner above the floor, radius about the base frame and mass, at home."""
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.1])
-    robot.add_to(spec)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    data.qpos[:7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]
-    for name, value in robot.home_qpos:
-        data.qpos[model.joint(name).qposadr[0]] = value
-    mujoco.mj_kinematics(model, data)
+    world = mujoco.MjSpec()
+    world.worldbody.add_geom(name=FLOOR, type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.1])
+    model, data = stand(robot, world)
     low, high, radius = np.full(3, np.inf), np.full(3, -np.inf), 0.0
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     for geom in range(model.ngeom):
