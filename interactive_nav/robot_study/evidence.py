@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,43 +19,19 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
+from interactive_nav.robot_study.hall import GRAVITY_M_S2, LOADS, box, hall
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.scenes.scene import Movable, Scene
 from interactive_nav.scenes.world import World, build_world
 from interactive_nav_common.rotations import yaw_from_quat
-from scenes_mjcf.schema import SceneManifest, SceneMaps
 
-GRAVITY_M_S2 = 9.81
 _DT_S = 0.1
 _STEPS = 60
 _SETTLE = 10
 """Control steps that a robot may take to settle on its wheels before drift counts."""
 PUSH_SPEED_M_S = 0.3
 MODE = "twist"
-
-
-@dataclasses.dataclass(frozen=True)
-class Load:
-    """A box to push."""
-
-    name: str
-    mass_kg: float
-    friction: float
-    half_m: tuple[float, float, float]
-
-    @property
-    def force_n(self) -> float:
-        """Horizontal force that keeps it sliding: mu m g."""
-        return self.friction * self.mass_kg * GRAVITY_M_S2
-
-
-LOADS = (
-    Load("basket", 0.9, 0.5, (0.14, 0.19, 0.12)),
-    Load("table", 12.0, 0.4, (0.3, 0.3, 0.25)),
-    Load("sofa", 80.0, 0.6, (0.45, 1.0, 0.4)),
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,33 +69,6 @@ class Evidence:
     def passed(self) -> bool:
         """Whether all checks passed."""
         return all(c.passed for c in self.checks)
-
-
-def _box(load: Load, x: float, y: float) -> Movable:
-    hx, hy, hz = load.half_m
-    inertia = load.mass_kg / 3 * np.array([hy**2 + hz**2, hx**2 + hz**2, hx**2 + hy**2])
-    return Movable(
-        name=load.name,
-        category="table",
-        mass_kg=load.mass_kg,
-        inertia=inertia,
-        com_m=np.zeros(3),
-        inertia_quat=np.array([1.0, 0, 0, 0]),
-        pos_w=np.array([x, y, hz]),
-        quat_w=np.array([1.0, 0, 0, 0]),
-        friction=load.friction,
-        boxes=np.array([[0, 0, 0, 1, 0, 0, 0, hx, hy, hz]]),
-        hulls=(),
-        hinge=None,
-    )
-
-
-def hall(movables: tuple[Movable, ...]) -> Scene:
-    """A scene in memory: a floor without walls near, and the given bodies."""
-    manifest = SceneManifest("hall", "train", {"format": "none", "files": {}}, "CC0-1.0", 1.0, (), {}, {}, {})
-    maps = SceneMaps(np.ones((4, 4), bool), 0.05, (0.0, 0.0), 0.0)
-    wall = np.array([[0.0, -100.0, 0.5, 1, 0, 0, 0, 1.0, 0.05, 0.5]])
-    return Scene(Path("hall"), "hall", "train", "", manifest, maps, wall, movables)
 
 
 def push_limit_n(robot: RobotSpec, world: World) -> float:
@@ -199,13 +147,15 @@ def measure_wheeled(name: str, backend: str = "native") -> Evidence:
     """
     robot = get_robot(name, MODE)
     assert robot.twist is not None
-    front = _front_m(build_world(robot, (hall((_box(LOADS[0], 50.0, 50.0),)),), NavConfig(num_objects=0)))
-    boxes = tuple(_box(load, front + load.half_m[0] + 0.1, 20.0 * (i + 1)) for i, load in enumerate(LOADS))
+    front = _front_m(build_world(robot, (hall((box(LOADS[0], 50.0, 50.0),)),), NavConfig(num_objects=0)))
+    boxes = tuple(box(load, front + load.half_m[0] + 0.1, 20.0 * (i + 1)) for i, load in enumerate(LOADS))
     config = NavConfig(backend=backend, num_objects=0, sleep=False)
     world = build_world(robot, (hall(boxes),), config)
     runs = _manoeuvres(robot)
     used, poses, forces = _run(robot, world, config, runs, _STEPS)
-    return _judge(robot, world, used, runs, poses, forces)
+    motion = _motion(world, runs, poses)
+    checks = _driving_checks(robot, world, motion) + _pushing_checks(robot, world, motion, poses, forces)
+    return _evidence(robot, used, runs, motion, checks)
 
 
 def _run(
@@ -235,59 +185,98 @@ def _tilt_deg(q: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1)))
 
 
-def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray, forces: np.ndarray) -> Evidence:
-    """Checks from poses [T + 1, N, nq] and mean contact forces [T, N]."""
-    assert robot.twist is not None
+@dataclasses.dataclass(frozen=True)
+class _Motion:
+    """What the base did in each of N manoeuvres, from poses [T + 1, N, nq]."""
+
+    index: dict[str, int]
+    """Name of a manoeuvre -> its place among the N."""
+    xy: np.ndarray
+    """[T + 1, N, 2] m, from the start."""
+    yaw: np.ndarray
+    """[T + 1, N] rad, without jumps."""
+    tilt: np.ndarray
+    """[T + 1, N] degrees."""
+    speed: np.ndarray
+    """[T, N] m/s along the world's x."""
+    rate: np.ndarray
+    """[T, N] rad/s"""
+
+
+def _motion(world: World, runs: tuple[_Manoeuvre, ...], poses: np.ndarray) -> _Motion:
     at = world.layout.robot_qpos
-    index = {run.name: i for i, run in enumerate(runs)}
     xy = poses[..., at : at + 2] - poses[:1, :, at : at + 2]
     yaw, tilt = np.unwrap(yaw_from_quat(poses[..., at + 3 : at + 7]), axis=0), _tilt_deg(poses[..., at + 3 : at + 7])
-    v, w = robot.twist.max_linear_m_s, robot.twist.max_angular_rad_s
     speed, rate = np.diff(xy[..., 0], axis=0) / _DT_S, np.diff(yaw, axis=0) / _DT_S
+    return _Motion({run.name: i for i, run in enumerate(runs)}, xy, yaw, tilt, speed, rate)
+
+
+def _mass_check(robot: RobotSpec, world: World) -> Check:
+    return Check("mass kg / table", world.robot_mass_kg / (robot.mass_kg or world.robot_mass_kg), 0.99, 1.01)
+
+
+def _axle_moves_m(robot: RobotSpec, world: World, motion: _Motion) -> float:
+    """How far the axle's middle moves in the turns on the spot."""
+    turns = [motion.index["turn"], motion.index["half turn"]]
+    # The base frame may lie off the axle, and then goes round it.
+    axle, cos, sin = _axle_b(robot, world), np.cos(motion.yaw[:, turns]), np.sin(motion.yaw[:, turns])
+    offset = np.stack([cos * axle[0] - sin * axle[1], sin * axle[0] + cos * axle[1]], -1)
+    centre = motion.xy[:, turns] + offset - offset[:1]
+    return float(np.linalg.norm(centre, axis=-1).max())
+
+
+def _driving_checks(robot: RobotSpec, world: World, motion: _Motion) -> list[Check]:
+    """Standing, driving straight, stopping, turning, cornering."""
+    assert robot.twist is not None
+    v, w = robot.twist.max_linear_m_s, robot.twist.max_angular_rad_s
+    index, xy, yaw, speed = motion.index, motion.xy, motion.yaw, motion.speed
+    straight, half_speed, corner, stand = (index[n] for n in ("straight", "half speed", "corner", "stand"))
     steady = slice(25, 40)
 
-    def linear(run: str, asked: float) -> float:
-        return float(speed[steady, index[run]].mean() / asked)
+    def ratio(values: np.ndarray, run: str, asked: float) -> float:
+        return float(values[steady, index[run]].mean() / asked)
 
-    def angular(run: str, asked: float) -> float:
-        return float(rate[steady, index[run]].mean() / asked)
-
-    straight, turn, corner, stand = (index[n] for n in ("straight", "turn", "corner", "stand"))
-    turns = [turn, index["half turn"]]
-    # The base frame may lie off the axle, and then goes round it.
-    axle, cos, sin = _axle_b(robot, world), np.cos(yaw[:, turns]), np.sin(yaw[:, turns])
-    offset = np.stack([cos * axle[0] - sin * axle[1], sin * axle[0] + cos * axle[1]], -1)
-    centre = xy[:, turns] + offset - offset[:1]
     # Four wheels that skid wander with the last bits of their contacts: by up to a twentieth of the robot's length.
     turn_limit_m = max(0.03, 0.05 * robot.size_m[0]) if robot.size_m else 0.03
-    checks = [
-        Check("mass kg / table", world.robot_mass_kg / (robot.mass_kg or world.robot_mass_kg), 0.99, 1.01),
+    return [
+        _mass_check(robot, world),
         Check("standing drift mm", 1e3 * float(np.abs(xy[_SETTLE:, stand] - xy[_SETTLE, stand]).max()), 0, 2),
         Check("standing drift deg", math.degrees(float(np.ptp(yaw[_SETTLE:, stand]))), 0, 0.2),
-        Check("linear / asked", linear("straight", v), 0.9, 1.1),
-        Check("linear / asked, half speed", linear("half speed", 0.5 * v), 0.9, 1.1),
+        Check("linear / asked", ratio(speed, "straight", v), 0.9, 1.1),
+        Check("linear / asked, half speed", ratio(speed, "half speed", 0.5 * v), 0.9, 1.1),
         Check("straight line deviation %", 100 * float(np.abs(xy[:41, straight, 1]).max() / xy[40, straight, 0]), 0, 2),
-        Check("stopped mm/s", 1e3 * float(np.abs(speed[-5:, [straight, index["half speed"]]]).max()), 0, 5),
-        Check("angular / asked", angular("turn", w), 0.9, 1.1),
-        Check("angular / asked, half rate", angular("half turn", -0.5 * w), 0.9, 1.1),
-        Check("turn: centre moves m", float(np.linalg.norm(centre, axis=-1).max()), 0, turn_limit_m),
+        Check("stopped mm/s", 1e3 * float(np.abs(speed[-5:, [straight, half_speed]]).max()), 0, 5),
+        Check("angular / asked", ratio(motion.rate, "turn", w), 0.9, 1.1),
+        Check("angular / asked, half rate", ratio(motion.rate, "half turn", -0.5 * w), 0.9, 1.1),
+        Check("turn: centre moves m", _axle_moves_m(robot, world, motion), 0, turn_limit_m),
         Check("corner: turned deg", math.degrees(float(yaw[-1, corner])), 90, 1e4),
-        Check("corner: largest tilt deg", float(tilt[:, corner].max()), 0, 5),
+        Check("corner: largest tilt deg", float(motion.tilt[:, corner].max()), 0, 5),
     ]
-    limit = push_limit_n(robot, world)
+
+
+def _face_friction(robot: RobotSpec, world: World) -> float:
+    """Largest friction of the base's own collision geoms."""
     model = world.models[0]
     base = model.body(robot.base_body).id
     solid = [g for g in range(model.ngeom) if model.geom_bodyid[g] == base and model.geom_contype[g]]
-    face_friction = float(model.geom_friction[solid, 0].max())
+    return float(model.geom_friction[solid, 0].max())
+
+
+def _pushing_checks(
+    robot: RobotSpec, world: World, motion: _Motion, poses: np.ndarray, forces: np.ndarray
+) -> list[Check]:
+    """What wheels and grip can push moves, by the force that it takes; what they cannot stays; nothing tips."""
+    checks = []
+    limit, friction = push_limit_n(robot, world), _face_friction(robot, world)
     for i, load in enumerate(LOADS):
-        run, slot = index[load.name], world.layout.slot_qpos[i]
+        run, slot = motion.index[load.name], world.layout.slot_qpos[i]
         pushed = float(poses[-1, run, slot] - poses[0, run, slot])
         if load.force_n < limit / 1.4:
             checks.append(Check(f"pushes {load.name} m", pushed, 0.5, 2))
             # The mean of the force's norm. With friction f between the robot's face and the load, the face lifts or
             # presses it: the push is mu m g / (1 -+ f mu), its norm at most sqrt(1 + f^2) of that; 7 % for contacts
             # that open and close. A test of C MuJoCo's force vectors holds the push to mu (m g - lift).
-            face = max(load.friction, face_friction)
+            face = max(load.friction, friction)
             low = 0.93 / (1 + face * load.friction)
             high = 1.07 * math.hypot(1, face) / max(1 - face * load.friction, 0.1)
             ratio = float(forces[-20:, run].mean()) / load.force_n
@@ -295,17 +284,25 @@ def _judge(robot: RobotSpec, world: World, backend: str, runs, poses: np.ndarray
         elif load.force_n > limit * 1.4:
             # Soft friction lets a load creep below its limit, here by less than 2 cm/s for 5 s.
             checks.append(Check(f"cannot push {load.name} m", pushed, -0.01, 0.1))
-        checks.append(Check(f"tilt at {load.name} deg", float(tilt[:, run].max()), 0, 5))
-    time = _DT_S * (np.arange(_STEPS) + 0.5)
-    asked = np.array([[run.twist(k * _DT_S) for run in runs] for k in range(_STEPS)])
+        checks.append(Check(f"tilt at {load.name} deg", float(motion.tilt[:, run].max()), 0, 5))
+    return checks
+
+
+def _evidence(
+    robot: RobotSpec, backend: str, runs: tuple[_Manoeuvre, ...], motion: _Motion, checks: list[Check]
+) -> Evidence:
+    """The checks with the curves of the manoeuvres `straight` and `turn`."""
+    straight, turn = motion.index["straight"], motion.index["turn"]
+    steps = len(motion.speed)
+    asked = np.array([[run.twist(k * _DT_S) for run in runs] for k in range(steps)])
     return Evidence(
         robot=robot.name,
         backend=backend,
         checks=tuple(checks),
-        time_s=time,
-        speed_m_s=speed[:, straight],
+        time_s=_DT_S * (np.arange(steps) + 0.5),
+        speed_m_s=motion.speed[:, straight],
         commanded_m_s=asked[:, straight, 0],
-        turn_rad_s=rate[:, turn],
+        turn_rad_s=motion.rate[:, turn],
         commanded_rad_s=asked[:, turn, 1],
     )
 
@@ -330,38 +327,26 @@ def measure_walking(name: str, backend: str = "native") -> Evidence:
     )
     config = NavConfig(backend=backend, num_objects=0, sleep=False)
     # One box far away: the layouts of all backends expect something that can be touched.
-    world = build_world(robot, (hall((_box(LOADS[0], 50.0, 50.0),)),), config)
+    world = build_world(robot, (hall((box(LOADS[0], 50.0, 50.0),)),), config)
     used, poses, _ = _run(robot, world, config, runs, steps)
-    at = world.layout.robot_qpos
+    motion, at = _motion(world, runs, poses), world.layout.robot_qpos
     xyz = poses[..., at : at + 3]
-    yaw, tilt = np.unwrap(yaw_from_quat(poses[..., at + 3 : at + 7]), axis=0), _tilt_deg(poses[..., at + 3 : at + 7])
     stood = xyz[_SETTLE : _SETTLE + 51, 0, :2]
     walked = xyz[:, 1] - xyz[:1, 1]
     stop_k, turn_k = round((start_s + going_s) / _DT_S), round((start_s + turning_s) / _DT_S)
-    turned = float(yaw[turn_k, 2] - yaw[0, 2])
-    checks = (
-        Check("mass kg / table", world.robot_mass_kg / (robot.mass_kg or world.robot_mass_kg), 0.99, 1.01),
+    turned = float(motion.yaw[turn_k, 2] - motion.yaw[0, 2])
+    checks = [
+        _mass_check(robot, world),
         Check("standing drift m, 5 s", float(np.abs(stood - stood[0]).max()), 0, 0.03),
         Check("moves m", float(np.linalg.norm(walked[stop_k, :2])), 1.0, 100.0),
         Check("linear / asked", float(np.linalg.norm(walked[stop_k, :2])) / (v * going_s), 0.65, 1.35),
         Check("sideways / ahead", float(np.abs(walked[stop_k, 1] / walked[stop_k, 0])), 0, 0.5),
         Check("stopped: last second moves m", float(np.linalg.norm(walked[-1] - walked[-11])), 0, 0.05),
         Check("angular / asked", turned / (w * turning_s), 0.65, 1.35),
-        Check("turn: centre moves m", float(np.linalg.norm(xyz[:, 2, :2] - xyz[:1, 2, :2], axis=-1).max()), 0, 0.5),
-        Check("largest tilt deg", float(tilt.max()), 0, 30),
-    )
-    asked = np.array([[run.twist(k * _DT_S) for run in runs] for k in range(steps)])
-    speed = np.diff(xyz[:, 1, 0], axis=0) / _DT_S
-    return Evidence(
-        robot=robot.name,
-        backend=used,
-        checks=checks,
-        time_s=_DT_S * (np.arange(steps) + 0.5),
-        speed_m_s=speed,
-        commanded_m_s=asked[:, 1, 0],
-        turn_rad_s=np.diff(yaw[:, 2], axis=0) / _DT_S,
-        commanded_rad_s=asked[:, 2, 1],
-    )
+        Check("turn: centre moves m", float(np.linalg.norm(motion.xy[:, 2], axis=-1).max()), 0, 0.5),
+        Check("largest tilt deg", float(motion.tilt.max()), 0, 30),
+    ]
+    return _evidence(robot, used, runs, motion, checks)
 
 
 EVIDENCE: dict[str, Callable[[str, str], Evidence]] = {

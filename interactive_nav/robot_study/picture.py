@@ -14,6 +14,7 @@ import numpy as np
 
 from interactive_nav.robot_study.evidence import Evidence
 from interactive_nav.robots import get_robot
+from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
 
 _SIZE = (480, 480)
@@ -23,7 +24,6 @@ _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG = 145.0, -22.0
 def stage(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The robot alone on a floor, standing in its home pose."""
     spec = mujoco.MjSpec()
-    spec.compiler.degree = False
     spec.visual.global_.offwidth, spec.visual.global_.offheight = _SIZE
     spec.visual.headlight.ambient = [0.3, 0.3, 0.3]
     spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
@@ -39,13 +39,7 @@ def stage(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[9, 9, 0.1])
     floor.rgba = [0.93, 0.93, 0.95, 1]
     spec.worldbody.add_light(pos=[1, 2, 4], dir=[-0.2, -0.45, -0.9])
-    robot.add_to(spec)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    at = model.jnt_qposadr[model.joint(robot.base_joint).id]
-    data.qpos[at : at + 7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]
-    for name, value in robot.home_qpos:
-        data.qpos[model.joint(name).qposadr[0]] = value
+    model, data = stand(robot, spec)
     mujoco.mj_forward(model, data)
     return model, data
 

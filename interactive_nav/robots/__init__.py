@@ -6,32 +6,20 @@ import difflib
 from collections.abc import Callable
 
 from interactive_nav.robots.models.ant import ant
-from interactive_nav.robots.models.fetch import fetch
-from interactive_nav.robots.models.freight import freight
 from interactive_nav.robots.models.humanoid import humanoid
-from interactive_nav.robots.models.husky import husky
-from interactive_nav.robots.models.jackrabbot1 import jackrabbot1
-from interactive_nav.robots.models.jackrabbot2 import jackrabbot2
 from interactive_nav.robots.models.minitaur import minitaur
 from interactive_nav.robots.models.quadrotor import quadrotor
-from interactive_nav.robots.models.ttbot import ttbot
-from interactive_nav.robots.models.turtlebot import turtlebot
+from interactive_nav.robots.models.wheeled import WHEELED
 from interactive_nav.robots.own import from_file
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.errors import ConfigError
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
     "ant": ant,
-    "fetch": fetch,
-    "freight": freight,
     "humanoid": humanoid,
-    "husky": husky,
-    "jackrabbot1": jackrabbot1,
-    "jackrabbot2": jackrabbot2,
     "minitaur": minitaur,
     "quadrotor": quadrotor,
-    "ttbot": ttbot,
-    "turtlebot": turtlebot,
+    **WHEELED,
 }
 """Name -> control mode -> spec."""
 

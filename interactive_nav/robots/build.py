@@ -136,6 +136,20 @@ def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
         )
 
 
+def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot alone in a world, on the floor in its home pose; its frames are computed."""
+    world.compiler.degree = False
+    robot.add_to(world)
+    model = world.compile()
+    data = mujoco.MjData(model)
+    at = int(model.joint(robot.base_joint).qposadr[0])
+    data.qpos[at : at + 7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]
+    for name, value in robot.home_qpos:
+        data.qpos[model.joint(name).qposadr[0]] = value
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """(3,) half sizes of a primitive's bounding box in its own frame, m."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
@@ -306,6 +320,26 @@ class _Mode:
             _set_servo(child.actuator(joint.name), self.kind[i], joint, self.limits[i], bounds.get(i))
 
 
+def _load(base: WheeledBase, prepare: Callable[[mujoco.MjSpec], None] | None) -> mujoco.MjSpec:
+    """The robot's file, parsed and prepared; it has a joint and an actuator of each driven joint's name."""
+    path = base.path or FOLDER / f"{base.name}.xml"
+    child = read_file(path)
+    if prepare is not None:
+        prepare(child)
+    missing = [j.name for j in base.joints if child.joint(j.name) is None or child.actuator(j.name) is None]
+    if missing:
+        raise ValueError(f"robot file {path}: no joint and actuator named '{missing[0]}'")
+    return child
+
+
+def _mode(base: WheeledBase, child: mujoco.MjSpec, control_mode: str) -> _Mode:
+    mode = _Mode(base, [_limits(child, joint) for joint in base.joints])
+    mode.choose(control_mode)
+    compiled = child.copy().compile()
+    mode.qpos_address = np.asarray([compiled.joint(j.name).qposadr[0] for j in base.joints])
+    return mode
+
+
 def wheeled_robot(
     base: WheeledBase,
     control_mode: str,
@@ -332,26 +366,13 @@ def wheeled_robot(
     """
     if control_mode not in base.modes:
         raise ValueError(f"robot '{base.name}' has no control mode '{control_mode}'; it has {', '.join(base.modes)}")
-    path, prefix = base.path or FOLDER / f"{base.name}.xml", f"{base.name}_"
-
-    def load() -> mujoco.MjSpec:
-        child = read_file(path)
-        if prepare is not None:
-            prepare(child)
-        return child
-
-    child = load()
-    missing = [j.name for j in base.joints if child.joint(j.name) is None or child.actuator(j.name) is None]
-    if missing:
-        raise ValueError(f"robot file {path}: no joint and actuator named '{missing[0]}'")
-    mode = _Mode(base, [_limits(child, joint) for joint in base.joints])
-    mode.choose(control_mode)
-    compiled = child.copy().compile()
-    mode.qpos_address = np.asarray([compiled.joint(j.name).qposadr[0] for j in base.joints])
+    prefix = f"{base.name}_"
+    child = _load(base, prepare)
+    mode = _mode(base, child, control_mode)
     free = next(j.name for j in child.body(base_body).joints)
 
     def add_to(world: mujoco.MjSpec) -> None:
-        own = load()
+        own = _load(base, prepare)
         mode.set_servos(own)
         attach(world, own, prefix)
 

@@ -1,8 +1,7 @@
-"""What legged robots share: MJCF and actuators in, joint servos by control mode; twist in, joint targets out.
+"""A legged robot's MJCF, joints and gait in, one `RobotSpec` per control mode out.
 
-A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step. Its
-targets are `home + reference(phase, command) + scale * tanh(network(observation))`: a scripted stepping motion,
-corrected by a small network where one was trained (`python -m train.gait`); its weights lie in `gaits/`.
+A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
+targets are `home + reference(phase, command, base)`, a scripted stepping motion.
 """
 
 from __future__ import annotations
@@ -11,16 +10,12 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
-import numpy as np
 
-from interactive_nav.robots.spec import ControlLaw, RobotState
-from interactive_nav_common.rotations import rotate_back
+from interactive_nav.robots.spec import ControlLaw, RobotSpec, RobotState, TwistMap
 
-GAITS = Path(__file__).parent / "gaits"
 GRAVITY_M_S2 = 9.81
 
 
@@ -40,58 +35,6 @@ def check_mode(robot: str, mode: str, known: tuple[str, ...]) -> None:
     """Raises ValueError for a control mode that the robot does not have."""
     if mode not in known:
         raise ValueError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
-
-
-def attach(spec: mujoco.MjSpec, mjcf: str, prefix: str) -> None:
-    """Attaches a robot's MJCF (one body with a free joint) to a world; every name gets the prefix."""
-    robot = mujoco.MjSpec.from_string(mjcf)
-    spec.worldbody.add_frame().attach_body(robot.worldbody.first_body(), prefix, "")
-
-
-def add_servos(
-    spec: mujoco.MjSpec,
-    joints: tuple[str, ...],
-    mode: str,
-    servo: Servo,
-    torque_nm: tuple[float, ...],
-    ranges_rad: tuple[tuple[float, float], ...],
-) -> None:
-    """One actuator per joint, named like it: torque (`native`, `torque`), velocity, or position otherwise."""
-    for joint, torque, limits in zip(joints, torque_nm, ranges_rad, strict=True):
-        gain, bias, control = 1.0, (0.0, 0.0, 0.0), (-torque, torque)
-        if mode == "velocity":
-            gain, bias, control = servo.velocity_gain, (0.0, 0.0, -servo.velocity_gain), (-100.0, 100.0)
-        elif mode not in ("native", "torque"):
-            gain, bias, control = servo.stiffness, (0.0, -servo.stiffness, -servo.damping), limits
-        spec.add_actuator(
-            name=joint,
-            target=joint,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE if any(bias) else mujoco.mjtBias.mjBIAS_NONE,
-            gainprm=[gain] + [0.0] * 9,
-            biasprm=[*bias] + [0.0] * 7,
-            ctrllimited=True,
-            ctrlrange=list(control),
-        )
-
-
-def joint_command_range(
-    mode: str, torque_nm: tuple[float, ...], ranges_rad: tuple[tuple[float, float], ...], speed_rad_s: float
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Commands at action -1 and +1 of a mode that drives joints: torques, positions or velocities."""
-    if mode == "position":
-        return tuple(low for low, _ in ranges_rad), tuple(high for _, high in ranges_rad)
-    most = (speed_rad_s,) * len(torque_nm) if mode == "velocity" else torque_nm
-    return tuple(-m for m in most), most
-
-
-def joint_units(joints: tuple[str, ...], mode: str) -> tuple[str, ...]:
-    """Action names with units."""
-    if mode == "twist":
-        return ("forward m/s", "turn rad/s")
-    unit = {"position": "rad", "velocity": "rad/s"}.get(mode, "N m")
-    return tuple(f"{joint.split('_', 1)[1]} {unit}" for joint in joints)
 
 
 class BaseMotion(NamedTuple):
@@ -127,148 +70,125 @@ def base_motion(state: RobotState, xp: Any) -> BaseMotion:
 
 
 @dataclasses.dataclass(frozen=True)
-class Gait:
-    """A robot's gait: its scripted motion, and all that training a correction needs to know."""
+class Legged:
+    """A legged robot's body, its J driven joints and its gait."""
 
-    robot: str
+    name: str
+    mjcf: str
+    """One body with the free joint `free`; names without the robot's in front."""
+    base_body: str
+    """Without the robot's name."""
     joints: tuple[str, ...]
-    """Driven joints, in the order of the actuators; J of them."""
+    """[J] names in the model; their actuators have the same."""
     home: tuple[float, ...]
     """[J] rad."""
     ranges: tuple[tuple[float, float], ...]
     """[J] least and largest target, rad."""
-    action_scale: tuple[float, ...]
-    """[J] largest correction of each target by the network, rad."""
+    torque_nm: tuple[float, ...]
+    """[J]"""
+    servo: Servo
+    max_speed_rad_s: float
+    """Of a joint in mode `velocity`."""
     frequency_hz: float
-    """Cycles a second."""
+    """Cycles of the gait a second."""
     reference: Callable[[Any, Any, BaseMotion, Any], Any]
     """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
-    tracked: tuple[int, ...]
-    """Joints whose reference training rewards following."""
     max_linear_m_s: float
     max_angular_rad_s: float
-    servo: Servo
-    torque_nm: tuple[float, ...]
-    fall_height_m: float
-    """Base below this: fallen."""
-    offsets: tuple[int, ...] = ()
-    """Driven joints among the robot's joints after the free one; by default the first J."""
-
-    @property
-    def joint_index(self) -> np.ndarray:
-        """[J] position of each driven joint after the free joint."""
-        return np.asarray(self.offsets or range(len(self.joints)))
-
-    @property
-    def observation_size(self) -> int:
-        """O: 14 numbers of the base, command and clock, and two per joint."""
-        return 14 + 2 * len(self.joints)
-
-    def command_range(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """(linear m/s, angular rad/s) at action -1 and +1: symmetric, so that action 0 stands."""
-        most = (self.max_linear_m_s, self.max_angular_rad_s)
-        return (-most[0], -most[1]), most
+    modes: tuple[str, ...] = ("native", "position", "velocity", "twist")
+    native: str = "torque"
+    """What the original's actions are: `torque` or `position` of the joints."""
 
 
-def phase_at(gait: Gait, time_s: Any) -> Any:
-    """The gait's phase [...], rad."""
-    return 2.0 * math.pi * gait.frequency_hz * time_s
+def gait_law(legs: Legged) -> ControlLaw:
+    """Twist to joint targets [..., J], rad, within the joints' ranges."""
+
+    def law(command, state, xp):
+        phase = 2.0 * math.pi * legs.frequency_hz * state.time_s
+        low, high = xp.asarray(legs.ranges).T
+        wanted = xp.asarray(legs.home) + legs.reference(phase, command, base_motion(state, xp), xp)
+        return xp.clip(wanted, low, high)
+
+    return law
 
 
-def observe(gait: Gait, command: Any, state: RobotState, xp: Any) -> Any:
-    """What the network sees, [..., O].
-
-    Gravity's direction (3), linear and angular velocity (6) in the base frame, height of the base; joints from
-    home and their velocities / 10; command over its maximum (2); cosine and sine of the phase.
-    """
-    qpos, qvel = state.qpos, state.qvel
-    quat = qpos[..., 3:7]
-    down = xp.zeros_like(qpos[..., :3]) + xp.asarray([0.0, 0.0, -1.0], dtype=qpos.dtype)
-    joints = gait.joint_index
-    phase = phase_at(gait, state.time_s)[..., None] + xp.zeros_like(qpos[..., :1])
-    most = xp.asarray([gait.max_linear_m_s, gait.max_angular_rad_s], dtype=qpos.dtype)
-    return xp.concatenate(
-        [
-            rotate_back(quat, down),
-            rotate_back(quat, qvel[..., :3]),
-            qvel[..., 3:6],
-            qpos[..., 2:3],
-            qpos[..., 7 + joints] - xp.asarray(gait.home, dtype=qpos.dtype),
-            0.1 * qvel[..., 6 + joints],
-            command / most,
-            xp.cos(phase),
-            xp.sin(phase),
-        ],
-        -1,
-    )
+def _command_range(legs: Legged, mode: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Commands at action -1 and +1: positions of the joints, or what is symmetric: action 0 stands."""
+    if mode == "position":
+        return tuple(low for low, _ in legs.ranges), tuple(high for _, high in legs.ranges)
+    most = legs.torque_nm
+    if mode == "velocity":
+        most = (legs.max_speed_rad_s,) * len(legs.joints)
+    elif mode == "twist":
+        most = (legs.max_linear_m_s, legs.max_angular_rad_s)
+    return tuple(-m for m in most), most
 
 
-def targets(gait: Gait, command: Any, correction: Any, state: RobotState, xp: Any) -> Any:
-    """Joint targets [..., J], rad, within the joints' ranges; `correction` [..., J] is in [-1, 1]."""
-    low, high = xp.asarray(gait.ranges).T
-    wanted = xp.asarray(gait.home) + gait.reference(phase_at(gait, state.time_s), command, base_motion(state, xp), xp)
-    return xp.clip(wanted + xp.asarray(gait.action_scale) * correction, low, high)
+def _action_names(legs: Legged, mode: str) -> tuple[str, ...]:
+    """With units."""
+    if mode == "twist":
+        return ("forward m/s", "turn rad/s")
+    unit = {"position": "rad", "velocity": "rad/s"}.get(mode, "N m")
+    return tuple(f"{joint.split('_', 1)[1]} {unit}" for joint in legs.joints)
 
 
-@dataclasses.dataclass(frozen=True)
-class Network:
-    """A trained correction: a swish network whose tanh is the correction."""
-
-    mean: np.ndarray
-    """[O] of the observations."""
-    deviation: np.ndarray
-    """[O]"""
-    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
-    """Kernels [in, out] and biases [out]; the last layer has J outputs."""
-
-    def __call__(self, observation: Any, xp: Any) -> Any:
-        """[..., O] to corrections [..., J] in [-1, 1]."""
-        x = xp.clip((observation - xp.asarray(self.mean)) / xp.asarray(self.deviation), -10.0, 10.0)
-        for i, (kernel, bias) in enumerate(self.layers):
-            x = x @ xp.asarray(kernel) + xp.asarray(bias)
-            if i + 1 < len(self.layers):
-                x = x * 0.5 * (1.0 + xp.tanh(0.5 * x))
-        return xp.tanh(x)
-
-
-def save_network(network: Network, path: Path) -> None:
-    """Writes weights as float16, statistics as float32."""
-    arrays = {"mean": network.mean.astype(np.float32), "deviation": network.deviation.astype(np.float32)}
-    for i, (kernel, bias) in enumerate(network.layers):
-        arrays |= {f"kernel_{i}": kernel.astype(np.float16), f"bias_{i}": bias.astype(np.float16)}
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
-
-
-@functools.cache
-def load_network(path: Path) -> Network:
-    """Reads what `save_network` wrote."""
-    with np.load(path) as file:
-        count = sum(name.startswith("kernel_") for name in file.files)
-        layers = tuple(
-            (file[f"kernel_{i}"].astype(np.float32), file[f"bias_{i}"].astype(np.float32)) for i in range(count)
+def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
+    """Attaches the robot to a world, with one actuator per joint: torque, velocity, or position otherwise."""
+    robot = mujoco.MjSpec.from_string(legs.mjcf)
+    world.worldbody.add_frame().attach_body(robot.worldbody.first_body(), f"{legs.name}_", "")
+    servo = legs.servo
+    for joint, torque, limits in zip(legs.joints, legs.torque_nm, legs.ranges, strict=True):
+        gain, bias, control = servo.stiffness, (0.0, -servo.stiffness, -servo.damping), limits
+        if mode == "velocity":
+            gain, bias, control = servo.velocity_gain, (0.0, 0.0, -servo.velocity_gain), (-100.0, 100.0)
+        elif mode == "torque":
+            gain, bias, control = 1.0, (0.0, 0.0, 0.0), (-torque, torque)
+        world.add_actuator(
+            name=joint,
+            target=joint,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE if any(bias) else mujoco.mjtBias.mjBIAS_NONE,
+            gainprm=[gain] + [0.0] * 9,
+            biasprm=[*bias] + [0.0] * 7,
+            ctrllimited=True,
+            ctrlrange=list(control),
         )
-        return Network(file["mean"], file["deviation"], layers)
 
 
-def scripted_gait(gait: Gait) -> ControlLaw:
-    """Twist to joint targets by the reference motion alone."""
+def legged_robot(legs: Legged, control_mode: str, **figures: Any) -> RobotSpec:
+    """The spec of a legged robot in a control mode.
 
-    def law(command, state, xp):
-        return targets(gait, command, 0.0, state, xp)
+    Args:
+        legs: its body, joints and gait.
+        control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and
+            angular velocity through the gait.
+        **figures: other fields of `RobotSpec`, or other values of those set here.
 
-    return law
-
-
-def learned_gait(gait: Gait, network: Network) -> ControlLaw:
-    """Twist to joint targets with the network's corrections."""
-
-    def law(command, state, xp):
-        return targets(gait, command, network(observe(gait, command, state, xp), xp), state, xp)
-
-    return law
-
-
-def gait_law(gait: Gait) -> ControlLaw:
-    """Twist to joint targets: corrected by the network in `gaits/<robot>.npz` where there is one."""
-    path = GAITS / f"{gait.robot}.npz"
-    return learned_gait(gait, load_network(path)) if path.is_file() else scripted_gait(gait)
+    Raises:
+        ValueError: unknown mode.
+    """
+    check_mode(legs.name, control_mode, legs.modes)
+    joint_mode = legs.native if control_mode == "native" else control_mode
+    twist = control_mode == "twist"
+    low, high = _command_range(legs, joint_mode)
+    fields: dict[str, Any] = {
+        "action_low": low,
+        "action_high": high,
+        "action_names": _action_names(legs, joint_mode),
+        "home_qpos": tuple(zip(legs.joints, legs.home, strict=True)),
+        "control": gait_law(legs) if twist else None,
+    }
+    return RobotSpec(
+        name=legs.name,
+        add_to=functools.partial(_add_to, legs, joint_mode),
+        base_body=f"{legs.name}_{legs.base_body}",
+        base_joint=f"{legs.name}_free",
+        actuators=legs.joints,
+        kind="legged",
+        control_mode=control_mode,
+        control_modes=legs.modes,
+        control_every_substep=twist,
+        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), legs.max_linear_m_s, legs.max_angular_rad_s) if twist else None,
+        **(fields | figures),
+    )

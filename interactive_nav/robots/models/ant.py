@@ -9,22 +9,10 @@ density 5) and 182 kg (PyBullet, density 1000), both at scale 1. Ours is the sec
 
 from __future__ import annotations
 
-import functools
 import math
 
-import mujoco
-
-from interactive_nav.robots.gait import (
-    Gait,
-    Servo,
-    add_servos,
-    attach,
-    check_mode,
-    gait_law,
-    joint_command_range,
-    joint_units,
-)
-from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
+from interactive_nav.robots.gait import Legged, Servo, legged_robot
+from interactive_nav.robots.spec import Camera, RobotSpec
 
 SCALE = 0.25
 TORQUE_NM = 250.0 * SCALE**4
@@ -33,9 +21,6 @@ JOINTS = tuple(f"ant_{part}_{i}" for i in range(1, 5) for part in ("hip", "ankle
 _ANKLE_SIGN = (1.0, -1.0, -1.0, 1.0)
 _HIP_RANGE = (-math.radians(40.0), math.radians(40.0))
 _ANKLE_RANGE = (math.radians(30.0), math.radians(100.0))
-_MODES = ("native", "position", "velocity", "twist")
-MAX_LINEAR_M_S = 0.2
-MAX_ANGULAR_RAD_S = 0.8
 
 
 def _ankle_range(sign: float) -> tuple[float, float]:
@@ -88,11 +73,6 @@ MJCF = f"""
 """
 """Limbs collide with everything but each other."""
 
-_SERVO = Servo(stiffness=9.0, damping=0.4, velocity_gain=0.2)
-_HOME = tuple(v for sign in _ANKLE_SIGN for v in (0.0, sign * HOME_ANKLE_RAD))
-_RANGES = tuple(r for sign in _ANKLE_SIGN for r in (_HIP_RANGE, _ankle_range(sign)))
-
-
 _FREQUENCY_HZ = 2.3
 _LIFT_RAD = 0.325
 _PRESS = 0.1
@@ -118,26 +98,21 @@ def _reference(phase, command, base, xp):
     return xp.stack(offsets, -1)
 
 
-GAIT = Gait(
-    robot="ant",
+LEGS = Legged(
+    name="ant",
+    mjcf=MJCF,
+    base_body="torso",
     joints=JOINTS,
-    home=_HOME,
-    ranges=_RANGES,
-    action_scale=(0.5,) * 8,
+    home=tuple(v for sign in _ANKLE_SIGN for v in (0.0, sign * HOME_ANKLE_RAD)),
+    ranges=tuple(r for sign in _ANKLE_SIGN for r in (_HIP_RANGE, _ankle_range(sign))),
+    torque_nm=(TORQUE_NM,) * 8,
+    servo=Servo(stiffness=9.0, damping=0.4, velocity_gain=0.2),
+    max_speed_rad_s=8.0,
     frequency_hz=_FREQUENCY_HZ,
     reference=_reference,
-    tracked=tuple(range(8)),
-    max_linear_m_s=MAX_LINEAR_M_S,
-    max_angular_rad_s=MAX_ANGULAR_RAD_S,
-    servo=_SERVO,
-    torque_nm=(TORQUE_NM,) * 8,
-    fall_height_m=0.26 * SCALE,
+    max_linear_m_s=0.2,
+    max_angular_rad_s=0.8,
 )
-
-
-def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
-    attach(spec, MJCF, "ant_")
-    add_servos(spec, JOINTS, mode, _SERVO, (TORQUE_NM,) * 8, _RANGES)
 
 
 def ant(control_mode: str = "native") -> RobotSpec:
@@ -151,34 +126,16 @@ def ant(control_mode: str = "native") -> RobotSpec:
     Raises:
         ValueError: unknown mode.
     """
-    check_mode("ant", control_mode, _MODES)
-    twist = control_mode == "twist"
-    low, high = joint_command_range(control_mode, (TORQUE_NM,) * 8, _RANGES, 8.0)
-    if twist:
-        low, high = GAIT.command_range()
-    return RobotSpec(
-        name="ant",
-        add_to=functools.partial(_add_to, mode=control_mode),
-        base_body="ant_torso",
-        base_joint="ant_free",
-        actuators=JOINTS,
-        action_low=low,
-        action_high=high,
-        action_names=joint_units(JOINTS, control_mode),
+    return legged_robot(
+        LEGS,
+        control_mode,
         body_width_m=1.39 * SCALE,
         footprint_radius_m=0.25,
         height_m=0.21,
         spawn_height_m=(0.4 * math.sqrt(2.0) * math.sin(HOME_ANKLE_RAD) + 0.08) * SCALE,
         camera=Camera("ant_torso", (0.0, 0.0, 0.0)),
-        home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
-        kind="legged",
         mass_kg=182.2 * SCALE**3,
         size_m=(1.39 * SCALE, 1.39 * SCALE, 0.81 * SCALE),
         drive_type="4 legs, 8 hinges",
         source="MuJoCo and GibsonEnv ant.xml at scale 0.25, PyBullet's density",
-        control_mode=control_mode,
-        control_modes=_MODES,
-        control=gait_law(GAIT) if twist else None,
-        control_every_substep=twist,
-        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

@@ -8,43 +8,27 @@ limbs do not collide with each other.
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import NamedTuple
 
-import mujoco
+from interactive_nav.robots.gait import Legged, Servo, legged_robot
+from interactive_nav.robots.spec import Camera, RobotSpec
 
-from interactive_nav.robots.gait import (
-    Gait,
-    Servo,
-    add_servos,
-    attach,
-    check_mode,
-    gait_law,
-    joint_command_range,
-    joint_units,
-)
-from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
-
-_MODES = ("native", "position", "velocity", "twist")
-MAX_LINEAR_M_S = 0.35
-MAX_ANGULAR_RAD_S = 0.5
 _THIGH_RAD, _SHIN_RAD = 0.2, 0.24
 """Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
 
 # name: (range in degrees, torque in N m, home in rad)
+_LEG: dict[str, tuple[tuple[float, float], float, float]] = {
+    "hip_x": ((-25, 5), 41.0, 0.0),
+    "hip_z": ((-60, 35), 41.0, 0.0),
+    "hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
+    "knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+}
 _TABLE: dict[str, tuple[tuple[float, float], float, float]] = {
     "abdomen_z": ((-45, 45), 41.0, 0.0),
     "abdomen_y": ((-75, 30), 41.0, 0.0),
     "abdomen_x": ((-35, 35), 41.0, 0.0),
-    "right_hip_x": ((-25, 5), 41.0, 0.0),
-    "right_hip_z": ((-60, 35), 41.0, 0.0),
-    "right_hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
-    "right_knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
-    "left_hip_x": ((-25, 5), 41.0, 0.0),
-    "left_hip_z": ((-60, 35), 41.0, 0.0),
-    "left_hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
-    "left_knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+    **{f"{side}_{joint}": facts for side in ("right", "left") for joint, facts in _LEG.items()},
     "right_shoulder1": ((-85, 60), 30.75, 0.67),
     "right_shoulder2": ((-85, 60), 30.75, -0.51),
     "right_elbow": ((-90, 50), 30.75, -1.47),
@@ -53,9 +37,6 @@ _TABLE: dict[str, tuple[tuple[float, float], float, float]] = {
     "left_elbow": ((-90, 50), 30.75, -1.47),
 }
 JOINTS = tuple(f"humanoid_{name}" for name in _TABLE)
-_RANGES = tuple((math.radians(low), math.radians(high)) for (low, high), _, _ in _TABLE.values())
-_TORQUE_NM = tuple(torque for _, torque, _ in _TABLE.values())
-_HOME = tuple(home for _, _, home in _TABLE.values())
 
 
 def _joint(name: str, axis: str, pos: str = "0 0 0", kind: str = "humanoid") -> str:
@@ -139,9 +120,6 @@ MJCF = f"""
 </mujoco>
 """
 
-_SERVO = Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0)
-_LEGS = tuple(i for i, name in enumerate(_TABLE) if "hip" in name or "knee" in name)
-
 
 class Stepping(NamedTuple):
     """A walk with feedback, after SIMBICON (Yin et al. 2007): the leg in swing steps to where the body falls, the
@@ -185,66 +163,40 @@ class Stepping(NamedTuple):
     """Untold, it steps in so far as step_speed * speed + step_lean * (|pitch| + |roll|) exceeds the threshold."""
 
 
-WALK = Stepping(
-    frequency_hz=2.15,
-    hip_lift=0.179,
-    knee_lift=0.414,
-    sway=0.141,
-    sway_phase=0.326,
-    waist=-0.16,
-    stride=0.624,
-    lean=0.401,
-    width=0.034,
-    bend=0.145,
-    place_forward=0.427,
-    place_side=0.935,
-    pitch=0.705,
-    pitch_rate=0.067,
-    roll=0.937,
-    roll_rate=0.23,
-    swing_pitch=1.385,
-    waist_roll=-0.357,
-    turn=0.696,
-    slip=0.333,
-    step_speed=4.0,
-    step_lean=6.0,
-    step_threshold=0.6,
-)
-"""Told to go."""
-
-STAND = Stepping(
-    frequency_hz=2.15,
-    hip_lift=0.273,
-    knee_lift=0.478,
-    sway=0.201,
-    sway_phase=0.226,
-    waist=-0.18,
-    stride=0.778,
-    lean=0.305,
-    width=0.021,
-    bend=-0.018,
-    place_forward=0.639,
-    place_side=0.77,
-    pitch=0.562,
-    pitch_rate=0.094,
-    roll=1.057,
-    roll_rate=0.194,
-    swing_pitch=1.039,
-    waist_roll=-0.549,
-    turn=0.764,
-    slip=0.224,
-    step_speed=8.327,
-    step_lean=10.492,
-    step_threshold=0.8,
-)
-"""Told to stand: it steps only where it must."""
+_FIGURES = {
+    # Told to go; told to stand: it steps only where it must.
+    "frequency_hz": (2.15, 2.15),
+    "hip_lift": (0.179, 0.273),
+    "knee_lift": (0.414, 0.478),
+    "sway": (0.141, 0.201),
+    "sway_phase": (0.326, 0.226),
+    "waist": (-0.16, -0.18),
+    "stride": (0.624, 0.778),
+    "lean": (0.401, 0.305),
+    "width": (0.034, 0.021),
+    "bend": (0.145, -0.018),
+    "place_forward": (0.427, 0.639),
+    "place_side": (0.935, 0.77),
+    "pitch": (0.705, 0.562),
+    "pitch_rate": (0.067, 0.094),
+    "roll": (0.937, 1.057),
+    "roll_rate": (0.23, 0.194),
+    "swing_pitch": (1.385, 1.039),
+    "waist_roll": (-0.357, -0.549),
+    "turn": (0.696, 0.764),
+    "slip": (0.333, 0.224),
+    "step_speed": (4.0, 8.327),
+    "step_lean": (6.0, 10.492),
+    "step_threshold": (0.6, 0.8),
+}
+WALK, STAND = (Stepping(**dict(zip(_FIGURES, own, strict=True))) for own in zip(*_FIGURES.values(), strict=True))
 
 
-def step_targets(walk, stand, phase, command, base, xp):
+def _reference(phase, command, base, xp):
     """The walk of `Stepping` p as offsets from home, [..., 17]; it stands when neither told nor forced to step."""
     forward, turn = command[..., 0], command[..., 1]
     told = xp.clip(10.0 * xp.abs(forward) + 5.0 * xp.abs(turn), 0.0, 1.0)
-    p = Stepping(*(told * a + (1.0 - told) * b for a, b in zip(walk, stand, strict=True)))
+    p = Stepping(*(told * a + (1.0 - told) * b for a, b in zip(WALK, STAND, strict=True)))
     speed = xp.sqrt(base.forward**2 + base.left**2 + 1e-6)
     forced = p.step_speed * speed + p.step_lean * (xp.abs(base.pitch) + xp.abs(base.roll)) - p.step_threshold
     going = xp.clip(xp.maximum(told, forced), 0.0, 1.0)
@@ -275,35 +227,26 @@ def step_targets(walk, stand, phase, command, base, xp):
     return xp.stack([out[name] for name in _TABLE], -1)
 
 
-def _reference(phase, command, base, xp):
-    return step_targets(WALK, STAND, phase, command, base, xp)
-
-
-GAIT = Gait(
-    robot="humanoid",
+LEGS = Legged(
+    name="humanoid",
+    mjcf=MJCF,
+    base_body="torso",
     joints=JOINTS,
-    home=_HOME,
-    ranges=_RANGES,
-    action_scale=tuple(0.4 if i in _LEGS else 0.2 for i in range(17)),
+    home=tuple(home for _, _, home in _TABLE.values()),
+    ranges=tuple((math.radians(low), math.radians(high)) for (low, high), _, _ in _TABLE.values()),
+    torque_nm=tuple(torque for _, torque, _ in _TABLE.values()),
+    servo=Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0),
+    max_speed_rad_s=8.0,
     frequency_hz=WALK.frequency_hz,
     reference=_reference,
-    tracked=tuple(i for i, name in enumerate(_TABLE) if "hip_y" in name or "knee" in name),
-    max_linear_m_s=MAX_LINEAR_M_S,
-    max_angular_rad_s=MAX_ANGULAR_RAD_S,
-    servo=_SERVO,
-    torque_nm=_TORQUE_NM,
-    fall_height_m=0.85,
+    max_linear_m_s=0.35,
+    max_angular_rad_s=0.5,
 )
 
 
 def _spawn_height_m() -> float:
     thigh, shin = 0.383, 0.02 + 0.35
     return 0.26 + 0.165 + 0.04 + thigh * math.cos(_THIGH_RAD) + shin * math.cos(_SHIN_RAD) + 0.075
-
-
-def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
-    attach(spec, MJCF, "humanoid_")
-    add_servos(spec, JOINTS, mode, _SERVO, _TORQUE_NM, _RANGES)
 
 
 def humanoid(control_mode: str = "native") -> RobotSpec:
@@ -316,35 +259,17 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
     Raises:
         ValueError: unknown mode.
     """
-    check_mode("humanoid", control_mode, _MODES)
-    twist = control_mode == "twist"
-    low, high = joint_command_range(control_mode, _TORQUE_NM, _RANGES, 8.0)
-    if twist:
-        low, high = GAIT.command_range()
-    return RobotSpec(
-        name="humanoid",
-        add_to=functools.partial(_add_to, mode=control_mode),
-        base_body="humanoid_torso",
-        base_joint="humanoid_free",
-        actuators=JOINTS,
-        action_low=low,
-        action_high=high,
-        action_names=joint_units(JOINTS, control_mode),
+    return legged_robot(
+        LEGS,
+        control_mode,
         body_width_m=0.42,
         footprint_radius_m=0.35,
         height_m=1.57,
         spawn_height_m=_spawn_height_m(),
         camera=Camera("humanoid_torso", (0.0, 0.0, 0.19)),
-        home_qpos=tuple(zip(JOINTS, _HOME, strict=True)),
-        kind="legged",
         mass_kg=42.116,
         size_m=(0.28, 0.58, 1.56),
         drive_type="2 legs, 17 hinges",
         source="MuJoCo and GibsonEnv humanoid.xml; feet are ours",
-        control_mode=control_mode,
-        control_modes=_MODES,
-        control=gait_law(GAIT) if twist else None,
-        control_every_substep=twist,
         contact_time_constant_s=0.04,
-        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
     )

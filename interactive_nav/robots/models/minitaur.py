@@ -12,35 +12,21 @@ which keep the chains from folding through themselves, and no collisions of the 
 
 from __future__ import annotations
 
-import functools
 import math
+from typing import Any
 
-import mujoco
-
-from interactive_nav.robots.gait import (
-    Gait,
-    Servo,
-    add_servos,
-    attach,
-    check_mode,
-    gait_law,
-    joint_command_range,
-    joint_units,
-)
-from interactive_nav.robots.spec import Camera, RobotSpec, TwistMap
+from interactive_nav.robots.gait import Legged, Servo, legged_robot
+from interactive_nav.robots.spec import Camera, RobotSpec
 
 UPPER_M, LOWER_M = 0.115, 0.2
 HIP_X_M, FOOT_Y_M = 0.21, 0.107
 TOE_RADIUS_M = 0.0125
 TORQUE_NM = 3.5
 HOME_RAD = math.pi / 2
-MAX_LINEAR_M_S = 0.4
-MAX_ANGULAR_RAD_S = 0.5
 _DROP_M = math.sqrt(LOWER_M**2 - UPPER_M**2)
 _KNEE_HOME_RAD = math.atan2(_DROP_M, UPPER_M) - math.pi
 _MOTOR_RANGE = (0.5, 2.7)
 _KNEE_RANGE = (-2.95, -0.6)
-_MODES = ("native", "position", "velocity", "torque", "leg", "twist")
 _LEGS = (("front_left", 1, 1), ("back_left", -1, 1), ("front_right", 1, -1), ("back_right", -1, -1))
 """Name, sign of x, sign of y; the original's order of motors."""
 JOINTS = tuple(f"minitaur_motor_{leg}_{link}" for leg, _, _ in _LEGS for link in ("fore", "aft"))
@@ -119,7 +105,6 @@ MJCF = f"""
 </mujoco>
 """
 
-_SERVO = Servo(stiffness=20.0, damping=0.35, velocity_gain=0.5)
 _FREQUENCY_HZ = 3.24
 _LIFT_RAD = 0.285
 _PRESS = 0.17
@@ -146,21 +131,22 @@ def _reference(phase, command, base, xp):
     return xp.stack(out, -1)
 
 
-GAIT = Gait(
-    robot="minitaur",
+LEGS = Legged(
+    name="minitaur",
+    mjcf=MJCF,
+    base_body="chassis",
     joints=JOINTS,
     home=(HOME_RAD,) * 8,
     ranges=(_MOTOR_RANGE,) * 8,
-    action_scale=(0.4,) * 8,
+    torque_nm=(TORQUE_NM,) * 8,
+    servo=Servo(stiffness=20.0, damping=0.35, velocity_gain=0.5),
+    max_speed_rad_s=30.0,
     frequency_hz=_FREQUENCY_HZ,
     reference=_reference,
-    tracked=tuple(range(8)),
-    max_linear_m_s=MAX_LINEAR_M_S,
-    max_angular_rad_s=MAX_ANGULAR_RAD_S,
-    servo=_SERVO,
-    torque_nm=(TORQUE_NM,) * 8,
-    fall_height_m=0.1,
-    offsets=tuple(range(0, 16, 2)),
+    max_linear_m_s=0.4,
+    max_angular_rad_s=0.5,
+    modes=("native", "position", "velocity", "torque", "leg", "twist"),
+    native="position",
 )
 
 
@@ -171,11 +157,6 @@ def _leg_angles(command, state, xp):
     middle = math.pi - 0.25 * math.pi * (extension + 1.5)
     angles = xp.stack([middle + 0.25 * math.pi * swing, middle - 0.25 * math.pi * swing], -1)
     return xp.clip(angles.reshape((*angles.shape[:-2], 8)), *_MOTOR_RANGE)
-
-
-def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
-    attach(spec, MJCF, "minitaur_")
-    add_servos(spec, JOINTS, "position" if mode == "native" else mode, _SERVO, (TORQUE_NM,) * 8, (_MOTOR_RANGE,) * 8)
 
 
 def minitaur(control_mode: str = "native") -> RobotSpec:
@@ -189,43 +170,23 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
     Raises:
         ValueError: unknown mode.
     """
-    check_mode("minitaur", control_mode, _MODES)
-    twist = control_mode == "twist"
-    joint_mode = "position" if control_mode == "native" else control_mode
-    low, high = joint_command_range(joint_mode, (TORQUE_NM,) * 8, (_MOTOR_RANGE,) * 8, 30.0)
-    names = joint_units(JOINTS, joint_mode)
-    control = None
+    figures: dict[str, Any] = {}
     if control_mode == "leg":
-        low, high, control = (-1.0,) * 8, (1.0,) * 8, _leg_angles
         names = tuple(f"{leg} {what}" for what in ("swing", "extension") for leg, _, _ in _LEGS)
-    if twist:
-        low, high = GAIT.command_range()
-        control = gait_law(GAIT)
-    home = [(f"minitaur_{part}_{leg}_{link}", value) for leg, _, _ in _LEGS for link in ("fore", "aft")
-            for part, value in (("motor", HOME_RAD), ("knee", _KNEE_HOME_RAD))]  # fmt: skip
-    return RobotSpec(
-        name="minitaur",
-        add_to=functools.partial(_add_to, mode=control_mode),
-        base_body="minitaur_chassis",
-        base_joint="minitaur_free",
-        actuators=JOINTS,
-        action_low=low,
-        action_high=high,
-        action_names=names,
+        figures = {"action_low": (-1.0,) * 8, "action_high": (1.0,) * 8, "action_names": names, "control": _leg_angles}
+    parts = (("motor", HOME_RAD), ("knee", _KNEE_HOME_RAD))
+    return legged_robot(
+        LEGS,
+        control_mode,
         body_width_m=0.28,
         footprint_radius_m=0.36,
         height_m=0.23,
         spawn_height_m=_DROP_M + TOE_RADIUS_M,
         camera=Camera("minitaur_chassis", (0.3, 0.0, 0.05)),
-        home_qpos=tuple(home),
-        kind="legged",
+        home_qpos=tuple((joint.replace("motor", part), value) for joint in JOINTS for part, value in parts),
         mass_kg=6.0,
         size_m=(0.65, 0.28, 0.21),
         drive_type="4 closed-chain legs, 8 motors",
         source="GibsonEnv minitaur.urdf; iGibson's motor model",
-        control_mode=control_mode,
-        control_modes=_MODES,
-        control=control,
-        control_every_substep=twist,
-        twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), MAX_LINEAR_M_S, MAX_ANGULAR_RAD_S) if twist else None,
+        **figures,
     )

@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.robots import get_robot
-from interactive_nav.robots.gait import (
-    Gait,
-    Network,
-    base_motion,
-    gait_law,
-    learned_gait,
-    load_network,
-    observe,
-    save_network,
-    scripted_gait,
-)
+from interactive_nav.robots.gait import Legged, base_motion, gait_law
 from interactive_nav.robots.spec import RobotState
 from tests.interactive_nav.robots.motion import extents, hall_world, home_data, move, plain_model, schedule
 
@@ -29,8 +19,8 @@ LEGGED = ("ant", "humanoid", "minitaur")
 NOTHING = RobotState(None, None, None)
 
 
-def gait_of(name: str) -> Gait:
-    return importlib.import_module(f"interactive_nav.robots.models.{name}").GAIT
+def legs_of(name: str) -> Legged:
+    return importlib.import_module(f"interactive_nav.robots.models.{name}").LEGS
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +79,7 @@ def test_humanoid_masses_by_body():
 @pytest.mark.parametrize("name", LEGGED)
 def test_joint_limits_and_torque_limits_hold_under_full_torque(name):
     mode = "torque" if name == "minitaur" else "native"
-    robot, gait = get_robot(name, mode), gait_of(name)
+    robot, legs = get_robot(name, mode), legs_of(name)
     model = plain_model(name, mode, gravity=False)
     address = [model.joint(j).qposadr[0] for j in robot.actuators]
     dofs = [model.joint(j).dofadr[0] for j in robot.actuators]
@@ -100,7 +90,7 @@ def test_joint_limits_and_torque_limits_hold_under_full_torque(name):
         for _ in range(100):
             data.ctrl[:] = 10.0 * robot.command(action)  # ten times too much: the limits are physical
             mujoco.mj_step(model, data)
-            assert (np.abs(data.qfrc_actuator[dofs]) <= np.array(gait.torque_nm) * (1 + 1e-6)).all()
+            assert (np.abs(data.qfrc_actuator[dofs]) <= np.array(legs.torque_nm) * (1 + 1e-6)).all()
             reached.append(data.qpos[address].copy())
         # MuJoCo's limits are soft: a joint that runs into one at full speed overshoots, and is then held.
         over = np.maximum(ranges[:, 0] - reached, reached - ranges[:, 1])[-20:]
@@ -259,36 +249,19 @@ def test_base_motion_by_hand():
 
 
 @pytest.mark.parametrize("name", LEGGED)
-def test_a_network_corrects_the_script_alike_on_host_and_device(name, tmp_path):
-    gait, rng = gait_of(name), np.random.default_rng(0)
-    sizes = (gait.observation_size, 16, len(gait.joints))
-    layers = tuple(
-        (rng.normal(size=(a, b)) / math.sqrt(a), rng.normal(size=b)) for a, b in zip(sizes, sizes[1:], strict=False)
-    )
-    network = Network(rng.normal(size=sizes[0]), rng.uniform(0.5, 2, sizes[0]), layers)
-    save_network(network, tmp_path / "net.npz")
-    read = load_network(tmp_path / "net.npz")
-    robot = get_robot(name, "twist")
-    model = plain_model(name, "twist")
-    data = home_data(model, robot)
-    qpos = data.qpos + 0.05 * rng.normal(size=(3, model.nq))
-    state = RobotState(qpos, rng.normal(size=(3, model.nv)), np.array([0.0, 0.13, 2.0]))
+def test_a_gait_asks_alike_on_host_and_device_and_within_the_ranges(name):
+    legs, rng = legs_of(name), np.random.default_rng(0)
+    data = home_data(plain_model(name, "twist"), get_robot(name, "twist"))
+    qpos = data.qpos + 0.05 * rng.normal(size=(3, len(data.qpos)))
+    state = RobotState(qpos, rng.normal(size=(3, len(data.qvel))), np.array([0.0, 0.13, 2.0]))
     command = rng.uniform(-0.2, 0.2, (3, 2))
-    seen = observe(gait, command, state, np)
-    assert seen.shape == (3, gait.observation_size)
-    # Weights travel as half precision.
-    np.testing.assert_allclose(read(seen, np), network(seen, np), atol=0.03)
-    zero = Network(network.mean, network.deviation, ((layers[0]), (0 * layers[1][0], 0 * layers[1][1])))
-    script = scripted_gait(gait)(command, state, np)
-    np.testing.assert_allclose(learned_gait(gait, zero)(command, state, np), script)
-    corrected = learned_gait(gait, read)(command, state, np)
-    assert np.abs(corrected - script).max() > 0.01
-    assert (np.abs(corrected - script) <= np.array(gait.action_scale) + 1e-9).all()
-    on_device = learned_gait(gait, read)(jnp.asarray(command), RobotState(*map(jnp.asarray, state)), jnp)
-    np.testing.assert_allclose(on_device, corrected, atol=2e-4)
-    low, high = np.array(gait.ranges).T
-    assert (corrected >= low).all() and (corrected <= high).all()
-    assert gait_law(gait)(command, state, np).shape == corrected.shape
+    targets = gait_law(legs)(command, state, np)
+    low, high = np.array(legs.ranges).T
+    assert targets.shape == (3, len(legs.home))
+    assert (targets >= low).all() and (targets <= high).all()
+    assert np.abs(targets - legs.home).max() > 0.01
+    on_device = gait_law(legs)(jnp.asarray(command), RobotState(*map(jnp.asarray, state)), jnp)
+    np.testing.assert_allclose(on_device, targets, atol=2e-4)
 
 
 def test_unknown_modes_are_answered_with_the_list():

@@ -8,6 +8,7 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.robot_study import evidence
+from interactive_nav.robot_study.hall import LOADS, box, hall
 from interactive_nav.robot_study.picture import picture, stage
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav.robots.__main__ import main
@@ -35,7 +36,7 @@ def _simulate(robot, model, data, action, seconds):
 
 def _alone(robot):
     """The robot alone in an empty hall, at home: model and data."""
-    world = build_world(robot, (evidence.hall(()),), NavConfig(num_objects=0))
+    world = build_world(robot, (hall(()),), NavConfig(num_objects=0))
     model = world.models[0]
     data = mujoco.MjData(model)
     data.qpos[:] = world.rest_qpos[0]
@@ -85,9 +86,9 @@ def test_a_broken_robot_fails_its_evidence(monkeypatch):
 def test_pushing_at_constant_speed_balances_the_floors_friction(name):
     # The floor gives mu (m g - lift), lift being the upward part of the robot's force; at constant speed the
     # robot's horizontal force equals it. Vectors from the contact sensors, means over 2 s.
-    robot, load = get_robot(name, "twist"), evidence.LOADS[1 if name != "turtlebot" else 0]
+    robot, load = get_robot(name, "twist"), LOADS[1 if name != "turtlebot" else 0]
     front = 0.6
-    scene = evidence.hall((evidence._box(load, front + load.half_m[0], 0.0),))
+    scene = hall((box(load, front + load.half_m[0], 0.0),))
     world = build_world(robot, (scene,), NavConfig(num_objects=0))
     model = world.models[0]
     data = mujoco.MjData(model)

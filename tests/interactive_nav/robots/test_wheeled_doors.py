@@ -7,7 +7,7 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robot_study import evidence
+from interactive_nav.robot_study.hall import hall
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Hinge, Movable
 from interactive_nav.scenes.world import build_world
@@ -48,7 +48,7 @@ class _Stage:
 
     def __init__(self, robot, door):
         config = NavConfig(backend="native", num_objects=0, sleep=False, threads=1)
-        self.robot, self.world = robot, build_world(robot, (evidence.hall((door,)),), config)
+        self.robot, self.world = robot, build_world(robot, (hall((door,)),), config)
         self._step = jax.jit(make_physics(self.world, config).step)
         qpos = self.world.rest_qpos[0].copy()
         qpos[:7] = [0, 0, robot.spawn_height_m, 1, 0, 0, 0]

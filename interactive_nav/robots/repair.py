@@ -1,0 +1,213 @@
+"""A user's parsed robot file in, the same made fit for the task's physics out; every change is warned of.
+
+What is needed and may lack is put right: wheels become spheres that roll on the floor only, with a box in front of
+furniture; cylinders become boxes; links without inertia take their shapes'; driven joints get a servo. Actuators,
+sensors and options of the file go.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from interactive_nav.robots.build import Joint, WheeledBase
+
+_GEOM = mujoco.mjtGeom
+_STIFFNESS_PER_EFFORT = 10.0
+"""Position servo of a joint: its torque limit is reached at an error of 0.1 rad (m)."""
+_WHEEL_FRICTION = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Wheel:
+    """A driven wheel, as the file has it."""
+
+    joint: str
+    side: int
+    body: str
+    pos_m: np.ndarray
+    """In the base's frame."""
+    radius_m: float
+    half_width_m: float
+    backwards: bool
+    """The joint's axis points right: its positive speed rolls backwards."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What the file itself says, at its zero pose, in the base's frame."""
+
+    wheels: tuple[Wheel, ...]
+    bottom_m: float
+    """Lowest point of the wheels."""
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=2)
+
+
+def _solid(geom) -> bool:
+    return bool(geom.contype or geom.conaffinity)
+
+
+def find(child: mujoco.MjSpec, path: Path, kind: str, name: str):
+    """The body or joint of a name.
+
+    Raises:
+        ValueError: there is none; the message lists what there is.
+    """
+    found = child.body(name) if kind == "body" else child.joint(name)
+    if found is None:
+        known = [x.name for x in (child.bodies if kind == "body" else child.joints) if x.name not in ("world", "")]
+        raise ValueError(f"robot file {path} has no {kind} named '{name}'; it has {', '.join(known)}")
+    return found
+
+
+def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
+    """Leaves bodies, joints, geoms, sites and cameras; gives the base its free joint, geoms their groups."""
+    child.compiler.fusestatic = False
+    child.compiler.balanceinertia = True
+    child.compiler.boundmass, child.compiler.boundinertia = 1e-4, 1e-7
+    for kind in (child.actuators, child.sensors, child.keys, child.pairs, child.tendons, child.lights):
+        for element in list(kind):
+            child.delete(element)
+    base = find(child, path, "body", base_body)
+    for geom in list(child.worldbody.geoms):
+        child.delete(geom)
+    for other in list(child.worldbody.bodies):
+        if other.name != base.name:
+            raise ValueError(f"robot file {path}: body '{other.name}' is no part of '{base_body}', expected one tree")
+    free = [j for j in base.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
+    if not free:
+        if base.joints:
+            raise ValueError(f"robot file {path}: base body '{base_body}' hangs on a joint, expected it free")
+        base.add_freejoint(name="free")
+    elif not free[0].name:
+        free[0].name = "free"
+    base.pos, base.quat = [0, 0, 0], [1, 0, 0, 0]
+    for k, geom in enumerate(list(child.geoms)):
+        if not geom.name:
+            geom.name = f"{geom.parent.name}_geom_{k}"
+        if _solid(geom) and geom.type == _GEOM.mjGEOM_MESH:
+            raise ValueError(
+                f"robot file {path}: geom '{geom.name}' of body '{geom.parent.name}' collides as a mesh, expected "
+                "boxes, capsules, spheres or cylinders; replace it (meshes may stay as visuals)"
+            )
+        if _solid(geom):
+            geom.group, geom.contype, geom.conaffinity = 3, 1, 0
+        else:
+            geom.group, geom.mass = 2, 0.0
+
+
+def _replace_wheel(child: mujoco.MjSpec, wheel: Wheel, base_body: str) -> None:
+    body = child.body(wheel.body)
+    old = next(g for g in body.geoms if g.group == 3)
+    centre = list(old.pos)
+    child.delete(old)
+    sphere = body.add_geom(name=f"{wheel.body}_roll", type=_GEOM.mjGEOM_SPHERE, size=[wheel.radius_m, 0, 0], pos=centre)
+    sphere.group, sphere.contype, sphere.conaffinity, sphere.mass = 3, 0, 0, 0.0
+    sphere.condim, sphere.friction = 3, [_WHEEL_FRICTION, 0.005, 0.0001]
+    guard = child.body(base_body).add_geom(name=f"{wheel.body}_guard", type=_GEOM.mjGEOM_BOX, pos=wheel.pos_m)
+    guard.size = [0.7 * wheel.radius_m, wheel.half_width_m, 0.7 * wheel.radius_m]
+    guard.group, guard.contype, guard.conaffinity, guard.mass = 3, 1, 0, 0.0
+    guard.friction = [0.3, 0.005, 0.0001]
+
+
+def _replace_cylinder(child: mujoco.MjSpec, geom) -> None:
+    """A regular octagon of four boxes instead."""
+    radius, half, name = float(geom.size[0]), float(geom.size[1]), geom.name
+    body, pos, quat = geom.parent, np.array(geom.pos), np.array(geom.quat)
+    quat = quat / np.linalg.norm(quat)
+    child.delete(geom)
+    for k in range(4):
+        turned = np.zeros(4)
+        angle = k * math.pi / 8
+        mujoco.mju_mulQuat(turned, quat, np.array([math.cos(angle), 0, 0, math.sin(angle)]))
+        box = body.add_geom(name=f"{name}_{k}", type=_GEOM.mjGEOM_BOX, pos=pos, quat=turned)
+        box.size = [radius * math.cos(math.pi / 8), radius * math.sin(math.pi / 8), half]
+        box.group, box.contype, box.conaffinity, box.mass = 3, 1, 0, 0.0
+
+
+def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
+    """Every body's inertia made explicit, so that what is put in for collision weighs nothing."""
+    for body in child.bodies:
+        if body.name == "world" or body.explicitinertial:
+            continue
+        if any(g.group == 3 for g in body.geoms):
+            _warn(f"{path}: body '{body.name}' has no inertia; taken from its shapes at 1000 kg/m3")
+        elif body.joints and body.name != base_body:
+            raise ValueError(f"robot file {path}: moving body '{body.name}' has neither inertia nor collision shapes")
+    model = child.copy().compile()
+    for body in child.bodies:
+        if body.name == "world":
+            continue
+        own = model.body(body.name)
+        body.explicitinertial = True
+        body.mass, body.ipos, body.iquat, body.inertia = own.mass[0], own.ipos, own.iquat, own.inertia
+        body.fullinertia = [math.nan] * 6
+
+
+def complete(
+    path: Path,
+    facts: Facts,
+    base: WheeledBase,
+    base_body: str,
+    casters: tuple[str, ...],
+    torque_limits: Mapping[str, float],
+    child: mujoco.MjSpec,
+) -> None:
+    """Every change to the file, in order; warns of each."""
+    for name, limit in torque_limits.items():
+        child.joint(name).actfrcrange = [-limit, limit]
+    strip(child, path, base_body)
+    _fix_masses(child, path, base_body)
+    for wheel in facts.wheels:
+        _warn(
+            f"{path}: wheel '{wheel.body}' now rolls on the floor as a sphere of radius {wheel.radius_m:g} m and "
+            "meets furniture as a box"
+        )
+        _replace_wheel(child, wheel, base_body)
+        if wheel.backwards:
+            joint = child.joint(wheel.joint)
+            joint.axis = [-v for v in joint.axis]
+    for name in casters:
+        for geom in [g for g in find(child, path, "body", name).geoms if g.group == 3]:
+            if geom.type != _GEOM.mjGEOM_SPHERE:
+                raise ValueError(f"robot file {path}: caster '{name}' is no sphere, expected one")
+            geom.contype, geom.condim, geom.friction = 0, 1, [0.0, 0.0, 0.0]
+    for geom in [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_CYLINDER]:
+        _warn(f"{path}: cylinder '{geom.name}' now collides as four boxes, an octagon")
+        _replace_cylinder(child, geom)
+    for joint in base.joints:
+        _add_servo(child, path, joint)
+
+
+def _add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
+    """The joint's native actuator; gains from its torque limit and speed."""
+    own = child.joint(joint.name)
+    effort = float(own.actfrcrange[1])
+    if not effort > 0:
+        raise ValueError(
+            f"robot file {path}: joint '{joint.name}' has no torque limit; give one (URDF: <limit effort>, "
+            f"MJCF: actuatorfrcrange, or torque_limits={{'{joint.name}': ...}})"
+        )
+    own.actfrclimited = True
+    if joint.side:
+        stiff, damp = 0.0, 5.0 * effort / joint.max_speed
+        # Wheels much lighter than their servo is stiff chatter at the environment's timestep of 0.02 s.
+        least = 0.01 * damp
+    else:
+        stiff = _STIFFNESS_PER_EFFORT * effort
+        damp = 0.12 * stiff
+        least = 2e-4 * stiff
+    if own.armature < least:
+        own.armature = least
+    actuator = child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.gainprm = [stiff or damp] + [0.0] * 9
+    actuator.biasprm = [0.0, -stiff, -damp] + [0.0] * 7
