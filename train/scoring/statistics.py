@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from scipy import stats
 
-from interactive_nav_common.statistics import LEVEL, Contrast, _constant, estimate, p_text, welch
+from interactive_nav_common.statistics import CONFIDENCE, LEVEL, Contrast, _constant, estimate, p_text, welch
 
-CONFIDENCE = 0.95
 SCORES = ("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5")
 
 
@@ -185,6 +184,102 @@ class Finding:
     verdict: str
 
 
+def _verdict(test: Contrast, expected: str) -> str:
+    """What a contrast says to a claim that expects higher, lower or same."""
+    if expected == "same" and test.verdict == "undecided":
+        return "no significant difference"
+    if math.isnan(test.p_value):
+        return "too few runs to test"
+    return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
+
+
+def _compared(
+    means: Sequence[RunMean],
+    claim: str,
+    what: str,
+    expected: str,
+    score: Callable[[RunMean], float],
+    axis: str,
+    left: Any,
+    right: Any,
+    **where: Any,
+) -> Finding:
+    """A claim about two values of an axis; see `contrast`."""
+    test = contrast(means, axis, left, right, score, **where)
+    if test is None:
+        return Finding(claim, what, "-", f"no runs of {left} and {right} to compare")
+    return Finding(claim, what, str(test), _verdict(test, expected))
+
+
+def _ins(run: RunMean) -> float:
+    return run.ins(0.5)
+
+
+def _p_eff(run: RunMean) -> float:
+    return run.scores["path_efficiency"]
+
+
+def _e_eff(run: RunMean) -> float:
+    return run.scores["effort_efficiency"]
+
+
+def _of_algorithms(means: Sequence[RunMean], robots: Sequence[str]) -> Iterator[Finding]:
+    """SAC against the others."""
+    algorithms = {run.algorithm for run in means}
+    for robot in robots:
+        for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
+            what = f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
+            yield _compared(means, "SAC is best overall", what, "higher", _ins, "algorithm", "sac", other, robot=robot)
+
+
+def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
+    """What k_int does to one robot's scores."""
+    by_cell = {
+        cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
+    }
+    best = max(by_cell, key=lambda cell: by_cell[cell])
+    yield Finding(
+        "k_int = 1 is best at alpha = 0",
+        f"{robot}: cell of the highest mean INS_0",
+        f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
+        "holds" if best[2] == 1.0 else "does not hold",
+    )
+    for k, claim, expectations in (
+        (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
+        (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
+    ):
+        for score, name, expected in ((_e_eff, "E_eff", expectations[0]), (_p_eff, "P_eff", expectations[1])):
+            what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
+            yield _compared(means, claim, what, expected, score, "k_int", k, 0.0, robot=robot)
+
+
+def _of_robots(means: Sequence[RunMean]) -> Iterator[Finding]:
+    """Fetch against TurtleBot."""
+    claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
+    for score, name, expected in ((_e_eff, "E_eff", "higher"), (_p_eff, "P_eff", "same")):
+        what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
+        yield _compared(means, claim, what, expected, score, "robot", "fetch", "turtlebot")
+
+
+def _of_effort(means: Sequence[RunMean], robot: str) -> Finding:
+    """The two terms of one robot's E_eff."""
+    chosen = [run.scores for run in means if run.robot == robot]
+    r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
+    what = f"{robot}: Pearson's r over runs"
+    return Finding("The two terms of E_eff are correlated", what, str(r), r.verdict)
+
+
+def _of_splits(rows: pa.Table) -> Finding:
+    """Train against test scenes."""
+    pairs, test = seen_unseen(rows)
+    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
+    result, verdict = "-", "no runs with rows of train and of test scenes"
+    if test is not None:
+        result = str(test)
+        verdict = "too few runs to test" if math.isnan(test.p_value) else _verdict(test, "same")
+    return Finding("Seen and unseen scenes do not differ", what, result, verdict)
+
+
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     """The paper's claims (section V), one comparison a line; those whose runs are missing say so.
 
@@ -193,72 +288,10 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
         split: of the scenes for all but the train/test claim; None: all.
     """
     means = run_means(rows, split)
-    found: list[Finding] = []
-
-    def p_eff(run: RunMean) -> float:
-        return run.scores["path_efficiency"]
-
-    def e_eff(run: RunMean) -> float:
-        return run.scores["effort_efficiency"]
-
-    def compare(claim: str, what: str, expected: str, score: Any, axis: str, left: Any, right: Any, **where: Any):
-        test = contrast(means, axis, left, right, score, **where)
-        if test is None:
-            found.append(Finding(claim, what, "-", f"no runs of {left} and {right} to compare"))
-            return
-        if expected == "same":
-            verdict = "no significant difference" if test.verdict == "undecided" else f"does not hold: {test.verdict}"
-        elif math.isnan(test.p_value):
-            verdict = "too few runs to test"
-        else:
-            names = {expected: "holds", "undecided": "undecided"}
-            verdict = names.get(test.verdict, f"does not hold: {test.verdict}")
-        found.append(Finding(claim, what, str(test), verdict))
-
     robots = sorted({run.robot for run in means})
-    algorithms = sorted({run.algorithm for run in means})
+    found = list(_of_algorithms(means, robots))
     for robot in robots:
-        for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
-            what = f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
-            compare("SAC is best overall", what, "higher", lambda r: r.ins(0.5), "algorithm", "sac", other, robot=robot)
-    for robot in robots:
-        by_cell = {
-            cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
-        }
-        best = max(by_cell, key=lambda cell: by_cell[cell])
-        found.append(
-            Finding(
-                "k_int = 1 is best at alpha = 0",
-                f"{robot}: cell of the highest mean INS_0",
-                f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
-                "holds" if best[2] == 1.0 else "does not hold",
-            )
-        )
-        for k, claim, expectations in (
-            (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
-            (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
-        ):
-            for score, name, expected in ((e_eff, "E_eff", expectations[0]), (p_eff, "P_eff", expectations[1])):
-                what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
-                compare(claim, what, expected, score, "k_int", k, 0.0, robot=robot)
+        found += _of_penalties(means, robot)
     if len(robots) > 1:
-        claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
-        for score, name, expected in ((e_eff, "E_eff", "higher"), (p_eff, "P_eff", "same")):
-            what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
-            compare(claim, what, expected, score, "robot", "fetch", "turtlebot")
-    for robot in robots:
-        chosen = [run.scores for run in means if run.robot == robot]
-        r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
-        what = f"{robot}: Pearson's r over runs"
-        found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
-    pairs, test = seen_unseen(rows)
-    if test is None:
-        result, verdict = "-", "no runs with rows of train and of test scenes"
-    else:
-        result = str(test)
-        verdict = "no significant difference" if test.verdict == "undecided" else f"does not hold: {test.verdict}"
-        if math.isnan(test.p_value):
-            verdict = "too few runs to test"
-    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
-    found.append(Finding("Seen and unseen scenes do not differ", what, result, verdict))
-    return found
+        found += _of_robots(means)
+    return [*found, *(_of_effort(means, robot) for robot in robots), _of_splits(rows)]
