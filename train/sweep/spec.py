@@ -227,7 +227,7 @@ def expand(config: SweepConfig, where: str) -> Sweep:
         for entry in overrides:
             if _matches(entry["where"], values):
                 launch = config_io.overlay(launch, entry["launch"], told, "launch.")
-        run = dataclasses.replace(train.runs.run, name=name, out_dir=str(root / "runs"))
+        run = dataclasses.replace(train.run, name=name, out_dir=str(root / "runs"))
         train = dataclasses.replace(train, run=run)
         validate(train)
         if name in runs:
