@@ -16,12 +16,13 @@ from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError
 from interactive_nav.episodes import load as load_episodes
+from interactive_nav.types import FAILURES
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.rows import write_parquet
 from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
-from train.runs.run_folder import FAILURES, RunFolder, claim
+from train.runs.run_folder import RunFolder, claim
 from train.scoring.evaluation import AUTO_BATCH, LEARNED, add_playing_words, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
 from train.scoring.policies import PLANNERS, YARDSTICKS

@@ -24,8 +24,8 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import build_world, parking_spot
 from interactive_nav.sensing.observation import advance_odometry, rotation_from_quat, waypoints_in_body, wrap_angle
 from interactive_nav.sensing.sensors import Sensors
-from interactive_nav.task.episode_scores import EPISODE_METRICS, episode_scores, score_mass_kg
-from interactive_nav.types import EpisodeStart, GoalField, NavInfo
+from interactive_nav.task.episode_scores import episode_scores, score_mass_kg
+from interactive_nav.types import EPISODE_METRICS, EpisodeStart, GoalField, NavInfo
 
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
