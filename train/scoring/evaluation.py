@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -207,26 +208,10 @@ def write_paths(path: Path, played: dict[str, Episodes], env: Any) -> None:
         np.savez_compressed(file, **arrays)
 
 
-class _progress:
+@contextlib.contextmanager
+def _progress(console: Console, name: str, episodes: int) -> Iterator[Callable[[int, int], None]]:
     """A line that says how many episodes are over."""
-
-    def __init__(self, console: Console, name: str, episodes: int):
-        columns = (
-            SpinnerColumn(),
-            TextColumn(name),
-            TextColumn("{task.fields[status]}"),
-            TimeElapsedColumn(),
-        )
-        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._task = self._bar.add_task("", status="compiling")
-        self._episodes = episodes
-
-    def __enter__(self) -> Callable[[int, int], None]:
-        self._bar.start()
-        return self._show
-
-    def _show(self, finished: int, step: int) -> None:
-        self._bar.update(self._task, status=f"{finished} of {self._episodes} episodes over, step {step}")
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+    columns = (SpinnerColumn(), TextColumn(name), TextColumn("{task.fields[status]}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", status="compiling")
+        yield lambda finished, step: bar.update(task, status=f"{finished} of {episodes} episodes over, step {step}")
