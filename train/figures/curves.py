@@ -8,7 +8,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
 from interactive_nav_common.statistics import estimate
@@ -108,19 +107,14 @@ def cell_curves(cells: Mapping[Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> 
         seeds = set()
         for (robot, algorithm, k_int), runs in sorted(cells.items()):
             colour, marker = style.look(style.ALGORITHMS, algorithm, algorithms)
-            look = _look(k_int, k_ints, colour, marker)
+            look = {"color": colour, "marker": marker, "markersize": 4, **style.look_of(k_int, k_ints)}
             for axis, (key, _) in zip(grid[robots.index(robot)], CELL_CURVES, strict=True):
                 seeds |= _draw_cell(axis, key, [with_goal_rate(lines) for lines in runs], look)
         for row, robot in zip(grid, robots, strict=True):
             for axis, (key, label) in zip(row, CELL_CURVES, strict=True):
                 _label(axis, key, label)
                 axis.set_title(style.robot_name(robot))
-        handles = [
-            Line2D([], [], color=colour, label=style.name_of(a), marker=marker, markersize=4)
-            for a in algorithms
-            for colour, marker in [style.look(style.ALGORITHMS, a, algorithms)]
-        ]
-        handles += [Line2D([], [], label=f"k$_{{int}}$ = {k:g}", **_look(k, k_ints, "0.3", "o")) for k in k_ints]
+        handles = [*style.algorithm_handles(algorithms, 4), *style.k_int_handles(k_ints, 4)]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         figure.suptitle(
             f"training episodes that ended (exploring policy), mean of {style.seeds_text(seeds)}, 95 % t interval\n"
@@ -128,12 +122,6 @@ def cell_curves(cells: Mapping[Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> 
             fontsize=9,
         )
     return figure
-
-
-def _look(k_int: float, k_ints: list[float], colour: Any, marker: str) -> dict[str, Any]:
-    """How a line of one k_int is drawn."""
-    line, fill = style.line_of(k_int, k_ints), style.fill_of(k_int, k_ints)
-    return {"color": colour, "linestyle": line, "marker": marker, "markersize": 4, "fillstyle": fill}
 
 
 def _draw_cell(axis: Any, key: str, runs: Sequence[Sequence[Mapping[str, Any]]], look: dict[str, Any]) -> set[int]:

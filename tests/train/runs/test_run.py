@@ -20,6 +20,7 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import release, take_lock
@@ -370,13 +371,13 @@ def test_failures_are_summed_over_logged_episodes(tmp_path):
 
 def test_a_run_tells_its_command_without_the_machines_folders(monkeypatch):
     monkeypatch.setattr("sys.argv", ["/somewhere/train/__main__.py", "--config", "demo"])
-    assert run_folder.command() == ["train", "--config", "demo"]
+    assert versions.command() == ["train", "--config", "demo"]
     monkeypatch.setattr("sys.argv", ["/somewhere/my_sweep.py"])
-    assert run_folder.command() == ["my_sweep.py"]
+    assert versions.command() == ["my_sweep.py"]
 
 
 def test_the_environment_may_tell_the_commit(monkeypatch):
     monkeypatch.setenv("GIT_COMMIT", "abc1234")
-    assert run_folder.commit() == "abc1234"
+    assert versions.commit() == "abc1234"
     monkeypatch.delenv("GIT_COMMIT")
-    assert run_folder.commit() != "abc1234"
+    assert versions.commit() != "abc1234"
