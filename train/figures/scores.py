@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from interactive_nav_common.statistics import estimate, p_text
 from train.figures import style
 from train.figures.frontier import equal_ins
-from train.scoring.statistics import RunMean, cells, correlation, run_means, seen_unseen
+from train.scoring.statistics import RunMean, cells, correlation, learned_rows, run_means, seen_unseen
 
 ALPHAS = np.linspace(0.0, 1.0, 11)
 DOTS = 3000
@@ -138,7 +138,7 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
     """
     means = run_means(rows, split)
     has = Legend(means)
-    episodes = _learned(rows, split)
+    episodes = learned_rows(rows, split)
     told = "structure_steps" in episodes.column_names
     touched = episodes["structure_steps"].to_numpy() > 0 if told else np.zeros(len(episodes), bool)
     with style.applied():
@@ -343,10 +343,3 @@ def _without_line(handles: list[Line2D]) -> list[Line2D]:
     for handle in handles:
         handle.set_linestyle("")
     return handles
-
-
-def _learned(rows: pa.Table, split: str | None) -> pa.Table:
-    chosen = np.asarray(rows["policy"].to_pylist()) == "learned"
-    if split is not None:
-        chosen &= np.asarray(rows["split"].to_pylist()) == split
-    return rows.filter(pa.array(chosen))

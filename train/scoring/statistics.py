@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from scipy import stats
 
 from interactive_nav_common.statistics import CONFIDENCE, LEVEL, Contrast, _constant, estimate, p_text, welch
@@ -42,6 +43,12 @@ class RunMean:
         return alpha * self.scores["path_efficiency"] + (1.0 - alpha) * self.scores["effort_efficiency"]
 
 
+def learned_rows(rows: pa.Table, split: str | None = None) -> pa.Table:
+    """Those of learned policies, in one part of the scenes or all."""
+    kept = pc.field("policy") == "learned"
+    return rows.filter(kept if split is None else kept & (pc.field("split") == split))
+
+
 def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
     """Means of each learned run over its episodes.
 
@@ -49,10 +56,7 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
         rows: of `train.evaluate`.
         split: train or test scenes; None: all.
     """
-    learned = np.array([policy == "learned" for policy in rows["policy"].to_pylist()], bool)
-    if split is not None:
-        learned &= np.array([s == split for s in rows["split"].to_pylist()], bool)
-    chosen = rows.filter(pa.array(learned))
+    chosen = learned_rows(rows, split)
     names = [name for name in SCORES if name in chosen.column_names]
     keys = ["run", "robot", "algorithm", "k_int", "seed"]
     means = chosen.group_by(keys).aggregate([(name, "mean") for name in names] + [("episode", "count")]).to_pylist()
@@ -194,42 +198,14 @@ def _verdict(test: Contrast, expected: str) -> str:
 
 
 def _compared(
-    means: Sequence[RunMean],
-    claim: str,
-    what: str,
-    expected: str,
-    score: Callable[[RunMean], float],
-    axis: str,
-    left: Any,
-    right: Any,
-    **where: Any,
+    means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **where: Any
 ) -> Finding:
-    """A claim about two values of an axis; see `contrast`."""
-    test = contrast(means, axis, left, right, score, **where)
+    """A claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
+    axis, left, right = sides
+    test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **where)
     if test is None:
         return Finding(claim, what, "-", f"no runs of {left} and {right} to compare")
     return Finding(claim, what, str(test), _verdict(test, expected))
-
-
-def _ins(run: RunMean) -> float:
-    return run.ins(0.5)
-
-
-def _p_eff(run: RunMean) -> float:
-    return run.scores["path_efficiency"]
-
-
-def _e_eff(run: RunMean) -> float:
-    return run.scores["effort_efficiency"]
-
-
-def _of_algorithms(means: Sequence[RunMean], robots: Sequence[str]) -> Iterator[Finding]:
-    """SAC against the others."""
-    algorithms = {run.algorithm for run in means}
-    for robot in robots:
-        for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
-            what = f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
-            yield _compared(means, "SAC is best overall", what, "higher", _ins, "algorithm", "sac", other, robot=robot)
 
 
 def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
@@ -248,25 +224,9 @@ def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
         (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
         (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
     ):
-        for score, name, expected in ((_e_eff, "E_eff", expectations[0]), (_p_eff, "P_eff", expectations[1])):
+        for alpha, name, expected in ((0.0, "E_eff", expectations[0]), (1.0, "P_eff", expectations[1])):
             what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
-            yield _compared(means, claim, what, expected, score, "k_int", k, 0.0, robot=robot)
-
-
-def _of_robots(means: Sequence[RunMean]) -> Iterator[Finding]:
-    """Fetch against TurtleBot."""
-    claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
-    for score, name, expected in ((_e_eff, "E_eff", "higher"), (_p_eff, "P_eff", "same")):
-        what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
-        yield _compared(means, claim, what, expected, score, "robot", "fetch", "turtlebot")
-
-
-def _of_effort(means: Sequence[RunMean], robot: str) -> Finding:
-    """The two terms of one robot's E_eff."""
-    chosen = [run.scores for run in means if run.robot == robot]
-    r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
-    what = f"{robot}: Pearson's r over runs"
-    return Finding("The two terms of E_eff are correlated", what, str(r), r.verdict)
+            yield _compared(means, claim, what, expected, alpha, "k_int", k, 0.0, robot=robot)
 
 
 def _of_splits(rows: pa.Table) -> Finding:
@@ -289,9 +249,21 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     """
     means = run_means(rows, split)
     robots = sorted({run.robot for run in means})
-    found = list(_of_algorithms(means, robots))
+    algorithms = {run.algorithm for run in means}
+    found: list[Finding] = []
+    for robot in robots:
+        for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
+            claim, what = "SAC is best overall", f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
+            found.append(_compared(means, claim, what, "higher", 0.5, "algorithm", "sac", other, robot=robot))
     for robot in robots:
         found += _of_penalties(means, robot)
-    if len(robots) > 1:
-        found += _of_robots(means)
-    return [*found, *(_of_effort(means, robot) for robot in robots), _of_splits(rows)]
+    for alpha, name, expected in ((0.0, "E_eff", "higher"), (1.0, "P_eff", "same")) if len(robots) > 1 else ():
+        claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
+        what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
+        found.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
+    for robot in robots:
+        chosen = [run.scores for run in means if run.robot == robot]
+        r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
+        what = f"{robot}: Pearson's r over runs"
+        found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
+    return [*found, _of_splits(rows)]
