@@ -68,18 +68,11 @@ def presets() -> list[str]:
     return sorted(path.stem for path in PRESET_DIR.glob("*.yaml"))
 
 
-def read_file(name_or_path: str, folder: Path, told: str, what: str, expected: str) -> tuple[Path, Any]:
-    """The nested plain values of a YAML file, by path or by its name among those of a folder.
-
-    Args:
-        name_or_path: a path ends in .yaml or .yml.
-        folder: of the files that have names.
-        told: what messages begin with.
-        what: such a file is, for messages.
-        expected: of a path, for messages.
+def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tuple[Path, Any]:
+    """The nested plain values of a YAML file: a path that ends in .yaml or .yml, or a name among a folder's.
 
     Raises:
-        ConfigError: no such file, or it is not readable as YAML.
+        ConfigError: no such file, or it is not readable as YAML; the message begins with `told`, and calls it `what`.
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
@@ -94,7 +87,7 @@ def read_file(name_or_path: str, folder: Path, told: str, what: str, expected: s
         return path, _parsed(path.read_text(), path.name)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ConfigError(f"{told}cannot read {path} ({reason}); expected {expected}") from None
+        raise ConfigError(f"{told}cannot read {path} ({reason}); expected a YAML file") from None
 
 
 def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
@@ -103,7 +96,7 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
     Raises:
         ConfigError: no such config, or one of its values or an override is wrong.
     """
-    path, plain = read_file(name_or_path, PRESET_DIR, "--config: ", "preset", "a YAML file")
+    path, plain = read_file(name_or_path, PRESET_DIR, "preset", "--config: ")
     config = apply_overrides(from_dict(plain, where=path.name), overrides)
     if not config.run.name:
         run = dataclasses.replace(config.run, name=f"{path.stem}-seed{config.run.seed}")

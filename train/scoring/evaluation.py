@@ -16,8 +16,7 @@ import pyarrow as pa
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from interactive_nav.episodes import EpisodeFile, EpisodeFileError, starts_of
-from interactive_nav_common.errors import ConfigError
+from interactive_nav.episodes import EpisodeFile, starts_of
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
@@ -136,7 +135,7 @@ def evaluate(
     env = player.env
     # Everything that can be refused is refused before the first episode.
     made = make_policies(asked.policies, folder, config, env, asked.checkpoint, asked.deterministic, player.known)
-    starts = _starts(fixed, env) if fixed else None
+    starts = starts_of(fixed, env, "--episode-file") if fixed else None
     turns = np.arange(asked.episodes, dtype=np.int32) % len(env.scenes) if asked.balanced and not fixed else None
     keys = episode_keys(asked.seed, asked.episodes)
     batch = batch or AUTO_BATCH[env.backend]
@@ -158,14 +157,6 @@ def evaluate(
         note = f" ({policy.note})" if isinstance(policy, Planner) and policy.note else ""
         console.print(f"{name}: {asked.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
     return pa.concat_tables(tables), played
-
-
-def _starts(fixed: EpisodeFile, env: Any) -> Any:
-    """Where the episodes of a file start."""
-    try:
-        return starts_of(fixed, env, "--episode-file")
-    except EpisodeFileError as error:
-        raise ConfigError(str(error)) from None
 
 
 def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: EvaluationAsked) -> dict[str, Any]:

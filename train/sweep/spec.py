@@ -138,7 +138,7 @@ def load(name_or_path: str) -> Sweep:
     Raises:
         ConfigError: no such file, or something in it cannot be run.
     """
-    path, plain = config_io.read_file(name_or_path, SWEEP_DIR, "", "sweep", "a YAML file of a sweep")
+    path, plain = config_io.read_file(name_or_path, SWEEP_DIR, "sweep")
     return expand(read(plain, path.name, path.stem), path.name)
 
 
