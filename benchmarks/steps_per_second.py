@@ -32,13 +32,14 @@ import interactive_nav
 from interactive_nav.physics import resolve_backend
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav.types import FAILURES
 from interactive_nav_common.versions import commit
 from train import config_io
 from train.runs.run import train_run
 
 MODES = ("physics", "task", "observed", "simulation", "train")
-COUNTED = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
-"""Failures summed over ended episodes."""
+CHUNK = 20
+"""Steps in one compiled scan."""
 PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
 
 
@@ -119,6 +120,22 @@ def step_of(env: Any, part: str, num_envs: int, batch: Any = None) -> Any:
     return parts[part]
 
 
+def _chunk_of(step: Any, num_envs: int, action_size: int) -> Any:
+    """State and key to the state after `CHUNK` steps of random driving, and what was counted in each."""
+
+    def one(state, key):
+        action = jax.random.uniform(key, (num_envs, action_size), minval=-1.0, maxval=1.0)
+        state = step(state, action)
+        finished = state.info["episode_metrics"]
+        ended = state.info["episode_done"] > 0
+        seen = {k: jnp.sum(jnp.where(ended, finished[k], 0.0)) for k in FAILURES}
+        obs = jax.tree.leaves(state.obs)
+        bad = sum(jnp.sum(~jnp.isfinite(x.astype(jnp.float32))) for x in obs)
+        return state, {**seen, "episodes": ended.sum(), "nonfinite_observations": bad}
+
+    return lambda state, key: jax.lax.scan(one, state, jax.random.split(key, CHUNK))
+
+
 def simulation(
     robot: str,
     scenes: list[str],
@@ -129,7 +146,7 @@ def simulation(
     part: str = "simulation",
     devices: int = 1,
 ) -> dict[str, Any]:
-    """Rate of random driving: chunks of 20 steps, each one compiled scan; the first chunk is not counted.
+    """Rate of random driving: chunks of steps, each one compiled scan; the first chunk is not counted.
 
     `part` leaves things out: `physics` steps the backend alone, `task` adds scores and rewards, `observed` adds the
     observation, `simulation` adds new episodes.
@@ -138,47 +155,31 @@ def simulation(
     batch: Any = AutoResetEnv(env)
     if devices > 1:
         batch = ShardedEnv(batch, jax.devices()[:devices])
-    step = step_of(env, part, num_envs, batch)
-    chunk = 20
-
-    def advance(state, key):
-        def one(state, key):
-            action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
-            state = step(state, action)
-            finished = state.info["episode_metrics"]
-            ended = state.info["episode_done"] > 0
-            seen = {k: jnp.sum(jnp.where(ended, finished[k], 0.0)) for k in COUNTED}
-            obs = jax.tree.leaves(state.obs)
-            bad = sum(jnp.sum(~jnp.isfinite(x.astype(jnp.float32))) for x in obs)
-            return state, {**seen, "episodes": ended.sum(), "nonfinite_observations": bad}
-
-        return jax.lax.scan(one, state, jax.random.split(key, chunk))
-
+    advance = _chunk_of(step_of(env, part, num_envs, batch), num_envs, env.action_size)
     state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
     clock = time.perf_counter()
     # Not donated: the first state may share buffers with constants.
     program = jax.jit(advance).lower(state, jax.random.PRNGKey(1)).compile()
     state, _ = jax.block_until_ready(program(state, jax.random.PRNGKey(1)))
     compile_s = time.perf_counter() - clock
-    rates, totals = [], {name: 0.0 for name in (*COUNTED, "episodes", "nonfinite_observations")}
+    rates, totals = [], {name: 0.0 for name in (*FAILURES, "episodes", "nonfinite_observations")}
     memory = [_gpu_memory_mib()]
-    for i in range(max(1, steps // chunk)):
+    for i in range(max(1, steps // CHUNK)):
         clock = time.perf_counter()
         state, seen = jax.block_until_ready(program(state, jax.random.PRNGKey(2 + i)))
-        rates.append(chunk * num_envs / (time.perf_counter() - clock))
+        rates.append(CHUNK * num_envs / (time.perf_counter() - clock))
         for name in totals:
             totals[name] += float(seen[name].sum())
         if i % 10 == 0:
             memory.append(_gpu_memory_mib())
-    nav = state.info["nav"]
-    physics = env.physics
+    nav, physics = state.info["nav"], env.physics
     return {
         "env_steps_per_s": round(statistics.median(rates)),
         "compile_s": round(compile_s, 1),
-        "steps": chunk * len(rates),
-        "env_steps": chunk * len(rates) * num_envs,
+        "steps": CHUNK * len(rates),
+        "env_steps": CHUNK * len(rates) * num_envs,
         **totals,
-        "running": {name: int(getattr(nav, name).sum()) for name in COUNTED if hasattr(nav, name)},
+        "running": {name: int(getattr(nav, name).sum()) for name in FAILURES if hasattr(nav, name)},
         "peak_memory_mib": _peak_memory_mib(),
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "contacts_per_env": getattr(physics, "contacts_per_env", None),

@@ -11,20 +11,15 @@ from typing import Any
 
 from interactive_nav_common.errors import ConfigError
 
-BACKENDS = ("auto", "warp", "jax", "native")
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
 SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar")
 """Parts of the state vector."""
 IMAGES = ("depth", "segmentation")
-RENDERERS = ("auto", "warp", "rays")
-IMAGE_DTYPES = ("float32", "float16", "uint8")
-COLLISIONS = ("boxes", "hulls")
-CONES = ("pyramidal", "elliptic")
-CHOICES = {
-    "backend": BACKENDS,
-    "collision": COLLISIONS,
-    "cone": CONES,
+CHOICES: dict[str, tuple[Any, ...]] = {
+    "backend": ("auto", "warp", "jax", "native"),
+    "collision": ("boxes", "hulls"),
+    "cone": ("pyramidal", "elliptic"),
     "small_objects": ("train", "test"),
     "interaction_with": ("movables", "anything"),
     "kinematic_sum": ("all", "touched"),
@@ -34,8 +29,24 @@ CHOICES = {
     "waypoint_style": ("ahead", "grid"),
     "potential": ("continuous", "quantised"),
     "scene_choice": ("episode", "slot"),
+    "renderer": ("auto", "warp", "rays"),
+    "image_dtype": ("float32", "float16", "uint8"),
+    "segmentation_classes": (4, 5),
 }
-"""Settings that are one of a few words."""
+"""Settings that are one of a few values."""
+_BOUNDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
+    ("num_objects contacts_per_env constraints_per_env threads k_int active_furniture active_small active_doors "
+     "active_walls depth_noise lidar_noise odometry_noise", "0 or more", lambda x: x >= 0),
+    ("episode_steps num_waypoints solver_iterations image_size lidar_rays", "at least 1", lambda x: x >= 1),
+    ("control_dt_s sim_dt_s waypoint_spacing_m nav_cell_m max_goal_distance_m contact_time_constant_s "
+     "score_gravity_m_s2 depth_range_m lidar_range_m", "a positive number", lambda x: x > 0),
+    ("depth_dropout lidar_dropout", "between 0 and 1", lambda x: 0 <= x <= 1),
+    ("success_distance_m", "a positive number or none", lambda x: x is None or x > 0),
+    ("image_fov_deg", "between 0 and 180, or none", lambda x: x is None or 0 < x < 180),
+    ("lidar_fov_deg", "between 0 and 360", lambda x: 0 < x <= 360),
+    ("lidar_pos_m", "three numbers", lambda x: len(x) == 3),
+)  # fmt: skip
+"""Settings with bounds: their names, what is expected, and the test of it."""
 _IDLE: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
     ("active_furniture active_small active_doors active_walls", "backend auto, jax or warp, or 0 (all)",
      lambda c: c.backend != "native"),
@@ -211,68 +222,23 @@ class NavConfig:
         if isinstance(self.objects, (str, Path)):
             refuse("objects", f"a list of object folders; write ['{self.objects}']")
         object.__setattr__(self, "objects", tuple(str(folder) for folder in self.objects))
+        object.__setattr__(self, "lidar_pos_m", tuple(self.lidar_pos_m))
         for field, choices in CHOICES.items():
             if getattr(self, field) not in choices:
-                refuse(field, f"one of {', '.join(choices)}")
+                refuse(field, f"one of {', '.join(map(str, choices))}")
         if self.objects and self.small_objects != "train":
             refuse("small_objects", "train, its default: with objects there are no built-in models to choose from")
         known = (*SIGNALS, *IMAGES)
         unknown = [o for o in self.observations if o not in known]
         if unknown or not self.observations or len(set(self.observations)) != len(self.observations):
             refuse("observations", f"a choice from {', '.join(known)}")
-        for field, choice in (("renderer", RENDERERS), ("image_dtype", IMAGE_DTYPES), ("segmentation_classes", (4, 5))):
-            if getattr(self, field) not in choice:
-                refuse(field, f"one of {', '.join(map(str, choice))}")
-        if self.image_fov_deg is not None and not 0 < self.image_fov_deg < 180:
-            refuse("image_fov_deg", "between 0 and 180, or none")
-        if not 0 < self.lidar_fov_deg <= 360:
-            refuse("lidar_fov_deg", "between 0 and 360")
-        object.__setattr__(self, "lidar_pos_m", tuple(self.lidar_pos_m))
-        if len(self.lidar_pos_m) != 3:
-            refuse("lidar_pos_m", "three numbers")
-        for field in ("depth_dropout", "lidar_dropout"):
-            if not 0 <= getattr(self, field) <= 1:
-                refuse(field, "between 0 and 1")
-        for field in ("depth_noise", "lidar_noise", "odometry_noise"):
-            if not getattr(self, field) >= 0:
-                refuse(field, "0 or more")
-        for field in ("depth_range_m", "lidar_range_m"):
-            if not getattr(self, field) > 0:
-                refuse(field, "a positive number")
-        for field in ("episode_steps", "num_waypoints", "solver_iterations", "image_size", "lidar_rays"):
-            if getattr(self, field) < 1:
-                refuse(field, "at least 1")
-        for field in (
-            "num_objects",
-            "contacts_per_env",
-            "constraints_per_env",
-            "threads",
-            "k_int",
-            "active_furniture",
-            "active_small",
-            "active_doors",
-            "active_walls",
-        ):
-            if not getattr(self, field) >= 0:
-                refuse(field, "0 or more")
-        for field in (
-            "control_dt_s",
-            "sim_dt_s",
-            "waypoint_spacing_m",
-            "nav_cell_m",
-            "max_goal_distance_m",
-            "contact_time_constant_s",
-            "score_gravity_m_s2",
-        ):
-            if not getattr(self, field) > 0:
-                refuse(field, "a positive number")
-        if self.min_goal_distance_m < 0 or self.min_goal_distance_m >= self.max_goal_distance_m:
-            refuse(
-                "min_goal_distance_m",
-                f"0 or more and less than max_goal_distance_m ({self.max_goal_distance_m})",
-            )
-        if self.success_distance_m is not None and not self.success_distance_m > 0:
-            refuse("success_distance_m", "a positive number or none")
+        for names, expected, within in _BOUNDS:
+            for field in names.split():
+                if not within(getattr(self, field)):
+                    refuse(field, expected)
+        if not 0 <= self.min_goal_distance_m < self.max_goal_distance_m:
+            bound = f"0 or more and less than max_goal_distance_m ({self.max_goal_distance_m})"
+            refuse("min_goal_distance_m", bound)
         _refuse_idle(self)
         ratio = self.control_dt_s / self.sim_dt_s
         if abs(ratio - round(ratio)) > 1e-6:

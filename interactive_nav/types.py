@@ -5,6 +5,16 @@ from __future__ import annotations
 import flax.struct
 import jax
 
+FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
+"""Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
+EPISODE_METRICS = (
+    *("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5"),
+    *("robot_path_m", "shortest_path_m", "object_displacement_kg_m", "force_sum_n", "episode_steps"),
+    *(FAILURES[0], "interaction_steps", "structure_steps", *FAILURES[1:]),
+    *("objects_dropped", "off_distance", "lifted"),
+)
+"""What an episode's last step reports, in the order of the columns of rows."""
+
 
 @flax.struct.dataclass
 class SceneTables:

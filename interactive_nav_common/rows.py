@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -12,10 +11,6 @@ import pyarrow.parquet as pq
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
-
-if TYPE_CHECKING:
-    pass
-
 
 IDENTITY = ("run", "robot", "policy", "evaluation_seed", "scene", "episode")
 """Columns that name an episode that was played."""

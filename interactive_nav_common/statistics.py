@@ -6,18 +6,13 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import stats
 
-if TYPE_CHECKING:
-    pass
-
-
 CONFIDENCE = 0.95
-
-
+LEVEL = 0.05
+"""Of significance."""
 RESAMPLES = 10_000
 
 
@@ -38,10 +33,6 @@ def interval(name: str, values: np.ndarray) -> tuple[float, float]:
         rng=np.random.default_rng(0),
     ).confidence_interval
     return float(found.low), float(found.high)
-
-
-LEVEL = 0.05
-"""Of significance."""
 
 
 @dataclasses.dataclass(frozen=True)

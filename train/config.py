@@ -11,7 +11,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav_common.errors import ConfigError
 
 
-def _require(config: Any, names: str, low: float, high: float = math.inf) -> None:
+def require(config: Any, names: str, low: float, high: float = math.inf) -> None:
     """Refuses values (or elements of tuples) outside [low, high]; None is still to be chosen."""
     for name in names.split():
         values = getattr(config, name)
@@ -21,11 +21,12 @@ def _require(config: Any, names: str, low: float, high: float = math.inf) -> Non
                 raise ValueError(f"{name} is {value!r}, expected {interval}")
 
 
-def _require_positive(config: Any, names: str) -> None:
-    """Refuses values that are not finite numbers above 0."""
+def require_positive(config: Any, names: str) -> None:
+    """Refuses values that are not finite numbers above 0; None is still to be chosen."""
     for name in names.split():
-        if not 0.0 < getattr(config, name) < math.inf:
-            raise ValueError(f"{name} is {getattr(config, name)!r}, expected a positive number")
+        value = getattr(config, name)
+        if value is not None and not 0.0 < value < math.inf:
+            raise ValueError(f"{name} is {value!r}, expected a positive number")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +67,7 @@ class NetworkConfig:
     """Arithmetic of the image encoder; parameters stay float32."""
 
     def __post_init__(self) -> None:
-        _require(self, "conv_channels conv_kernels conv_strides image_features state_features action_features", 1)
+        require(self, "conv_channels conv_kernels conv_strides image_features state_features action_features", 1)
         if not len(self.conv_channels) == len(self.conv_kernels) == len(self.conv_strides) > 0:
             raise ValueError(
                 f"conv_channels, conv_kernels and conv_strides have {len(self.conv_channels)}, "
@@ -123,11 +124,11 @@ class PPOConfig:
     """Widths of the value network, behind its encoder if there are images."""
 
     def __post_init__(self) -> None:
-        _require(self, "num_envs unroll_length batch_size num_minibatches num_updates_per_batch", 1)
-        _require(self, "policy_hidden_layer_sizes value_hidden_layer_sizes", 1)
-        _require(self, "entropy_cost vf_loss_coefficient", 0.0)
-        _require(self, "discounting gae_lambda", 0.0, 1.0)
-        _require_positive(self, "learning_rate desired_kl reward_scaling clipping_epsilon max_grad_norm")
+        require(self, "num_envs unroll_length batch_size num_minibatches num_updates_per_batch", 1)
+        require(self, "policy_hidden_layer_sizes value_hidden_layer_sizes", 1)
+        require(self, "entropy_cost vf_loss_coefficient", 0.0)
+        require(self, "discounting gae_lambda", 0.0, 1.0)
+        require_positive(self, "learning_rate desired_kl reward_scaling clipping_epsilon max_grad_norm")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,10 +167,10 @@ class OffPolicyConfig:
     """Layer normalisation in the critics' hidden layers: they stay stable at larger steps."""
 
     def __post_init__(self) -> None:
-        _require(self, "num_envs steps_per_update grad_steps_per_update batch_size min_replay_size max_replay_size", 1)
-        _require(self, "n_steps policy_hidden_layer_sizes q_hidden_layer_sizes", 1)
-        _require(self, "discounting", 0.0, 1.0)
-        _require_positive(self, "replay_limit_gb reward_scaling")
+        require(self, "num_envs steps_per_update grad_steps_per_update batch_size min_replay_size max_replay_size", 1)
+        require(self, "n_steps policy_hidden_layer_sizes q_hidden_layer_sizes", 1)
+        require(self, "discounting", 0.0, 1.0)
+        require_positive(self, "replay_limit_gb reward_scaling")
 
     @property
     def replay_slots(self) -> int:
@@ -197,8 +198,8 @@ class SACConfig(OffPolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, "tau", 0.0, 1.0)
-        _require_positive(self, "actor_learning_rate critic_learning_rate alpha_learning_rate initial_alpha")
+        require(self, "tau", 0.0, 1.0)
+        require_positive(self, "actor_learning_rate critic_learning_rate alpha_learning_rate initial_alpha")
         if not math.isfinite(self.target_entropy_per_action):
             raise ValueError(f"target_entropy_per_action is {self.target_entropy_per_action!r}, expected a number")
 
@@ -226,10 +227,10 @@ class DDPGConfig(OffPolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(self, "target_update_period num_critics", 1)
-        _require(self, "noise_sd", 0.0)
-        _require(self, "tau noise_damping", 0.0, 1.0)
-        _require_positive(self, "actor_learning_rate critic_learning_rate")
+        require(self, "target_update_period num_critics", 1)
+        require(self, "noise_sd", 0.0)
+        require(self, "tau noise_damping", 0.0, 1.0)
+        require_positive(self, "actor_learning_rate critic_learning_rate")
         if len(self.noise_sd) not in (1, 2) or tuple(sorted(self.noise_sd)) != self.noise_sd:
             raise ValueError(f"noise_sd is {self.noise_sd!r}, expected one number, or the least and the largest")
 
@@ -264,9 +265,9 @@ class RunConfig:
     """Project there."""
 
     def __post_init__(self) -> None:
-        _require(self, "seed", 0, 2**32 - 1)
-        _require(self, "num_timesteps log_every_steps checkpoint_every_steps keep_checkpoints", 1)
-        _require(self, "env_state_limit_mb", 0.0)
+        require(self, "seed", 0, 2**32 - 1)
+        require(self, "num_timesteps log_every_steps checkpoint_every_steps keep_checkpoints", 1)
+        require(self, "env_state_limit_mb", 0.0)
         if self.name != Path(self.name).name or self.name == "..":
             raise ValueError(f"name is {self.name!r}, expected one folder name (out_dir says where it lies)")
         if self.checkpoint_every_steps < self.log_every_steps:

@@ -53,16 +53,41 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
 
 def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
     """As `from_dict`, from YAML text."""
+    return from_dict(_parsed(text, where), base, where)
+
+
+def _parsed(text: str, where: str) -> Any:
     try:
-        plain = yaml.safe_load(text)
+        return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError(f"{where}: not readable as YAML: {' '.join(str(error).split())}") from None
-    return from_dict(plain, base, where)
 
 
 def presets() -> list[str]:
     """Names that `--config` knows."""
     return sorted(path.stem for path in PRESET_DIR.glob("*.yaml"))
+
+
+def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tuple[Path, Any]:
+    """The nested plain values of a YAML file: a path that ends in .yaml or .yml, or a name among a folder's.
+
+    Raises:
+        ConfigError: no such file, or it is not readable as YAML; the message begins with `told`, and calls it `what`.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = folder / f"{name_or_path}.yaml"
+        if not path.is_file():
+            known = sorted(file.stem for file in folder.glob("*.yaml"))
+            raise ConfigError(
+                f"{told}no {what} {name_or_path!r}{nearest(name_or_path, known)}; "
+                f"expected one of {', '.join(known)}, or the path of a .yaml file"
+            )
+    try:
+        return path, _parsed(path.read_text(), path.name)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise ConfigError(f"{told}cannot read {path} ({reason}); expected a YAML file") from None
 
 
 def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
@@ -71,20 +96,8 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
     Raises:
         ConfigError: no such config, or one of its values or an override is wrong.
     """
-    path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        path = PRESET_DIR / f"{name_or_path}.yaml"
-        if not path.is_file():
-            raise ConfigError(
-                f"--config: no preset {name_or_path!r}{nearest(name_or_path, presets())}; "
-                f"expected one of {', '.join(presets())}, or the path of a .yaml file"
-            )
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ConfigError(f"--config: cannot read {path} ({reason}); expected a YAML file") from None
-    config = apply_overrides(from_yaml(text, where=path.name), overrides)
+    path, plain = read_file(name_or_path, PRESET_DIR, "preset", "--config: ")
+    config = apply_overrides(from_dict(plain, where=path.name), overrides)
     if not config.run.name:
         run = dataclasses.replace(config.run, name=f"{path.stem}-seed{config.run.seed}")
         config = dataclasses.replace(config, run=run)

@@ -19,9 +19,9 @@ from rich.console import Console
 from interactive_nav.pictures import replay
 from interactive_nav_common.errors import ConfigError, UserError
 from train.config import EnvConfig
-from train.evaluate import LEARNED, load_policy
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
+from train.scoring.evaluation import LEARNED, add_playing_words, make_policies
 from train.scoring.policies import YARDSTICKS
 from train.scoring.rollout import episode_keys
 
@@ -35,18 +35,10 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.replay", description="Records episodes step by step.")
     made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
-    made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
     made.add_argument("--episodes", default="0", metavar="K,K,...", help="which of the fixed episodes (default 0)")
-    made.add_argument("--seed", type=int, default=1_000_000, help="of the fixed episodes (default 1000000)")
     names = ",".join((LEARNED, *YARDSTICKS))
     made.add_argument("--policies", default=LEARNED, help=f"comma-separated choice from {names} (default {LEARNED})")
-    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
-    made.add_argument(
-        "--stochastic",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="sample the learned policy's actions, as `train.evaluate` does (default), or take their mode",
-    )
+    add_playing_words(made)
     made.add_argument("overrides", nargs="*", metavar="env.key=value", help="environment settings to change")
     return made
 
@@ -64,15 +56,14 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         claim(folder.path / "replays")
         env = build_env(config.env)
         keys = episode_keys(arguments.seed, max(episodes) + 1)
-        for name in dict.fromkeys(arguments.policies.split(",")):
-            if name == LEARNED:
-                policy, meta = load_policy(folder, config, env, arguments.checkpoint, not arguments.stochastic)
-                label = f"{config.run.name}, {meta.env_steps:,} steps"
-            elif name in YARDSTICKS:
-                policy, label = YARDSTICKS[name](env), ""
-            else:
+        names = list(dict.fromkeys(arguments.policies.split(",")))
+        for name in names:
+            if name not in (LEARNED, *YARDSTICKS):
                 known = ", ".join((LEARNED, *YARDSTICKS))
                 raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
+        made = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
+        for name, (policy, meta) in made.items():
+            label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
             player = replay.Player(env, policy, name, label)
             for episode in episodes:
                 with console.status(f"{name}, episode {episode}: compiling") as status:

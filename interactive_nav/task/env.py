@@ -24,8 +24,8 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import build_world, parking_spot
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
-from interactive_nav.task.episode_scores import EPISODE_METRICS, episode_scores, score_mass_kg
-from interactive_nav.types import EpisodeStart, GoalField, NavInfo
+from interactive_nav.task.episode_scores import episode_scores, score_mass_kg
+from interactive_nav.types import EPISODE_METRICS, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 
 STILL_M = 1e-4

@@ -11,29 +11,6 @@ from interactive_nav.navigation.placement import DISTANCE_TOLERANCE_M
 from interactive_nav.scenes.world import World
 from interactive_nav.types import NavInfo, SceneTables
 
-EPISODE_METRICS = (
-    "success",
-    "path_efficiency",
-    "effort_efficiency",
-    "kinematic_effort",
-    "dynamic_effort",
-    "ins_0.5",
-    "robot_path_m",
-    "shortest_path_m",
-    "object_displacement_kg_m",
-    "force_sum_n",
-    "episode_steps",
-    "nonfinite",
-    "interaction_steps",
-    "structure_steps",
-    "overflow_steps",
-    "left_out_steps",
-    "unconverged_steps",
-    "objects_dropped",
-    "off_distance",
-    "lifted",
-)
-
 
 def score_mass_kg(world: World, config: NavConfig) -> float:
     """m_0 as the scores take it, kg."""

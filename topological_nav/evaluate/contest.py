@@ -274,8 +274,8 @@ def _digest_of(policy: str) -> str:
 
 
 def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulator, Any]:
-    from train.evaluate import load_policy
     from train.runs.run import make_env as make_trained_env
+    from train.scoring.evaluation import load_policy
 
     folder = RunFolder(run)
     made = folder.read_config()

@@ -8,7 +8,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
 from interactive_nav_common.statistics import estimate
@@ -39,11 +38,7 @@ def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
         for name, lines in runs.items():
             seen = [(line["env_steps"], line[key]) for line in lines if key in line]
             axis.plot(*np.array(seen).reshape(-1, 2).T, label=name, marker="." if len(seen) < 30 else None)
-        if key != "episode/sum_reward":
-            axis.set_ylim(-0.02, 1.02)
-        axis.set_xlabel("environment steps")
-        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axis.set_ylabel(label)
+        _label(axis, key, label)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     figure.suptitle("training episodes (exploring policy), means over log intervals", fontsize=10)
@@ -93,7 +88,11 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
     return (sums[..., high] - sums[..., low]) / (high - low)
 
 
-def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
+Cell = tuple[str, str, float]
+"""Robot, algorithm, k_int."""
+
+
+def cell_curves(cells: Mapping[Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
     """Goals reached, INS_0.5 and reward of training episodes over env steps: a line a cell, with its seeds' interval.
 
     Args:
@@ -108,61 +107,14 @@ def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping
         seeds = set()
         for (robot, algorithm, k_int), runs in sorted(cells.items()):
             colour, marker = style.look(style.ALGORITHMS, algorithm, algorithms)
+            look = {"color": colour, "marker": marker, "markersize": 4, **style.look_of(k_int, k_ints)}
             for axis, (key, _) in zip(grid[robots.index(robot)], CELL_CURVES, strict=True):
-                steps, values = common_curve([with_goal_rate(lines) for lines in runs], key)
-                if not len(steps):
-                    continue
-                values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
-                seeds.add(len(values))
-                points = [estimate(column) for column in values.T]
-                axis.plot(
-                    steps,
-                    [point.mean for point in points],
-                    color=colour,
-                    linestyle=style.line_of(k_int, k_ints),
-                    marker=marker,
-                    markevery=max(1, len(steps) // 6),
-                    markersize=4,
-                    fillstyle=style.fill_of(k_int, k_ints),
-                    linewidth=1.2,
-                )
-                bounds = BOUNDS.get(key, (-np.inf, np.inf))
-                low, high = (np.clip([getattr(p, end) for p in points], *bounds) for end in ("low", "high"))
-                axis.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
+                seeds |= _draw_cell(axis, key, [with_goal_rate(lines) for lines in runs], look)
         for row, robot in zip(grid, robots, strict=True):
             for axis, (key, label) in zip(row, CELL_CURVES, strict=True):
-                if key == GOALS:
-                    axis.set_ylim(bottom=0.0)
-                elif key in BOUNDS:
-                    axis.set_ylim(-0.02, 1.02)
-                axis.set_xlabel("environment steps")
-                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-                axis.set_ylabel(label)
+                _label(axis, key, label)
                 axis.set_title(style.robot_name(robot))
-        handles = [
-            Line2D(
-                [],
-                [],
-                color=style.look(style.ALGORITHMS, a, algorithms)[0],
-                label=style.name_of(a),
-                marker=style.look(style.ALGORITHMS, a, algorithms)[1],
-                markersize=4,
-            )
-            for a in algorithms
-        ]
-        handles += [
-            Line2D(
-                [],
-                [],
-                color="0.3",
-                linestyle=style.line_of(k, k_ints),
-                marker="o",
-                markersize=4,
-                fillstyle=style.fill_of(k, k_ints),
-                label=f"k$_{{int}}$ = {k:g}",
-            )
-            for k in k_ints
-        ]
+        handles = [*style.algorithm_handles(algorithms, 4), *style.k_int_handles(k_ints, 4)]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         figure.suptitle(
             f"training episodes that ended (exploring policy), mean of {style.seeds_text(seeds)}, 95 % t interval\n"
@@ -170,3 +122,28 @@ def cell_curves(cells: Mapping[tuple[str, str, float], Sequence[Sequence[Mapping
             fontsize=9,
         )
     return figure
+
+
+def _draw_cell(axis: Any, key: str, runs: Sequence[Sequence[Mapping[str, Any]]], look: dict[str, Any]) -> set[int]:
+    """One cell's mean and interval over its runs; returns how many there were, nothing where there was nothing."""
+    steps, values = common_curve(runs, key)
+    if not len(steps):
+        return set()
+    values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
+    points = [estimate(column) for column in values.T]
+    axis.plot(steps, [point.mean for point in points], markevery=max(1, len(steps) // 6), linewidth=1.2, **look)
+    bounds = BOUNDS.get(key, (-np.inf, np.inf))
+    low, high = (np.clip([getattr(p, end) for p in points], *bounds) for end in ("low", "high"))
+    axis.fill_between(steps, low, high, color=look["color"], alpha=0.12, linewidth=0)
+    return {len(values)}
+
+
+def _label(axis: Any, key: str, label: str) -> None:
+    """Axes of a metric over environment steps."""
+    if key == GOALS:
+        axis.set_ylim(bottom=0.0)
+    elif key in BOUNDS:
+        axis.set_ylim(-0.02, 1.02)
+    axis.set_xlabel("environment steps")
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axis.set_ylabel(label)

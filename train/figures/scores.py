@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from interactive_nav_common.statistics import estimate, p_text
 from train.figures import style
 from train.figures.frontier import equal_ins
-from train.scoring.statistics import RunMean, cells, correlation, run_means, seen_unseen
+from train.scoring.statistics import RunMean, cells, correlation, learned_rows, run_means, seen_unseen
 
 ALPHAS = np.linspace(0.0, 1.0, 11)
 DOTS = 3000
@@ -34,30 +34,6 @@ class Legend:
         self.algorithms = style.in_order({run.algorithm for run in means})
         self.k_ints = sorted({run.k_int for run in means})
         self.seeds = style.seeds_text({len(runs) for runs in cells(means).values()})
-
-    def algorithm_handles(self) -> list[Line2D]:
-        """For a legend."""
-        found = []
-        for algorithm in self.algorithms:
-            colour, marker = style.look(style.ALGORITHMS, algorithm, self.algorithms)
-            found.append(Line2D([], [], color=colour, marker=marker, markersize=5, label=style.name_of(algorithm)))
-        return found
-
-    def k_int_handles(self) -> list[Line2D]:
-        """For a legend."""
-        return [
-            Line2D(
-                [],
-                [],
-                color="0.3",
-                marker="o",
-                markersize=5,
-                fillstyle=style.fill_of(k, self.k_ints),
-                linestyle=style.line_of(k, self.k_ints),
-                label=f"k$_{{int}}$ = {k:g}",
-            )
-            for k in self.k_ints
-        ]
 
 
 def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
@@ -86,8 +62,7 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
                     marker=marker,
                     markevery=5,
                     markersize=5,
-                    fillstyle=style.fill_of(k_int, has.k_ints),
-                    linestyle=style.line_of(k_int, has.k_ints),
+                    **style.look_of(k_int, has.k_ints),
                 )
                 axis.fill_between(
                     ALPHAS, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.13, linewidth=0
@@ -100,7 +75,7 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
             axis.set_xlabel("α: 0 effort only, 1 path only")
         for axis in grid[0]:
             axis.tick_params(labelbottom=True)
-        handles = [*has.algorithm_handles(), *has.k_int_handles()]
+        handles = [*style.algorithm_handles(has.algorithms), *style.k_int_handles(has.k_ints)]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         figure.suptitle(f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds}, 95 % t interval", fontsize=9)
     return figure
@@ -117,7 +92,7 @@ def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
             _chain(axis, [run for run in means if run.algorithm == algorithm], has.k_ints, colour, marker)
         _yardsticks(axis, rows, robot, split)
         step = _finish_plane(axis)
-        handles = [*has.algorithm_handles(), *_without_line(has.k_int_handles())]
+        handles = [*style.algorithm_handles(has.algorithms), *_without_line(style.k_int_handles(has.k_ints))]
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6))
         axis.set_title(
             f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds}, 95 % t intervals\n"
@@ -149,7 +124,9 @@ def robots_plane(rows: pa.Table, split: str | None) -> Figure:
             Line2D([], [], color=c, marker=m, markersize=5, linestyle="-", label=style.robot_name(robot))
             for robot, (c, m) in looks.items()
         ]
-        figure.legend(handles=[*handles, *_without_line(has.k_int_handles())], loc="outside lower center", ncols=5)
+        figure.legend(
+            handles=[*handles, *_without_line(style.k_int_handles(has.k_ints))], loc="outside lower center", ncols=5
+        )
         figure.suptitle(f"{SPLITS[split]}; mean of {has.seeds}, 95 % t intervals", fontsize=9)
     return figure
 
@@ -161,7 +138,7 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
     """
     means = run_means(rows, split)
     has = Legend(means)
-    episodes = _learned(rows, split)
+    episodes = learned_rows(rows, split)
     told = "structure_steps" in episodes.column_names
     touched = episodes["structure_steps"].to_numpy() > 0 if told else np.zeros(len(episodes), bool)
     with style.applied():
@@ -201,7 +178,7 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
             axis.set_aspect("equal")
         kinds = ((FREE, "episode"), (WALLS, "episode that touched a wall")) if touched.any() else ((FREE, "episode"),)
         dots: list[Any] = [Line2D([], [], color=c, marker=".", linestyle="", label=name) for c, name in kinds]
-        handles = _without_line([*has.algorithm_handles(), *has.k_int_handles()])
+        handles = _without_line([*style.algorithm_handles(has.algorithms), *style.k_int_handles(has.k_ints)])
         figure.legend(handles=[*handles, *dots], loc="outside lower center", ncols=4)
         figure.suptitle(SPLITS[split] or "", fontsize=9)
     return figure
@@ -244,7 +221,7 @@ def seen_and_unseen(rows: pa.Table) -> Figure:
             Line2D([], [], color="0.3", marker="o", linestyle="", fillstyle="full", label="training scenes"),
             Line2D([], [], color="0.3", marker="o", linestyle="", fillstyle="none", label="unseen scenes"),
         ]
-        handles = [*_without_line(has.algorithm_handles()), *handles]
+        handles = [*_without_line(style.algorithm_handles(has.algorithms)), *handles]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     return figure
 
@@ -366,10 +343,3 @@ def _without_line(handles: list[Line2D]) -> list[Line2D]:
     for handle in handles:
         handle.set_linestyle("")
     return handles
-
-
-def _learned(rows: pa.Table, split: str | None) -> pa.Table:
-    chosen = np.asarray(rows["policy"].to_pylist()) == "learned"
-    if split is not None:
-        chosen &= np.asarray(rows["split"].to_pylist()) == split
-    return rows.filter(pa.array(chosen))

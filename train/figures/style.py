@@ -13,6 +13,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.lines import Line2D
 
 BLUE, ORANGE, GREEN, PINK, SKY, VERMILION = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"
 ALGORITHMS = {"ppo": (BLUE, "o"), "sac": (VERMILION, "s"), "ddpg": (GREEN, "^")}
@@ -72,6 +73,26 @@ def line_of(k_int: float, among: list[float]) -> Any:
     """Line style: the higher k_int, the more solid."""
     place = sorted(among).index(k_int)
     return LINES[2] if len(among) == 1 else LINES[min(place, 3)] if len(among) <= 3 else LINES[place % 4]
+
+
+def look_of(k_int: float, among: list[float]) -> dict[str, Any]:
+    """Marker fill and line style of a k_int."""
+    return {"fillstyle": fill_of(k_int, among), "linestyle": line_of(k_int, among)}
+
+
+def algorithm_handles(algorithms: list[str], markersize: float = 5) -> list[Line2D]:
+    """For a legend."""
+    looks = {algorithm: look(ALGORITHMS, algorithm, algorithms) for algorithm in algorithms}
+    return [
+        Line2D([], [], color=colour, marker=marker, markersize=markersize, label=name_of(algorithm))
+        for algorithm, (colour, marker) in looks.items()
+    ]
+
+
+def k_int_handles(k_ints: list[float], markersize: float = 5) -> list[Line2D]:
+    """For a legend."""
+    grey = {"color": "0.3", "marker": "o", "markersize": markersize}
+    return [Line2D([], [], label=f"k$_{{int}}$ = {k:g}", **grey, **look_of(k, k_ints)) for k in k_ints]
 
 
 def policy_colour(policy: str, index: int) -> str:

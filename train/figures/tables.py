@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 
 from interactive_nav_common.statistics import estimate, interval
 from train.figures import style
-from train.scoring.statistics import cells, claims, run_means
+from train.scoring.statistics import cells, claims, learned_rows, run_means
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
@@ -104,8 +104,7 @@ def provenance(rows: pa.Table) -> str:
     names = ("run", "train_env_steps", "checkpoint_steps", "train_wall_s", "train_device", "train_commit", "device")
     if not set(names) <= set(rows.column_names):
         return ""
-    learned = rows.filter(pa.array([policy == "learned" for policy in rows["policy"].to_pylist()]))
-    found = learned.group_by(list(names)).aggregate([("episode", "count")]).to_pylist()
+    found = learned_rows(rows).group_by(list(names)).aggregate([("episode", "count")]).to_pylist()
     lines = [
         (
             row["run"],

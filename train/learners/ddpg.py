@@ -11,6 +11,7 @@ not known (the environment shows a new episode's observation).
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.struct
@@ -18,13 +19,12 @@ import jax
 import jax.numpy as jnp
 import optax
 from brax.envs import Env
-from brax.training import gradients, types
+from brax.training import types
 from brax.training.acme import running_statistics
 from brax.training.networks import FeedForwardNetwork
 
 from train.config import DDPGConfig, TrainConfig
 from train.learners import networks, offpolicy
-from train.learners.learner import Callbacks, TrainResult
 
 
 @flax.struct.dataclass
@@ -158,17 +158,8 @@ class DDPG:
         c = self.config
         critic_loss, actor_loss = make_losses(self.networks, c.reward_scaling, c.discounting)
         policy_optimizer, q_optimizer = self._optimizers
-
-        def own_actor_loss(policy_params: Any, q_params: Any, normalizer_params: Any) -> jax.Array:
-            whole = offpolicy.seeing(policy_params, q_params, self.shared)
-            return actor_loss(whole, normalizer_params, q_params, transitions)
-
-        # No axis to average gradients over: one device.
-        critic_update = gradients.gradient_update_fn(critic_loss, q_optimizer, None)  # type: ignore[arg-type]
-        actor_update = gradients.gradient_update_fn(own_actor_loss, policy_optimizer, None)  # type: ignore[arg-type]
-
         normalizer = learner.normalizer_params
-        critic_loss_value, q_params, q_optimizer_state = critic_update(
+        critic_loss_value, q_params, q_optimizer_state = offpolicy.descend(critic_loss, q_optimizer)(
             learner.q_params,
             offpolicy.seeing(learner.target_policy_params, learner.target_q_params, self.shared),
             normalizer,
@@ -176,23 +167,29 @@ class DDPG:
             transitions,
             optimizer_state=learner.q_optimizer_state,
         )
-        actor_loss_value, policy_params, policy_optimizer_state = actor_update(
-            learner.policy_params, learner.q_params, normalizer, optimizer_state=learner.policy_optimizer_state
+        own_loss = offpolicy.own_actor_loss(actor_loss, self.shared)
+        actor_loss_value, policy_params, policy_optimizer_state = offpolicy.descend(own_loss, policy_optimizer)(
+            learner.policy_params,
+            learner.q_params,
+            normalizer,
+            transitions,
+            optimizer_state=learner.policy_optimizer_state,
         )
         steps = learner.gradient_steps + 1
         tau = jnp.where(steps % c.target_update_period == 0, c.tau, 0.0)
-        q = self.networks.q_network.apply(normalizer, learner.q_params, transitions.observation, transitions.action)
-        metrics = {"critic_loss": critic_loss_value, "actor_loss": actor_loss_value, "q_mean": jnp.mean(q)}
-        return DDPGState(
+        metrics = {
+            "critic_loss": critic_loss_value,
+            "actor_loss": actor_loss_value,
+            "q_mean": offpolicy.mean_q(self.networks.q_network, learner, transitions),
+        }
+        return learner.replace(  # type: ignore[attr-defined]
             policy_optimizer_state=policy_optimizer_state,
             policy_params=policy_params,
             target_policy_params=offpolicy.soft_update(learner.target_policy_params, policy_params, tau),
             q_optimizer_state=q_optimizer_state,
             q_params=q_params,
             target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, tau),
-            normalizer_params=normalizer,
             gradient_steps=steps,
-            key=learner.key,
         ), metrics
 
 
@@ -209,15 +206,8 @@ def make_agent(env: Env, config: TrainConfig) -> DDPG:
     return DDPG(config.ddpg, made, size, env.action_size, offpolicy.shares_encoder(config.network, size))
 
 
-def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-    """Trains a policy, see `offpolicy.train`."""
-    return offpolicy.train(make_agent, env, config, callbacks)
-
-
-def template(env: Env, config: TrainConfig) -> DDPGState:
-    """A learner in the shape of this config's checkpoints."""
-    key = jax.random.PRNGKey(0)
-    return make_agent(env, config).init(key, key)
+train = functools.partial(offpolicy.train, make_agent)
+template = functools.partial(offpolicy.template, make_agent)
 
 
 def policy(env: Env, config: TrainConfig, learner: DDPGState, deterministic: bool) -> types.Policy:

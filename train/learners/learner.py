@@ -138,13 +138,7 @@ def run_loop(
         before = learner
         learner, env_state, update = compiled(learner, env_state)
         if not bool(update.finite):
-            at = Snapshot(done * steps_per_update, before, None)
-            bad = [name for name, loss in sorted(update.losses.items()) if not np.isfinite(loss)]
-            saved = callbacks.on_diverged(at, update)
-            raise DivergedError(
-                f"diverged after env step {at.env_steps}: {', '.join(bad or ['parameters'])} not finite; "
-                f"batch and learner before it are in {saved}; lower the learning rate or mend the batch"
-            )
+            raise _diverged(Snapshot(done * steps_per_update, before, None), update, callbacks)
         done += 1
         interval.append(dataclasses.replace(update, batch=None))
         callbacks.on_update(done * steps_per_update)
@@ -160,6 +154,16 @@ def run_loop(
             callbacks.on_checkpoint(Snapshot(done * steps_per_update, learner, env_state))
             clock = time.perf_counter()
     return TrainResult(Snapshot(done * steps_per_update, learner, env_state), metrics, completed=done >= total)
+
+
+def _diverged(before: Snapshot, update: Update, callbacks: Callbacks) -> DivergedError:
+    """What to raise after an update whose numbers blew up, once that is saved."""
+    bad = [name for name, loss in sorted(update.losses.items()) if not np.isfinite(loss)]
+    saved = callbacks.on_diverged(before, update)
+    return DivergedError(
+        f"diverged after env step {before.env_steps}: {', '.join(bad or ['parameters'])} not finite; "
+        f"batch and learner before it are in {saved}; lower the learning rate or mend the batch"
+    )
 
 
 def interval_metrics(updates: list[Update]) -> dict[str, float]:

@@ -21,9 +21,10 @@ from typing import Any, Protocol
 import flax.struct
 import jax
 import jax.numpy as jnp
+import optax
 from brax.envs import Env
+from brax.training import gradients, types
 from brax.training import networks as brax_networks
-from brax.training import types
 from brax.training.acme import running_statistics
 
 from interactive_nav_common.errors import ConfigError
@@ -256,6 +257,34 @@ def train(
         del empty  # two replays might not fit
     steps_per_update = (agent.config.num_envs or 0) * (agent.config.steps_per_update or 0)
     return run_loop(functools.partial(update, agent, env), begin, steps_per_update, config.run, callbacks)
+
+
+def template(make_agent: Callable[[Env, TrainConfig], Agent], env: Env, config: TrainConfig) -> Any:
+    """A learner in the shape of this config's checkpoints."""
+    key = jax.random.PRNGKey(0)
+    return make_agent(env, config).init(key, key)
+
+
+def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+    """A step down a loss: (params, *rest, optimizer_state=) -> (loss, params, optimizer_state)."""
+    # No axis to average gradients over: one device.
+    return gradients.gradient_update_fn(loss, optimizer, None)  # type: ignore[arg-type]
+
+
+def own_actor_loss(actor_loss: Callable[..., jax.Array], shared: bool) -> Callable[..., jax.Array]:
+    """The policy's loss in what its optimiser moves: (policy_params, q_params, normalizer_params, *rest) -> ()."""
+
+    def loss(policy_params: Any, q_params: Any, normalizer_params: Any, *rest: Any) -> jax.Array:
+        return actor_loss(seeing(policy_params, q_params, shared), normalizer_params, q_params, *rest)
+
+    return loss
+
+
+def mean_q(q_network: brax_networks.FeedForwardNetwork, learner: Any, transitions: types.Transition) -> jax.Array:
+    """() mean value that a learner's critics see in what was done."""
+    return jnp.mean(
+        q_network.apply(learner.normalizer_params, learner.q_params, transitions.observation, transitions.action)
+    )
 
 
 def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:

@@ -11,6 +11,7 @@ environment shows a new episode's observation); it says nothing about the step's
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import flax.struct
@@ -18,14 +19,13 @@ import jax
 import jax.numpy as jnp
 import optax
 from brax.envs import Env
-from brax.training import distribution, gradients, types
+from brax.training import distribution, types
 from brax.training.acme import running_statistics
 from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
 from train.config import SACConfig, TrainConfig
 from train.learners import networks, offpolicy
-from train.learners.learner import Callbacks, TrainResult
 
 
 @flax.struct.dataclass
@@ -101,24 +101,12 @@ class SAC:
         self, learner: SACState, transitions: types.Transition, key: jax.Array
     ) -> tuple[SACState, dict[str, jax.Array]]:
         """Temperature, critics, policy, targets: Brax's step with its keys split in the same places."""
-        c = self.config
         alpha_loss, critic_loss, actor_loss = make_losses(self)
-        alpha_params: Any
         policy_optimizer, q_optimizer, alpha_optimizer = self._optimizers
-
-        def own_actor_loss(policy_params: Any, q_params: Any, normalizer_params: Any, *rest: Any) -> jax.Array:
-            whole = offpolicy.seeing(policy_params, q_params, self.shared)
-            return actor_loss(whole, normalizer_params, q_params, *rest)
-
-        # No axis to average gradients over: one device.
-        alpha_update = gradients.gradient_update_fn(alpha_loss, alpha_optimizer, None)  # type: ignore[arg-type]
-        critic_update = gradients.gradient_update_fn(critic_loss, q_optimizer, None)  # type: ignore[arg-type]
-        actor_update = gradients.gradient_update_fn(own_actor_loss, policy_optimizer, None)  # type: ignore[arg-type]
-
         _, key_alpha, key_critic, key_actor = jax.random.split(key, 4)
         seen_policy = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
-        normalizer = learner.normalizer_params
-        alpha_loss_value, alpha_params, alpha_optimizer_state = alpha_update(
+        normalizer, alpha = learner.normalizer_params, jnp.exp(learner.alpha_params)
+        alpha_loss_value, alpha_params, alpha_optimizer_state = offpolicy.descend(alpha_loss, alpha_optimizer)(
             learner.alpha_params,
             seen_policy,
             normalizer,
@@ -126,8 +114,7 @@ class SAC:
             key_alpha,
             optimizer_state=learner.alpha_optimizer_state,
         )
-        alpha = jnp.exp(learner.alpha_params)
-        critic_loss_value, q_params, q_optimizer_state = critic_update(
+        critic_loss_value, q_params, q_optimizer_state = offpolicy.descend(critic_loss, q_optimizer)(
             learner.q_params,
             seen_policy,
             normalizer,
@@ -137,7 +124,8 @@ class SAC:
             key_critic,
             optimizer_state=learner.q_optimizer_state,
         )
-        actor_loss_value, policy_params, policy_optimizer_state = actor_update(
+        own_loss = offpolicy.own_actor_loss(actor_loss, self.shared)
+        actor_loss_value, policy_params, policy_optimizer_state = offpolicy.descend(own_loss, policy_optimizer)(
             learner.policy_params,
             learner.q_params,
             normalizer,
@@ -146,25 +134,22 @@ class SAC:
             key_actor,
             optimizer_state=learner.policy_optimizer_state,
         )
-        q = self.networks.q_network.apply(normalizer, learner.q_params, transitions.observation, transitions.action)
         metrics = {
             "critic_loss": critic_loss_value,
             "actor_loss": actor_loss_value,
             "alpha_loss": alpha_loss_value,
             "alpha": jnp.exp(alpha_params),
-            "q_mean": jnp.mean(q),
+            "q_mean": offpolicy.mean_q(self.networks.q_network, learner, transitions),
         }
-        return SACState(
+        return learner.replace(  # type: ignore[attr-defined]
             policy_optimizer_state=policy_optimizer_state,
             policy_params=policy_params,
             q_optimizer_state=q_optimizer_state,
             q_params=q_params,
-            target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, c.tau),
+            target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, self.config.tau),
             alpha_optimizer_state=alpha_optimizer_state,
             alpha_params=alpha_params,
-            normalizer_params=normalizer,
             gradient_steps=learner.gradient_steps + 1,
-            key=learner.key,
         ), metrics
 
 
@@ -190,15 +175,8 @@ def make_agent(env: Env, config: TrainConfig) -> SAC:
     return SAC(config.sac, made, size, env.action_size, offpolicy.shares_encoder(config.network, size))
 
 
-def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-    """Trains a policy, see `offpolicy.train`."""
-    return offpolicy.train(make_agent, env, config, callbacks)
-
-
-def template(env: Env, config: TrainConfig) -> SACState:
-    """A learner in the shape of this config's checkpoints."""
-    key = jax.random.PRNGKey(0)
-    return make_agent(env, config).init(key, key)
+train = functools.partial(offpolicy.train, make_agent)
+template = functools.partial(offpolicy.template, make_agent)
 
 
 def policy(env: Env, config: TrainConfig, learner: SACState, deterministic: bool) -> types.Policy:

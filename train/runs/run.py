@@ -20,6 +20,7 @@ from tensorboardX import SummaryWriter
 import interactive_nav
 from interactive_nav.physics import resolve_backend
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav.types import FAILURES
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import locked
@@ -32,7 +33,7 @@ from train.config import EnvConfig, TrainConfig, resolve
 from train.errors import CheckpointError
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs.progress import TrainingDisplay, describe
-from train.runs.run_folder import FAILURES, RunFolder, claim
+from train.runs.run_folder import RunFolder, claim
 from interactive_nav_common.metrics_file import read_metrics
 from interactive_nav_common.versions import versions
 

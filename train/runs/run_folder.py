@@ -31,9 +31,6 @@ MAY_CHANGE = (
 """Settings that a run may be continued with at other values: they do not change what an update does."""
 HEADROOM_MB = 64.0
 
-FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
-"""Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
-
 
 class RunFolder:
     """Paths of a run, and the small files in it."""
@@ -154,9 +151,3 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
             f"{path}: {free_mb:.0f} MB free on its disk, expected {needed_mb:.0f} MB for checkpoints; "
             "make room, or set run.out_dir or run.env_state_limit_mb"
         )
-
-
-
-
-
-

@@ -20,6 +20,7 @@ import scipy.spatial
 
 from interactive_nav.geodesic import clearance, largest_component
 from interactive_nav_common.errors import UserError
+from train.scoring.steering import velocity_towards
 
 CELL_M = 0.05
 MARGIN_M = 0.02
@@ -32,8 +33,6 @@ REPLAN_STEPS = 10
 MOVED_M = 0.02
 LOOK_AHEAD_M = 0.25
 CRUISE_M_S = 0.4
-TURN_GAIN_PER_S = 4.0
-MAX_TURN_RAD_S = 2.0
 ALIGNED_RAD = math.pi / 6
 """Beyond this bearing the planners turn on the spot."""
 FORCED_COST = 1e3
@@ -324,8 +323,4 @@ class Planner:
         offset = target - pos
         bearing = math.atan2(offset[1], offset[0]) - yaw
         bearing = (bearing + math.pi) % (2 * math.pi) - math.pi
-        twist = self._env.robot.twist
-        most = min(MAX_TURN_RAD_S, twist.max_angular_rad_s)
-        turn = float(np.clip(TURN_GAIN_PER_S * bearing, -most, most))
-        speed = min(CRUISE_M_S, twist.max_linear_m_s) * math.cos(bearing) if abs(bearing) < ALIGNED_RAD else 0.0
-        return speed, turn
+        return velocity_towards(self._env.robot.twist, float(bearing), CRUISE_M_S, ALIGNED_RAD, np)

@@ -17,14 +17,13 @@ import jax.numpy as jnp
 from interactive_nav.robots import RobotSpec
 from interactive_nav_common.errors import UserError
 from train.scoring.planners import Planner
+from train.scoring.steering import velocity_towards
 
 Observation = jax.Array | Mapping[str, jax.Array]
 PolicyFn = Callable[[Observation, jax.Array], jax.Array]
 
 LOOK_AHEAD_M = 0.4
 CRUISE_M_S = 0.5
-TURN_GAIN_PER_S = 4.0
-MAX_TURN_RAD_S = 2.0
 ALIGNED_RAD = jnp.pi / 3
 """Beyond this bearing the follower turns on the spot."""
 
@@ -47,10 +46,7 @@ def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
     """
     assert robot.twist is not None
     bearing = jnp.arctan2(target_b[1], target_b[0])
-    most = min(MAX_TURN_RAD_S, robot.twist.max_angular_rad_s)
-    cruise = min(CRUISE_M_S, robot.twist.max_linear_m_s)
-    turn_rad_s = jnp.clip(TURN_GAIN_PER_S * bearing, -most, most)
-    speed_m_s = jnp.where(jnp.abs(bearing) < ALIGNED_RAD, cruise * jnp.cos(bearing), 0.0)
+    speed_m_s, turn_rad_s = velocity_towards(robot.twist, bearing, CRUISE_M_S, ALIGNED_RAD, jnp)
     return robot.drive(speed_m_s, turn_rad_s, jnp)
 
 

@@ -85,7 +85,7 @@ class Player:
         self._chunk = jax.jit(functools.partial(_play_chunk, env))
         self._step = jax.jit(functools.partial(_play_step, env))
         self.known: dict[Any, Any] = {}
-        """Functions of learned policies, by kind: see `train.evaluate.load_policy`."""
+        """Functions of learned policies, by kind: see `train.scoring.evaluation.load_policy`."""
 
     def play(
         self,
@@ -155,17 +155,13 @@ class Player:
         first_episode: int,
     ) -> Episodes:
         """Plays the first `count` of the keys' episodes; the rest fill the batch and are over from the start."""
-        env, size, record = self.env, len(keys), min(record, count)
-        if starts is not None:
-            assert self._reset_to is not None
-            state = self._reset_to(starts, keys)
-        else:
-            state = self._reset(keys) if scene_index is None else self._reset(keys, jnp.asarray(scene_index))
+        size, record = len(keys), min(record, count)
+        state = self._begin(keys, starts, scene_index)
         policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
         first = jax.tree.map(np.asarray, state.info["nav"])
         metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
         object_end = first.object_pos_w.copy()
-        tracks = [[first.robot_pos_w[:record, :2]]]
+        tracks = [first.robot_pos_w[None, :record, :2]]
 
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
@@ -190,23 +186,35 @@ class Player:
             places = np.full((CHUNK_STEPS, record, 2), np.nan, np.float32)
             seen = episode_of < record
             places[:, episode_of[seen]] = np.asarray(track)[:, seen]
-            tracks.append(list(places))
+            tracks.append(places)
             on_progress(int(finished[:count].sum()), step)
             running = np.flatnonzero(~finished[episode_of])
-            if env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
+            if self.env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
                 state = jax.tree.map(operator.itemgetter(running), state)
                 episode_of = episode_of[running]
-        robot_xy = np.stack([place for part in tracks for place in part], 1)
-        longest = np.isfinite(robot_xy[..., 0]).any(0).sum() if record else 0
-        paths = Paths(
-            scene_index=first.scene_index[:record],
-            start_xy_w=first.start_xy_w[:record],
-            goal_xy_w=first.goal_xy_w[:record],
-            robot_xy_w=robot_xy[:, :longest],
-            object_start_w=first.object_pos_w[:record],
-            object_end_w=object_end[:record],
-        )
+        paths = _paths(first, object_end, tracks, record)
         return Episodes(first.scene_index[:count], {name: x[:count] for name, x in metrics.items()}, paths)
+
+    def _begin(self, keys: jax.Array, starts: Any, scene_index: np.ndarray | None) -> Any:
+        """The first states of a batch; see `play`."""
+        if starts is not None:
+            assert self._reset_to is not None
+            return self._reset_to(starts, keys)
+        return self._reset(keys) if scene_index is None else self._reset(keys, jnp.asarray(scene_index))
+
+
+def _paths(first: Any, object_end: np.ndarray, tracks: list[np.ndarray], record: int) -> Paths:
+    """Where the first `record` episodes of a batch began, went and ended; tracks [T, record, 2] follow each other."""
+    robot_xy = np.concatenate(tracks).swapaxes(0, 1)
+    longest = np.isfinite(robot_xy[..., 0]).any(0).sum() if record else 0
+    return Paths(
+        scene_index=first.scene_index[:record],
+        start_xy_w=first.start_xy_w[:record],
+        goal_xy_w=first.goal_xy_w[:record],
+        robot_xy_w=robot_xy[:, :longest],
+        object_start_w=first.object_pos_w[:record],
+        object_end_w=object_end[:record],
+    )
 
 
 def _joined(parts: list[Episodes]) -> Episodes:

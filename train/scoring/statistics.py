@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from scipy import stats
 
-from interactive_nav_common.statistics import LEVEL, Contrast, _constant, estimate, p_text, welch
+from interactive_nav_common.statistics import CONFIDENCE, LEVEL, Contrast, _constant, estimate, p_text, welch
 
-CONFIDENCE = 0.95
 SCORES = ("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5")
 
 
@@ -43,6 +43,12 @@ class RunMean:
         return alpha * self.scores["path_efficiency"] + (1.0 - alpha) * self.scores["effort_efficiency"]
 
 
+def learned_rows(rows: pa.Table, split: str | None = None) -> pa.Table:
+    """Those of learned policies, in one part of the scenes or all."""
+    kept = pc.field("policy") == "learned"
+    return rows.filter(kept if split is None else kept & (pc.field("split") == split))
+
+
 def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
     """Means of each learned run over its episodes.
 
@@ -50,10 +56,7 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
         rows: of `train.evaluate`.
         split: train or test scenes; None: all.
     """
-    learned = np.array([policy == "learned" for policy in rows["policy"].to_pylist()], bool)
-    if split is not None:
-        learned &= np.array([s == split for s in rows["split"].to_pylist()], bool)
-    chosen = rows.filter(pa.array(learned))
+    chosen = learned_rows(rows, split)
     names = [name for name in SCORES if name in chosen.column_names]
     keys = ["run", "robot", "algorithm", "k_int", "seed"]
     means = chosen.group_by(keys).aggregate([(name, "mean") for name in names] + [("episode", "count")]).to_pylist()
@@ -185,6 +188,58 @@ class Finding:
     verdict: str
 
 
+def _verdict(test: Contrast, expected: str) -> str:
+    """What a contrast says to a claim that expects higher, lower or same."""
+    if expected == "same" and test.verdict == "undecided":
+        return "no significant difference"
+    if math.isnan(test.p_value):
+        return "too few runs to test"
+    return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
+
+
+def _compared(
+    means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **where: Any
+) -> Finding:
+    """A claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
+    axis, left, right = sides
+    test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **where)
+    if test is None:
+        return Finding(claim, what, "-", f"no runs of {left} and {right} to compare")
+    return Finding(claim, what, str(test), _verdict(test, expected))
+
+
+def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
+    """What k_int does to one robot's scores."""
+    by_cell = {
+        cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
+    }
+    best = max(by_cell, key=lambda cell: by_cell[cell])
+    yield Finding(
+        "k_int = 1 is best at alpha = 0",
+        f"{robot}: cell of the highest mean INS_0",
+        f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
+        "holds" if best[2] == 1.0 else "does not hold",
+    )
+    for k, claim, expectations in (
+        (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
+        (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
+    ):
+        for alpha, name, expected in ((0.0, "E_eff", expectations[0]), (1.0, "P_eff", expectations[1])):
+            what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
+            yield _compared(means, claim, what, expected, alpha, "k_int", k, 0.0, robot=robot)
+
+
+def _of_splits(rows: pa.Table) -> Finding:
+    """Train against test scenes."""
+    pairs, test = seen_unseen(rows)
+    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
+    result, verdict = "-", "no runs with rows of train and of test scenes"
+    if test is not None:
+        result = str(test)
+        verdict = "too few runs to test" if math.isnan(test.p_value) else _verdict(test, "same")
+    return Finding("Seen and unseen scenes do not differ", what, result, verdict)
+
+
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     """The paper's claims (section V), one comparison a line; those whose runs are missing say so.
 
@@ -193,72 +248,22 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
         split: of the scenes for all but the train/test claim; None: all.
     """
     means = run_means(rows, split)
-    found: list[Finding] = []
-
-    def p_eff(run: RunMean) -> float:
-        return run.scores["path_efficiency"]
-
-    def e_eff(run: RunMean) -> float:
-        return run.scores["effort_efficiency"]
-
-    def compare(claim: str, what: str, expected: str, score: Any, axis: str, left: Any, right: Any, **where: Any):
-        test = contrast(means, axis, left, right, score, **where)
-        if test is None:
-            found.append(Finding(claim, what, "-", f"no runs of {left} and {right} to compare"))
-            return
-        if expected == "same":
-            verdict = "no significant difference" if test.verdict == "undecided" else f"does not hold: {test.verdict}"
-        elif math.isnan(test.p_value):
-            verdict = "too few runs to test"
-        else:
-            names = {expected: "holds", "undecided": "undecided"}
-            verdict = names.get(test.verdict, f"does not hold: {test.verdict}")
-        found.append(Finding(claim, what, str(test), verdict))
-
     robots = sorted({run.robot for run in means})
-    algorithms = sorted({run.algorithm for run in means})
+    algorithms = {run.algorithm for run in means}
+    found: list[Finding] = []
     for robot in robots:
         for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
-            what = f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
-            compare("SAC is best overall", what, "higher", lambda r: r.ins(0.5), "algorithm", "sac", other, robot=robot)
+            claim, what = "SAC is best overall", f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
+            found.append(_compared(means, claim, what, "higher", 0.5, "algorithm", "sac", other, robot=robot))
     for robot in robots:
-        by_cell = {
-            cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
-        }
-        best = max(by_cell, key=lambda cell: by_cell[cell])
-        found.append(
-            Finding(
-                "k_int = 1 is best at alpha = 0",
-                f"{robot}: cell of the highest mean INS_0",
-                f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
-                "holds" if best[2] == 1.0 else "does not hold",
-            )
-        )
-        for k, claim, expectations in (
-            (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
-            (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
-        ):
-            for score, name, expected in ((e_eff, "E_eff", expectations[0]), (p_eff, "P_eff", expectations[1])):
-                what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
-                compare(claim, what, expected, score, "k_int", k, 0.0, robot=robot)
-    if len(robots) > 1:
+        found += _of_penalties(means, robot)
+    for alpha, name, expected in ((0.0, "E_eff", "higher"), (1.0, "P_eff", "same")) if len(robots) > 1 else ():
         claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
-        for score, name, expected in ((e_eff, "E_eff", "higher"), (p_eff, "P_eff", "same")):
-            what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
-            compare(claim, what, expected, score, "robot", "fetch", "turtlebot")
+        what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
+        found.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
     for robot in robots:
         chosen = [run.scores for run in means if run.robot == robot]
         r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
         what = f"{robot}: Pearson's r over runs"
         found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
-    pairs, test = seen_unseen(rows)
-    if test is None:
-        result, verdict = "-", "no runs with rows of train and of test scenes"
-    else:
-        result = str(test)
-        verdict = "no significant difference" if test.verdict == "undecided" else f"does not hold: {test.verdict}"
-        if math.isnan(test.p_value):
-            verdict = "too few runs to test"
-    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
-    found.append(Finding("Seen and unseen scenes do not differ", what, result, verdict))
-    return found
+    return [*found, _of_splits(rows)]

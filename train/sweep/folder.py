@@ -135,15 +135,19 @@ class SweepFolder:
         (self.root / "failed" / f"{run}.json").unlink(missing_ok=True)
 
 
-def last_line(path: Path) -> dict[str, Any]:
-    """The last whole line of a file of JSON lines; empty where there is none."""
+def _tail(path: Path) -> list[str]:
+    """The last lines of a file; none where there is none."""
     try:
         with open(path, "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
-            lines = file.read().decode(errors="replace").splitlines()
+            return file.read().decode(errors="replace").splitlines()
     except OSError:
-        return {}
-    for line in reversed(lines):
+        return []
+
+
+def last_line(path: Path) -> dict[str, Any]:
+    """The last whole line of a file of JSON lines; empty where there is none."""
+    for line in reversed(_tail(path)):
         with contextlib.suppress(ValueError):
             found = json.loads(line)
             if isinstance(found, dict):
@@ -153,13 +157,7 @@ def last_line(path: Path) -> dict[str, Any]:
 
 def log_tail(path: Path, count: int = 6) -> list[str]:
     """The last lines of a log that say something."""
-    try:
-        with open(path, "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
-            lines = file.read().decode(errors="replace").splitlines()
-    except OSError:
-        return []
-    return [line.rstrip() for line in lines if line.strip()][-count:]
+    return [line.rstrip() for line in _tail(path) if line.strip()][-count:]
 
 
 def programs_env() -> dict[str, str]:

@@ -13,7 +13,7 @@ import yaml
 
 from interactive_nav_common.errors import ConfigError
 from train import config_io
-from train.config import TrainConfig, validate
+from train.config import TrainConfig, require, require_positive, validate
 
 SWEEP_DIR = config_io.PRESET_DIR / "sweeps"
 BARE = ("algorithm", "env.robot")
@@ -43,10 +43,8 @@ class EvaluateConfig:
     """Episodes played at a time; auto: by backend."""
 
     def __post_init__(self) -> None:
-        for name, low in (("episodes", 1), ("seed", 0), ("record", 0), ("batch", 1)):
-            value = getattr(self, name)
-            if value is not None and value < low:
-                raise ValueError(f"{name} is {value!r}, expected at least {low}")
+        require(self, "episodes batch", 1)
+        require(self, "seed record", 0)
         if self.checkpoint not in ("best", "last") and not self.checkpoint.isdecimal():
             raise ValueError(f"checkpoint is {self.checkpoint!r}, expected best, last or a number of env steps")
 
@@ -71,13 +69,11 @@ class LaunchConfig:
     """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
 
     def __post_init__(self) -> None:
-        for name, low in (("runs_per_gpu", 1), ("slots", 1), ("cpus_per_run", 1), ("retries", 0), ("grace_s", 0)):
-            if getattr(self, name) < low:
-                raise ValueError(f"{name} is {getattr(self, name)!r}, expected at least {low}")
+        require(self, "runs_per_gpu slots cpus_per_run", 1)
+        require(self, "retries grace_s", 0)
+        require_positive(self, "gpu_memory_gb")
         if not 0.0 < self.jax_memory_share <= 1.0:
             raise ValueError(f"jax_memory_share is {self.jax_memory_share!r}, expected above 0 and at most 1")
-        if self.gpu_memory_gb is not None and self.gpu_memory_gb <= 0:
-            raise ValueError(f"gpu_memory_gb is {self.gpu_memory_gb!r}, expected a positive number")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,22 +138,7 @@ def load(name_or_path: str) -> Sweep:
     Raises:
         ConfigError: no such file, or something in it cannot be run.
     """
-    path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        path = SWEEP_DIR / f"{name_or_path}.yaml"
-        if not path.is_file():
-            near = config_io.nearest(name_or_path, known_sweeps())
-            raise ConfigError(
-                f"no sweep {name_or_path!r}{near}; expected one of {', '.join(known_sweeps())}, "
-                "or the path of a .yaml file"
-            )
-    try:
-        plain = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path.name}: not readable as YAML: {' '.join(str(error).split())}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ConfigError(f"cannot read {path} ({reason}); expected a YAML file of a sweep") from None
+    path, plain = config_io.read_file(name_or_path, SWEEP_DIR, "sweep")
     return expand(read(plain, path.name, path.stem), path.name)
 
 

@@ -20,6 +20,7 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import release, take_lock

@@ -1,0 +1,208 @@
+"""A run and an environment in; every policy's fixed episodes played, as rows and recorded paths, out."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pyarrow as pa
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from interactive_nav.episodes import EpisodeFile, starts_of
+from interactive_nav_common.files import whole_file
+from interactive_nav_common.versions import versions
+from train.config import TrainConfig
+from train.learners.algorithms import ALGORITHMS
+from train.runs import checkpoint
+from train.runs.checkpoint import CheckpointMeta
+from train.runs.run import check_fits
+from train.runs.run_folder import RunFolder
+from train.scoring.planners import Planner
+from train.scoring.policies import PolicyFn, make_yardstick
+from train.scoring.rollout import Episodes, Player, episode_keys
+from train.scoring.row_files import EvaluationAsked
+from train.scoring.rows import episode_table
+
+LEARNED = "learned"
+OF_LEARNED = (
+    *("algorithm", "seed", "checkpoint_steps", "deterministic"),
+    *("train_env_steps", "train_wall_s", "train_device", "train_commit"),
+)
+"""Columns that are empty for a policy that never learned."""
+AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
+"""Episodes played at a time, per physics backend."""
+
+
+def add_playing_words(made: argparse.ArgumentParser) -> None:
+    """The words of a command line that say which policy of a run plays which of the fixed episodes where."""
+    made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
+    made.add_argument("--seed", type=int, default=1_000_000, help="of the fixed episodes (default 1000000)")
+    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
+    made.add_argument(
+        "--stochastic",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="sample the learned policy's actions, as the original did (default), or take their mode",
+    )
+
+
+def load_policy(
+    folder: RunFolder,
+    config: TrainConfig,
+    env: Any,
+    which: str,
+    deterministic: bool,
+    known: dict[Any, Any] | None = None,
+) -> tuple[PolicyFn, CheckpointMeta]:
+    """The policy of a checkpoint.
+
+    Args:
+        folder: of the run.
+        config: of the run.
+        env: to act in.
+        which: best, last or env steps.
+        deterministic: take the mode of the actions.
+        known: filled and used by calls for the same environment: policies of equal networks then share one function,
+            and what is compiled for it.
+
+    Raises:
+        CheckpointError: no such checkpoint, or one of another robot or other observations than `env`'s.
+    """
+    path, meta = checkpoint.find(folder.checkpoints, which)
+    check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)
+    algorithm = ALGORITHMS[config.algorithm]
+    learner = checkpoint.load_learner(path, algorithm.template(env, config))
+
+    def act(learner: Any, observation: Any, key: jax.Array) -> jax.Array:
+        return algorithm.policy(env, config, learner, deterministic)(observation, key)[0]
+
+    kind = (config.algorithm, config.network, getattr(config, config.algorithm), deterministic)
+    act = act if known is None else known.setdefault(kind, act)
+    return jax.tree_util.Partial(act, learner), meta
+
+
+def make_policies(
+    names: Sequence[str],
+    folder: RunFolder | None,
+    config: TrainConfig,
+    env: Any,
+    which: str,
+    deterministic: bool,
+    known: dict[Any, Any] | None = None,
+) -> dict[str, tuple[Any, CheckpointMeta | None]]:
+    """Policies by name, and the checkpoints of those that learned; see `load_policy` and `make_yardstick`."""
+    return {
+        name: load_policy(folder, config, env, which, deterministic, known)
+        if name == LEARNED and folder
+        else (make_yardstick(name, env), None)
+        for name in names
+    }
+
+
+def evaluate(
+    folder: RunFolder | None,
+    config: TrainConfig,
+    player: Player,
+    asked: EvaluationAsked,
+    record: int,
+    console: Console,
+    fixed: EpisodeFile | None = None,
+    batch: int | None = None,
+) -> tuple[pa.Table, dict[str, Episodes]]:
+    """Plays the same fixed episodes with each policy: drawn from a seed, or those of a file.
+
+    Args:
+        folder: of the run; None for policies that never learned.
+        config: of the run, with the environment to evaluate in.
+        player: of that environment.
+        asked: what to play.
+        record: episodes to return paths of.
+        console: for progress.
+        fixed: episodes to play instead of drawn ones.
+        batch: episodes played at a time; None: by backend.
+
+    Returns:
+        Rows of all policies, one an episode; and the episodes by policy.
+    """
+    env = player.env
+    # Everything that can be refused is refused before the first episode.
+    made = make_policies(asked.policies, folder, config, env, asked.checkpoint, asked.deterministic, player.known)
+    starts = starts_of(fixed, env, "--episode-file") if fixed else None
+    turns = np.arange(asked.episodes, dtype=np.int32) % len(env.scenes) if asked.balanced and not fixed else None
+    keys = episode_keys(asked.seed, asked.episodes)
+    batch = batch or AUTO_BATCH[env.backend]
+    where = _origin(folder, config, env, asked)
+    tables, played = [], {}
+    for name, (policy, meta) in made.items():
+        began = time.perf_counter()
+        with _progress(console, name, asked.episodes) as on_progress:
+            played[name] = player.play(
+                policy, keys, record, on_progress, starts, turns, batch, lambda note: console.print(note)
+            )
+        wall_s = time.perf_counter() - began
+        constants = {**where, "policy": name, "evaluation_wall_s": wall_s}
+        if meta:
+            constants["checkpoint_steps"] = meta.env_steps
+        else:
+            constants |= dict.fromkeys(OF_LEARNED)
+        tables.append(episode_table(played[name], env.scenes, constants))
+        note = f" ({policy.note})" if isinstance(policy, Planner) and policy.note else ""
+        console.print(f"{name}: {asked.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
+    return pa.concat_tables(tables), played
+
+
+def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: EvaluationAsked) -> dict[str, Any]:
+    """The columns that say where rows come from, in their order; those that differ by policy are empty."""
+    here, trained = versions(), folder.origin() if folder else {}
+    return {
+        "run": config.run.name,
+        "robot": env.robot.name,
+        "algorithm": config.algorithm,
+        "policy": None,
+        "k_int": float(config.env.k_int),
+        "seed": config.run.seed,
+        "checkpoint_steps": None,
+        "deterministic": asked.deterministic,
+        "evaluation_seed": asked.seed,
+        "backend": env.backend,
+        "device": here["device"]["kind"],
+        "commit": here["commit"],
+        "versions": " ".join(f"{package}={number}" for package, number in here["packages"].items()),
+        "evaluation_wall_s": None,
+        **{f"train_{name}": trained.get(name) for name in ("env_steps", "wall_s", "device", "commit")},
+    }
+
+
+def write_paths(path: Path, played: dict[str, Episodes], env: Any) -> None:
+    """Writes the recorded paths with the scenes' maps, so that a figure needs no scene folder."""
+    arrays: dict[str, Any] = {"policies": np.array(list(played))}
+    for policy, episodes in played.items():
+        for name, value in dataclasses.asdict(episodes.paths).items():
+            arrays[f"{policy}/{name}"] = value
+        arrays[f"{policy}/success"] = episodes.metrics["success"][: len(episodes.paths.scene_index)]
+    for i, scene in enumerate(env.scenes):
+        arrays[f"scene/{i}/name"] = np.array(scene.name)
+        arrays[f"scene/{i}/traversable"] = scene.maps.traversable
+        arrays[f"scene/{i}/furniture"] = env.furniture_map(i)
+        arrays[f"scene/{i}/resolution_m"] = np.array(scene.maps.resolution_m)
+        arrays[f"scene/{i}/origin_w"] = np.array(scene.maps.origin_w)
+        arrays[f"scene/{i}/object_names"] = np.array(env.world.names[i], dtype=str)
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+@contextlib.contextmanager
+def _progress(console: Console, name: str, episodes: int) -> Iterator[Callable[[int, int], None]]:
+    """A line that says how many episodes are over."""
+    columns = (SpinnerColumn(), TextColumn(name), TextColumn("{task.fields[status]}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", status="compiling")
+        yield lambda finished, step: bar.update(task, status=f"{finished} of {episodes} episodes over, step {step}")
