@@ -120,20 +120,16 @@ def distance_field(
     masks = _edge_masks(jnp, free)
     lengths = [resolution * math.hypot(*move) for move in STENCIL]
 
-    def sweep(field):
-        best = field
-        for move, mask, length in zip(STENCIL, masks, lengths, strict=True):
-            candidate = _shifted(jnp, field, *move, jnp.inf) + length
-            best = jnp.where(mask, jnp.minimum(best, candidate), best)
-        return best
-
     def unfinished(carry):
         _, changed, i = carry
         return changed & (i < max_iterations)
 
     def body(carry):
         field, _, i = carry
-        new = sweep(field)
+        new = field
+        for move, mask, length in zip(STENCIL, masks, lengths, strict=True):
+            candidate = _shifted(jnp, field, *move, jnp.inf) + length
+            new = jnp.where(mask, jnp.minimum(new, candidate), new)
         return new, jnp.any(new < field), i + 1
 
     field, _, _ = jax.lax.while_loop(unfinished, body, (start, jnp.asarray(True), 0))
@@ -159,6 +155,21 @@ def clearance(traversable: np.ndarray, resolution_m: float) -> np.ndarray:
     padded = np.pad(np.asarray(traversable, bool), 1)
     distance = np.asarray(scipy.ndimage.distance_transform_edt(padded), float)[1:-1, 1:-1]
     return np.maximum(distance - 0.5, 0.0) * resolution_m
+
+
+def sampled_clearance(traversable: np.ndarray, resolution_m: float, cell_m: float) -> np.ndarray:
+    """[ceil(rows * resolution / cell), ...] metres: `clearance` at the centres of `cell_m` squares, bilinear."""
+    rows, columns = (math.ceil(n * resolution_m / cell_m - 1e-9) for n in traversable.shape)
+    r = (np.arange(rows) + 0.5) * cell_m / resolution_m - 0.5
+    c = (np.arange(columns) + 0.5) * cell_m / resolution_m - 0.5
+    grid = np.meshgrid(r, c, indexing="ij")
+    return scipy.ndimage.map_coordinates(clearance(traversable, resolution_m), grid, order=1, cval=0.0)
+
+
+def cell_centres(cells: np.ndarray, cell_m: float, origin_w: tuple[float, float]) -> np.ndarray:
+    """[n, 2] m, world: centres of the cells [rows along y, columns along x] that are set, row by row."""
+    rows, columns = np.nonzero(cells)
+    return np.asarray(origin_w) + (np.stack([columns, rows], -1) + 0.5) * cell_m
 
 
 def largest_component(free: np.ndarray) -> np.ndarray:
@@ -189,14 +200,7 @@ def navigation_grid(
     Returns:
         [ceil(rows * resolution / cell), ...] bool, the largest connected component only.
     """
-    margin = clearance(traversable, resolution_m)
-    rows, columns = (math.ceil(n * resolution_m / cell_m - 1e-9) for n in traversable.shape)
-    # Bilinear sample of the clearance at the navigation cells' centres, in map cell units.
-    r = (np.arange(rows) + 0.5) * cell_m / resolution_m - 0.5
-    c = (np.arange(columns) + 0.5) * cell_m / resolution_m - 0.5
-    grid = np.meshgrid(r, c, indexing="ij")
-    sampled = scipy.ndimage.map_coordinates(margin, grid, order=1, mode="constant", cval=0.0)
-    return largest_component(sampled >= max(radius_m, 1e-6))
+    return largest_component(sampled_clearance(traversable, resolution_m, cell_m) >= max(radius_m, 1e-6))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -320,6 +324,24 @@ def _seen_corners(
     return np.concatenate(firsts), np.concatenate(seconds)
 
 
+def _nodes(free: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
+    """The node of each coarse cell of `ratio` x `ratio` fine ones, and the nodes' points [n, 2] in fine cells."""
+    rows, columns = (-(-n // ratio) for n in free.shape)
+    margin = np.zeros((rows * ratio, columns * ratio))
+    margin[: free.shape[0], : free.shape[1]] = clearance(free, 1.0)
+    # The node of a cell is the middle of that of its fine cells that lies farthest from what is blocked.
+    split = margin.reshape(rows, ratio, columns, ratio).swapaxes(1, 2).reshape(rows, columns, -1)
+    best = split.argmax(-1)
+    has_node = split.max(-1) > 0
+    r, c = np.nonzero(has_node)
+    own = best[has_node]
+    points = np.stack([c * ratio + own % ratio + 0.5, r * ratio + own // ratio + 0.5], -1)
+    _, nearest = scipy.ndimage.distance_transform_edt(~has_node, return_indices=True)  # type: ignore[misc]
+    index = np.full(has_node.shape, -1, np.int64)
+    index[has_node] = np.arange(len(points))
+    return index[nearest[0], nearest[1]], points
+
+
 def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple[float, float]) -> CornerGraph:
     """Prepares shortest paths from anywhere to anywhere on a map of free cells.
 
@@ -341,21 +363,7 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
     free = largest_component(_without_pinches(np.asarray(free, bool)))
     if not free.any():
         raise ValueError("free has no free cell, expected at least one")
-    rows, columns = (-(-n // ratio) for n in free.shape)
-    margin = np.zeros((rows * ratio, columns * ratio))
-    margin[: free.shape[0], : free.shape[1]] = clearance(free, 1.0)
-    # The node of a cell is the middle of that of its fine cells that lies farthest from what is blocked.
-    split = margin.reshape(rows, ratio, columns, ratio).swapaxes(1, 2).reshape(rows, columns, -1)
-    best = split.argmax(-1)
-    has_node = split.max(-1) > 0
-    r, c = np.nonzero(has_node)
-    own = best[has_node]
-    points = np.stack([c * ratio + own % ratio + 0.5, r * ratio + own // ratio + 0.5], -1)
-    _, nearest = scipy.ndimage.distance_transform_edt(~has_node, return_indices=True)  # type: ignore[misc]
-    index = np.full(has_node.shape, -1, np.int64)
-    index[has_node] = np.arange(len(points))
-    node_of_cell = index[nearest[0], nearest[1]]
-
+    node_of_cell, points = _nodes(free, ratio)
     corners, into = _corners(free)
     count = len(corners)
     i, j = _seen_corners(free, corners, corners, into, 2 * _INSET)

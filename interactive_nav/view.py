@@ -17,7 +17,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from interactive_nav.geodesic import clearance
+from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.navigation.tables import furniture_map
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, pick
@@ -93,20 +93,16 @@ def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np
     maps = scene.maps
     poses = {m.name: (m.pos_w, m.quat_w) for m in scene.movables}
     room_m = clearance(maps.traversable & ~furniture_map(scene, poses, height_m), maps.resolution_m)
-    rows, columns = np.indices(room_m.shape)
-    centres = np.stack([columns + 0.5, rows + 0.5], axis=-1) * maps.resolution_m + maps.origin_w
     places: list[np.ndarray] = []
     for k, radius in enumerate(radii_m):
-        free = room_m >= radius + GAP_M
+        free = cell_centres(room_m >= radius + GAP_M, maps.resolution_m, maps.origin_w)
         for xy, other in zip(places, radii_m, strict=False):
-            free &= np.linalg.norm(centres - xy, axis=-1) > radius + other + GAP_M
-        cells = np.argwhere(free)
-        if not len(cells):
+            free = free[np.linalg.norm(free - xy, axis=-1) > radius + other + GAP_M]
+        if not len(free):
             raise ViewError(
                 f"{scene.name}: no free place for thing {k} of radius {radius:.2f} m; ask for fewer --objects"
             )
-        r, c = cells[rng.integers(len(cells))]
-        places.append(centres[r, c])
+        places.append(free[rng.integers(len(free))])
     return np.array(places).reshape(-1, 2)
 
 

@@ -84,6 +84,37 @@ def _draw_pair(
     return start, goal
 
 
+def _place_small(
+    key: jax.Array,
+    tables: SceneTables,
+    scene: jax.Array,
+    radius_m: jax.Array,
+    kept_free_w: list[jax.Array],
+    robot_radius_m: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Places [k, 2] of the small objects, clear of each other and of a robot at points (2,); and which found one."""
+    count = radius_m.shape[0]
+    if not count:
+        return jnp.zeros((0, 2)), jnp.zeros(0, bool)
+    shape = (count, CLUTTER_CANDIDATES)
+    places = _uniform_places(key, shape, tables.clutter_xy_w[scene], tables.num_clutter[scene], tables.fine_m)
+
+    def place(carry, i):
+        xys, oks = carry
+        xy = places[i]
+        reach = radius_m[i] + CLEARANCE_M
+        gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - radius_m
+        ok = ((gaps > reach) | ~oks).all(-1)
+        for point in kept_free_w:
+            ok &= jnp.linalg.norm(xy - point, axis=-1) > robot_radius_m + reach
+        ok &= tables.num_clutter[scene] > 0
+        best = jnp.argmax(ok)
+        return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None
+
+    placed, _ = jax.lax.scan(place, (jnp.zeros((count, 2)), jnp.zeros(count, bool)), jnp.arange(count))
+    return placed
+
+
 def draw_episode(
     key: jax.Array,
     tables: SceneTables,
@@ -121,33 +152,15 @@ def draw_episode(
         scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
     start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, min_goal_distance_m, max_goal_distance_m)
 
-    count = small_radius_m.shape[0]
-    shape = (count, CLUTTER_CANDIDATES)
-    places = _uniform_places(key_place, shape, tables.clutter_xy_w[scene], tables.num_clutter[scene], tables.fine_m)
-
-    def place(carry, i):
-        xys, oks = carry
-        xy = places[i]
-        reach = small_radius_m[i] + CLEARANCE_M
-        gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - small_radius_m
-        ok = ((gaps > reach) | ~oks).all(-1)
-        ok &= jnp.linalg.norm(xy - start_xy, axis=-1) > robot_radius_m + reach
-        if goal_clear:
-            ok &= jnp.linalg.norm(xy - goal_xy, axis=-1) > robot_radius_m + reach
-        ok &= tables.num_clutter[scene] > 0
-        best = jnp.argmax(ok)
-        return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None
-
-    small_xy, small_placed = jnp.zeros((count, 2)), jnp.zeros((count,), bool)
-    if count:
-        (small_xy, small_placed), _ = jax.lax.scan(place, (small_xy, small_placed), jnp.arange(count))
-    turn = jax.random.uniform(key_turn, (count,), minval=-jnp.pi, maxval=jnp.pi)
+    kept_free = [start_xy, goal_xy] if goal_clear else [start_xy]
+    small_xy, small_placed = _place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)
+    turn = jax.random.uniform(key_turn, small_radius_m.shape, minval=-jnp.pi, maxval=jnp.pi)
     return EpisodeStart(
         scene_index=scene,
         start_xy_w=start_xy,
         start_yaw_rad=jax.random.uniform(key_yaw, (), minval=-jnp.pi, maxval=jnp.pi),
         goal_xy_w=goal_xy,
         small_xy_w=small_xy,
-        small_yaw_rad=turn if random_yaw else jnp.zeros((count,)),
+        small_yaw_rad=turn if random_yaw else jnp.zeros_like(turn),
         small_placed=small_placed,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -9,10 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 
 from interactive_nav.config import NavConfig
-from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
+from interactive_nav.geodesic import CornerGraph, cell_centres, corner_graph, navigation_grid, sampled_clearance
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.placement import CLEARANCE_M
 from interactive_nav.scenes.scene import Scene
@@ -63,13 +63,6 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
     return covered
 
 
-def _sample(values: np.ndarray, resolution_m: float, shape: tuple[int, int], cell_m: float) -> np.ndarray:
-    """Bilinear sample of a map's cell values at the navigation cells' centres."""
-    r = (np.arange(shape[0]) + 0.5) * cell_m / resolution_m - 0.5
-    c = (np.arange(shape[1]) + 0.5) * cell_m / resolution_m - 0.5
-    return scipy.ndimage.map_coordinates(values, np.meshgrid(r, c, indexing="ij"), order=1, cval=0.0)
-
-
 def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
     qpos, layout = world.rest_qpos[index], world.layout
@@ -96,17 +89,14 @@ def _scene_places(
 
     def room(blocked: np.ndarray | bool) -> np.ndarray:
         """Clearance in metres that every point of a fine cell has."""
-        open_m = clearance(maps.traversable & ~np.asarray(blocked), maps.resolution_m)
-        return _sample(open_m, maps.resolution_m, free.shape, fine) - math.sqrt(0.5) * fine
+        open_ = maps.traversable & ~np.asarray(blocked)
+        return sampled_clearance(open_, maps.resolution_m, fine) - math.sqrt(0.5) * fine
 
     furnished = room(furniture_map(scene, rest_poses(world, index), robot.height_m))
     largest = max((o.radius_m for o in world.small_objects), default=0.0)
     needed = robot.footprint_radius_m + CLEARANCE_M
 
-    def centres(mask: np.ndarray) -> np.ndarray:
-        r, c = np.nonzero(mask)
-        return np.stack([maps.origin_w[0] + (c + 0.5) * fine, maps.origin_w[1] + (r + 0.5) * fine], -1)
-
+    centres = functools.partial(cell_centres, cell_m=fine, origin_w=maps.origin_w)
     starts = centres(graph.free & (furnished >= needed))
     # Unless the option says otherwise the robot must fit at the goal too, or one under a sofa could never be reached.
     goals = starts if config.goal_clear else centres(graph.free & (room(False) >= needed))

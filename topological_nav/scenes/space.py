@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 import shapely
 
-from interactive_nav.geodesic import clearance
+from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.topdown import shadow
 from topological_nav.errors import SpaceError
@@ -31,8 +31,7 @@ class FreeSpace:
 
     def centres(self, least_m: float) -> np.ndarray:
         """[n, 2] m, world: centres of the cells with at least this clearance, row by row."""
-        rows, columns = np.nonzero(self.clearance_m >= max(least_m, _FREE_M))
-        return np.asarray(self.origin_w) + (np.stack([columns, rows], -1) + 0.5) * self.resolution_m
+        return cell_centres(self.clearance_m >= max(least_m, _FREE_M), self.resolution_m, self.origin_w)
 
     def at(self, xy_w: np.ndarray) -> np.ndarray:
         """[...] m: clearance of the cells that hold points [..., 2]; 0 outside the map."""
