@@ -15,10 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from converters.bodies.alignment import Alignment, compare, upright
+from converters.bodies.alignment import Alignment
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject, name_objects, place_object, to_world
 from converters.bodies.physical import Physical, physical_properties
+from converters.bodies.placement import compare, upright
 from converters.check.gates import evaluate
 from converters.check.settle import Settled, settle
 from converters.fill.holes import fill_holes
