@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.geometry.boxes import upright_box
+from scenes_mjcf.categories import TABLE
 
 MIN_VOXELS = 60
 """A component of 0.05 m2 of surface; what is smaller and lies on no other is noise."""
@@ -18,19 +19,10 @@ STACKED_SHARE = 0.5
 """Components of one class are one thing when their footprints share this much of the smaller."""
 SAME_BOX_SHARE = 0.5
 """Instances of two classes are one thing when their boxes share this much of the smaller."""
-LABEL_CATEGORIES = {5: "chair", 6: "sofa", 7: "table", 8: "door", 14: "desk", 39: "basket"}
-"""NYU40 id -> category. 39 is 'otherfurniture', where ScanNet's waste baskets are."""
-SIZES_M = {
-    "chair": ((0.35, 1.0), (0.5, 1.4)),
-    "sofa": ((0.7, 3.2), (0.5, 1.2)),
-    "table": ((0.4, 3.0), (0.3, 1.1)),
-    "desk": ((0.6, 2.6), (0.6, 1.4)),
-    "door": ((0.6, 1.3), (1.7, 2.4)),
-    "basket": ((0.15, 0.6), (0.15, 0.8)),
-}
-"""Category -> usual ranges of the longer horizontal side and of the height."""
-LONGEST = {"chair": 1.6, "basket": 2.0, "door": math.inf}
-"""Category -> greatest usual ratio of the sides, of things that stand in rows: a row of chairs is no chair."""
+LABEL_CATEGORIES = {c.labels[0]: c.name for c in sorted(TABLE, key=lambda c: c.labels) if c.labels}
+"""NYU40 id -> category."""
+SIZES_M = {c.name: c.sizes_m for c in TABLE if c.sizes_m is not None}
+LONGEST = {c.name: c.longest for c in TABLE if c.longest is not None}
 FLAT = ("door",)
 """Seen from above a line, whose breadth says nothing."""
 NECK_SHARE = 0.6

@@ -11,10 +11,9 @@ from scipy.spatial import ConvexHull
 
 from converters.geometry.rotations import yaw_matrix
 from converters.propose.pieces import LABEL_CATEGORIES, MIN_VOXELS, PART_SHARE, SIZES_M, Piece, part_by_number
+from scenes_mjcf.categories import TABLE
 
-TOPS_M = {"table": (1.4, 3.2, 1.9), "desk": (1.2, 3.2, 1.9)}
-"""Category -> greatest usual depth, m, greatest and middle ratio of length to depth, of a rectangular top. A long table
-may be two, or one; what is longer than that, or deeper, is several put together."""
+TOPS_M = {c.name: c.top_m for c in TABLE if c.top_m is not None}
 RECTANGULAR = 0.9
 """Least share of its smallest rectangle that a rectangular top fills as scanned; a round one fills 0.785."""
 NOTCH_M = 0.2

@@ -16,9 +16,7 @@ import numpy as np
 
 from converters.generate.models import furniture
 from converters.generate.models.parts import Part
-
-CATID = {"chair": "03001627", "sofa": "04256520", "table": "04379243", "desk": "03179701", "door": "03221720"}
-"""Category -> ShapeNet synset."""
+from scenes_mjcf.categories import CATEGORIES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,4 +137,6 @@ def cad_model(name: str) -> CadModel:
     move = -(low + high) / 2 / unit_m + np.round(shift, 4)
     scaled = tuple(dataclasses.replace(p, vertices=np.round(p.vertices / unit_m + move, 6)) for p in parts)
     category = drawing.category
-    return CadModel(name, category, CATID[category], digest[:32], drawing.sym, drawing.front, scaled, unit_m)
+    return CadModel(
+        name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m
+    )
