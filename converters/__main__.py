@@ -12,23 +12,17 @@ import glob
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
+from typing import TypeAlias
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.progress import stage_progress
 from scenes_mjcf.schema import CATEGORIES
 
 
@@ -38,23 +32,6 @@ class Interrupted(BaseException):
 
 def _on_sigterm(signum: int, frame: FrameType | None) -> None:
     raise Interrupted
-
-
-@contextlib.contextmanager
-def _progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """One bar over the whole work, with the stage's name and the time left."""
-    with Progress(
-        TextColumn("{task.description:<16}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=False,
-    ) as bar:
-        task = bar.add_task("starting", total=1.0)
-        yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
 def _warn_once(console: Console) -> Callable[[str], None]:
@@ -84,7 +61,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         timeout_s=arguments.timeout,
     )
     warn = _warn_once(console)
-    with _progress(console) as report:
+    with stage_progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
     for result in results:
         if any(row.get("n_keypoints") for row in result.manifest.alignment):
@@ -158,7 +135,7 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.generate import generate_building
 
-    with _progress(console) as report:
+    with stage_progress(console) as report:
         generate_building(arguments.out, arguments.seed, report)
     console.print(
         f"{arguments.out}: building of seed {arguments.seed}; convert it with "
@@ -172,7 +149,7 @@ def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
     from converters.recipes import load_recipes, make_scenes
 
     recipes = load_recipes(arguments.recipes or arguments.out / "recipes.yaml")
-    with _progress(console) as report:
+    with stage_progress(console) as report:
         failed = make_scenes(
             recipes,
             arguments.out,
@@ -198,7 +175,7 @@ def _propose(arguments: argparse.Namespace, console: Console) -> int:
     from converters.read.source import read_source
 
     library = (arguments.library or arguments.source) if arguments.auto_align or arguments.library else None
-    with _progress(console) as report:
+    with stage_progress(console) as report:
         raw = read_source(arguments.source, arguments.format)
         found = propose(raw, arguments.output, library, report)
     for table in proposal_tables(found):
@@ -221,6 +198,9 @@ def _positive_number(text: str) -> float:
     return value
 
 
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
 def _add_decompose_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
     command.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
@@ -234,90 +214,113 @@ def _add_decompose_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    convert = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
-    convert.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
-    convert.add_argument(
+def _add_convert(commands: _Commands) -> None:
+    command = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
+    command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
+    command.add_argument(
         "out",
         type=Path,
         metavar="OUT",
         help="scene folder to make, its name becomes the scene's; several floors make OUT_0, OUT_1, ...",
     )
-    convert.add_argument(
+    command.add_argument(
         "--format",
         choices=("auto", "gibson", "interactive-gibson", "scan2cad"),
         default="auto",
         help="layout of SRC (default: told from its files)",
     )
-    convert.add_argument("--split", choices=("train", "test"), default="train", help="recorded in scene.json")
-    convert.add_argument(
+    command.add_argument("--split", choices=("train", "test"), default="train", help="recorded in scene.json")
+    command.add_argument(
         "--jobs",
         type=_positive,
         default=os.cpu_count() or 1,
         metavar="N",
         help="decompositions side by side (default: one a processor)",
     )
-    _add_decompose_options(convert)
-    convert.set_defaults(run=_convert, writes=("{}", "{}_[0-9]*"))
-    convert.add_argument(
+    _add_decompose_options(command)
+    command.set_defaults(run=_convert, writes=("{}", "{}_[0-9]*"))
+    command.add_argument(
         "--auto-align",
         action="store_true",
         help="also fit library models to labelled furniture that has no annotation",
     )
-    convert.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ for --auto-align (default: SRC)")
-    propose = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
-    propose.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
-    propose.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
-    propose.add_argument("--format", choices=("auto", "gibson", "interactive-gibson", "scan2cad"), default="auto")
-    propose.add_argument(
+    command.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ for --auto-align (default: SRC)")
+
+
+def _add_propose(commands: _Commands) -> None:
+    command = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
+    command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
+    command.add_argument("--format", choices=("auto", "gibson", "interactive-gibson", "scan2cad"), default="auto")
+    command.add_argument(
         "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
     )
-    propose.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
-    propose.set_defaults(run=_propose, writes=("{}/proposals.*",))
-    single = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
-    single.add_argument(
+    command.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
+    command.set_defaults(run=_propose, writes=("{}/proposals.*",))
+
+
+def _add_object(commands: _Commands) -> None:
+    command = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
+    command.add_argument(
         "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"
     )
-    single.add_argument("out", type=Path, metavar="OUT", help="folder to make; its name becomes the body's")
-    single.add_argument("--category", choices=CATEGORIES, help="default: told from the file's name, else other")
-    single.add_argument(
+    command.add_argument("out", type=Path, metavar="OUT", help="folder to make; its name becomes the body's")
+    command.add_argument("--category", choices=CATEGORIES, help="default: told from the file's name, else other")
+    command.add_argument(
         "--mass", type=_positive_number, metavar="KG", help="default: the URDF's, else density x volume"
     )
-    single.add_argument(
+    command.add_argument(
         "--friction", type=_positive_number, metavar="MU", help="default: the URDF's, else the category's"
     )
-    single.add_argument("--scale", type=_positive_number, default=1.0, help="of a mesh that is not in metres")
-    single.add_argument(
+    command.add_argument("--scale", type=_positive_number, default=1.0, help="of a mesh that is not in metres")
+    command.add_argument(
         "--up", choices=("z", "y"), default="z", help="axis of the mesh that points up (default z; DAE says it itself)"
     )
-    single.add_argument(
+    command.add_argument(
         "--within", type=Path, metavar="DIR", help="folder that textures are read from (default: the model's own)"
     )
-    _add_decompose_options(single)
-    single.set_defaults(run=_object, writes=("{}",))
-    check = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
-    check.add_argument("scene", type=Path, metavar="SCENE_DIR")
-    check.set_defaults(run=_check, writes=())
-    generate = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
-    generate.add_argument("out", type=Path, metavar="OUT", help="folder to make")
-    generate.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
-    generate.set_defaults(run=_generate, writes=("{}",))
-    scenes = commands.add_parser(
+    _add_decompose_options(command)
+    command.set_defaults(run=_object, writes=("{}",))
+
+
+def _add_check(commands: _Commands) -> None:
+    command = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
+    command.add_argument("scene", type=Path, metavar="SCENE_DIR")
+    command.set_defaults(run=_check, writes=())
+
+
+def _add_generate(commands: _Commands) -> None:
+    command = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
+    command.add_argument("out", type=Path, metavar="OUT", help="folder to make")
+    command.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
+    command.set_defaults(run=_generate, writes=("{}",))
+
+
+def _add_generate_scenes(commands: _Commands) -> None:
+    command = commands.add_parser(
         "generate-scenes", help="make the scenes of a recipe file: generate, convert, draw; goes on where it stopped"
     )
-    scenes.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
-    scenes.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
-    scenes.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
-    scenes.add_argument("--overwrite", action="store_true", help="make those again that are there")
-    scenes.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N")
-    scenes.set_defaults(run=_generate_scenes, writes=("{}/*",))
-    preview = commands.add_parser("preview", help="draw a conversion's stages from above")
-    preview.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
-    preview.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
-    preview.add_argument("--source", type=Path, metavar="SRC", help="raw folder: draws scan and cut too")
-    preview.set_defaults(run=_preview, writes=("{}",))
+    command.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
+    command.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
+    command.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
+    command.add_argument("--overwrite", action="store_true", help="make those again that are there")
+    command.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N")
+    command.set_defaults(run=_generate_scenes, writes=("{}/*",))
+
+
+def _add_preview(commands: _Commands) -> None:
+    command = commands.add_parser("preview", help="draw a conversion's stages from above")
+    command.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
+    command.add_argument("--source", type=Path, metavar="SRC", help="raw folder: draws scan and cut too")
+    command.set_defaults(run=_preview, writes=("{}",))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add in (_add_convert, _add_propose, _add_object, _add_check, _add_generate, _add_generate_scenes, _add_preview):
+        add(commands)
     return parser
 
 

@@ -15,10 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from converters.bodies.alignment import Alignment, compare, upright
-from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
+from converters.bodies.alignment import Alignment
+from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject, name_objects, place_object, to_world
-from converters.bodies.physical import Physical, physical_properties
+from converters.bodies.physical import physical_properties, with_source
+from converters.bodies.placement import compare, upright
 from converters.check.gates import evaluate
 from converters.check.settle import Settled, settle
 from converters.fill.holes import fill_holes
@@ -216,16 +217,47 @@ def _object_visuals(
         return list(pool.map(bake, clouds, annotated))
 
 
-def _with_source(physical: Physical, mass_kg: float | None, friction: float | None) -> Physical:
-    """The source's own mass and friction where it has them; moments scale with the mass."""
-    mass = physical.mass_kg if mass_kg is None else mass_kg
-    return dataclasses.replace(
-        physical,
-        mass_kg=mass,
-        inertia_b=physical.inertia_b * (mass / physical.mass_kg),
-        friction=physical.friction if friction is None else friction,
-        clipped=physical.clipped and mass_kg is None,
+def _with_alignments(
+    raw: RawScene, config: ConvertConfig, progress: Callable[[float], None]
+) -> tuple[RawScene, list[Alignment], list[dict[str, Any]]]:
+    """The scene with what `--auto-align` adds, and `align_objects` of it."""
+    retrieved: dict[int, float] = {}
+    if config.auto_align and config.library is not None:
+        raw, retrieved = with_retrieved(raw, config.library, progress)
+    placements, rows = align_objects(raw)
+    for k, confidence in retrieved.items():
+        rows[k]["retrieved_confidence"] = confidence
+    return raw, placements, rows
+
+
+def _decompose_models(
+    raw: RawScene, search: DecomposeConfig, config: ConvertConfig, cache: Path, progress: Callable[[float], None]
+) -> Decomposition:
+    """Hulls of every model: its own convex pieces where it came with them, else coacd's."""
+    bare = {k: c for k, c in sorted(raw.cads.items()) if c.pieces is None}
+    found = decompose_all(
+        {k: (c.vertices, c.faces) for k, c in bare.items()},
+        search,
+        config.jobs,
+        cache,
+        progress,
+        {k: DOOR_OVERRIDES for k, c in bare.items() if c.category == "door"},
+        config.strict,
     )
+    own = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
+    return dataclasses.replace(found, hulls=found.hulls | own)
+
+
+def _report_objects(
+    rows: list[dict[str, Any]], settled: Settled, seen: list[float], annotated: tuple[PlacedObject, ...]
+) -> None:
+    """Adds to each object's row how it settled and how much of it the scan showed."""
+    for row, moved, drop, share, placed in zip(
+        rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
+    ):
+        row |= {"settle_shift_m": moved, "settle_drop_m": drop, "texture_seen_share": round(share, 3)}
+        if placed.hinge is not None:
+            row["hinge_assumed"] = placed.hinge.assumed
 
 
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
@@ -240,34 +272,19 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
     """
     stages = StageCache(cache)
     with clock.stage("align") as progress:
-        retrieved: dict[int, float] = {}
-        if config.auto_align and config.library is not None:
-            raw, retrieved = with_retrieved(raw, config.library, progress)
-        placements, rows = align_objects(raw)
-        for k, confidence in retrieved.items():
-            rows[k]["retrieved_confidence"] = confidence
+        raw, placements, rows = _with_alignments(raw, config, progress)
         floor_height = floor_of(raw)
         vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
         walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
     decompose_config = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)
     with clock.stage("decompose") as progress:
-        decomposed = decompose_all(
-            {k: (c.vertices, c.faces) for k, c in sorted(raw.cads.items()) if c.pieces is None},
-            decompose_config,
-            config.jobs,
-            cache,
-            progress,
-            {k: DOOR_OVERRIDES for k, c in raw.cads.items() if c.category == "door" and c.pieces is None},
-            config.strict,
-        )
-        own = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
-        hulls = decomposed.hulls | own
+        decomposed = _decompose_models(raw, decompose_config, config, cache, progress)
         annotated = tuple(
-            place_object(name, a, raw.cads[a.cad_id], hulls[a.cad_id], pose, floor_height, walls_yaw)
+            place_object(name, a, raw.cads[a.cad_id], decomposed.hulls[a.cad_id], pose, floor_height, walls_yaw)
             for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, placements, strict=True)
         )
         physical = tuple(
-            _with_source(
+            with_source(
                 physical_properties(o.category, o.hulls_b), raw.cads[o.cad_id].mass_kg, raw.cads[o.cad_id].friction
             )
             for o in annotated
@@ -291,12 +308,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         progress(0.5)
         baked = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
         visuals, seen = [v for v, _ in baked], [share for _, share in baked]
-    for row, moved, drop, share, placed in zip(
-        rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
-    ):
-        row |= {"settle_shift_m": moved, "settle_drop_m": drop, "texture_seen_share": round(share, 3)}
-        if placed.hinge is not None:
-            row["hinge_assumed"] = placed.hinge.assumed
+    _report_objects(rows, settled, seen, annotated)
     with clock.stage("write"):
         parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=tuple(visuals))
         write_scene(parts, folder)

@@ -17,11 +17,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import trimesh
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject
-from converters.bodies.physical import MATERIALS, Physical
+from converters.bodies.physical import MATERIALS, Physical, mass_moments
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
@@ -40,26 +39,9 @@ from converters.write.manifest import PACKAGES
 from converters.write.texture import bake_object, colour_cloud
 from interactive_nav_common.files import whole_folder
 from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.categories import TABLE
 from scenes_mjcf.schema import CATEGORIES
 
-WORDS = {
-    "shoe": ("shoe", "sandal", "boot", "sneaker", "loafer", "slipper", "heel"),
-    "pot": ("pot", "planter", "plantcontainer", "flowerpot", "vase"),
-    "basket": ("basket", "bin", "hamper"),
-    "toy": ("toy", "doll", "teddy", "truck", "robot"),
-    "chair": ("chair", "stool"),
-    "sofa": ("sofa", "couch"),
-    "desk": ("desk",),
-    "table": ("table",),
-    "door": ("door",),
-}
-"""Category -> words that tell it in a name."""
-DENSITY_KG_M3 = {"shoe": 250.0, "pot": 900.0, "toy": 200.0, "other": 300.0}
-"""Of the hulls, for meshes without a mass: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm
-0.7 kg in 0.8 dm3, a plastic toy is mostly hollow; other things lie between.
-Furniture has `converters.bodies.physical.MATERIALS`."""
-FRICTION = {"shoe": 0.7, "pot": 0.5, "toy": 0.4, "other": 0.5}
-"""Sliding coefficients on a floor: rubber soles, clay, plastic, anything."""
 FOOT_SHARE = 0.03
 """Of the height: what ends within this above the base is brought down to it. Collision meshes come from voxels, and
 a pot on unequal hulls rests tilted."""
@@ -90,7 +72,7 @@ class ObjectConfig:
 def guess_category(*names: str) -> str | None:
     """The category whose word stands in a name, the longest word first; None where there is none."""
     text = re.sub(r"[^a-z]", "", " ".join(names).lower())
-    found = [(len(word), category) for category, words in WORDS.items() for word in words if word in text]
+    found = [(len(word), category.name) for category in TABLE for word in category.words if word in text]
     return max(found)[1] if found else None
 
 
@@ -136,22 +118,6 @@ def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
     level[level[:, 2] < foot_m, 2] = 0.0
     hull = convex_hull(np.vstack([points, level]))
     return dataclasses.replace(hull, vertices=hull.vertices - [0.0, 0.0, min(float(hull.vertices[:, 2].min()), 0.0)])
-
-
-def _properties(hulls: tuple[Hull, ...], mass_kg: float, friction: float, volume_m3: float) -> Physical:
-    """Centre of mass and inertia of hulls of even density at a given mass."""
-    volumes, centres, inertias = [], [], []
-    for hull in hulls:
-        own = trimesh.triangles.mass_properties(hull.vertices[hull.faces])
-        volumes.append(abs(float(own.volume)))
-        centres.append(np.asarray(own.center_mass, float))
-        inertias.append(np.asarray(own.inertia, float))
-    com = np.average(centres, axis=0, weights=volumes)
-    inertia = np.zeros((3, 3))
-    for volume, centre, own in zip(volumes, centres, inertias, strict=True):
-        r = centre - com
-        inertia += own + volume * (r @ r * np.eye(3) - np.outer(r, r))  # parallel axes
-    return Physical(mass_kg, com, inertia * mass_kg / sum(volumes), friction, volume_m3, False)
 
 
 def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
@@ -217,7 +183,7 @@ def convert_object(
         foot = FOOT_SHARE * float(high[2] - low[2])
         hulls = tuple(_level_feet(h.vertices - base, foot) for h in hulls)
         visual = _visual(_moved(item.surface, -base), path.name, source)
-        volume = sum(abs(float(trimesh.triangles.mass_properties(h.vertices[h.faces]).volume)) for h in hulls)
+        volume, com, inertia = mass_moments(hulls)
         mass, mass_source = _mass(item, category, volume, config)
         friction, friction_source = _friction(item, category, config)
         placed = PlacedObject(
@@ -233,7 +199,7 @@ def convert_object(
             quaternion_w=np.array([1.0, 0.0, 0.0, 0.0]),
             hinge=None,
         )
-        physical = _properties(hulls, mass, friction, volume)
+        physical = Physical(mass, com, inertia * mass / volume, friction, volume, False)
         settled = settle(SceneParts(target.name, (placed,), (physical,), ()))
         parts = dataclasses.replace(settled.parts, object_visuals=(visual,))
         rest = _rest(settled.parts)
@@ -288,10 +254,8 @@ def _mass(item: RigidObject, category: str, volume_m3: float, config: ObjectConf
         return config.mass_kg, "given"
     if item.mass_kg is not None:
         return item.mass_kg, "urdf"
-    if category in MATERIALS:
-        material = MATERIALS[category]
-        return float(np.clip(material.density_kg_m3 * volume_m3, *material.mass_range_kg)), "density"
-    return max(DENSITY_KG_M3[category] * volume_m3, 0.01), "density"
+    material = MATERIALS[category]
+    return float(np.clip(material.density_kg_m3 * volume_m3, *material.mass_range_kg)), "density"
 
 
 def _friction(item: RigidObject, category: str, config: ObjectConfig) -> tuple[float, str]:
@@ -299,7 +263,7 @@ def _friction(item: RigidObject, category: str, config: ObjectConfig) -> tuple[f
         return config.friction, "given"
     if item.friction is not None:
         return item.friction, "urdf"
-    return (MATERIALS[category].friction if category in MATERIALS else FRICTION[category]), "category"
+    return MATERIALS[category].friction, "category"
 
 
 def _rest(parts: SceneParts) -> dict[str, Any]:

@@ -29,9 +29,9 @@ from converters.read.files import read_image, read_textured_obj
 from converters.records.raw import RawScene, ScanMesh
 from converters.records.visual import ColourCloud
 from converters.structure.cut import cut_furniture
-from converters.write.emit import CATEGORY_COLOURS
 from converters.write.texture import colour_cloud
 from interactive_nav_common.files import whole_file
+from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 MARGIN_M = 0.3
@@ -80,7 +80,7 @@ def _palette(views: list[np.ndarray]) -> Image.Image:
     """A palette image: the views' own commonest colours beside those that the panels draw with."""
     surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
     own = surface.quantize(SURFACE_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette() or []
-    ground, flat = np.array(TRAVERSABLE), np.array(list(CATEGORY_COLOURS.values()))[:, :3]
+    ground, flat = np.array(TRAVERSABLE), np.array([CATEGORIES[c].preview_colour for c in OBJECT_CATEGORIES])
     drawn = [np.outer(np.linspace(0, 1, 12), np.ones(3)), ground[None], np.array(WALL)[None]]
     drawn += [flat * light for light in (0.55, 0.75, 1.0)] + [ground + (flat - ground) * a for a in (0.3, 0.51, 0.66)]
     chart = np.rint(255 * np.vstack(drawn)).astype(int).ravel().tolist()
@@ -153,7 +153,7 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         light = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
         order = np.argsort(corners[:, :, 2].max(axis=1), kind="stable")
-        colours = np.outer(0.55 + 0.45 * light, CATEGORY_COLOURS[item.category][:3])[order]
+        colours = np.outer(0.55 + 0.45 * light, CATEGORIES[item.category].preview_colour)[order]
         axes.add_collection(
             PolyCollection(corners[order, :, :2], facecolors=colours, edgecolors=colours, linewidth=0.2)
         )
@@ -172,7 +172,7 @@ def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
     count = 0
     for name, body, geom in _geoms(scene.model):
         if body in category and name.startswith(f"{body}_{kind}_"):
-            colour = CATEGORY_COLOURS[category[body]][:3]
+            colour = CATEGORIES[category[body]].preview_colour
             outline = _outline(scene.model, scene.data, geom)
             axes.fill(*outline.T, facecolor=(*colour, 0.30), edgecolor=colour, linewidth=0.6)
             count += 1
@@ -273,7 +273,7 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     _draw_collision(boxes, scene, "box")
 
     shown = sorted({o.category for o in scene.manifest.objects})
-    handles = [Patch(facecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
+    handles = [Patch(facecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
     handles += [Patch(facecolor=TRAVERSABLE, label="traversable"), Patch(facecolor=WALL, label="wall")]
     figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)

@@ -28,8 +28,8 @@ from converters.propose.retrieval import (
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, RawScene
 from converters.structure.floor import fit_floor
-from converters.write.emit import CATEGORY_COLOURS
 from interactive_nav_common.files import whole_file
+from scenes_mjcf.categories import CATEGORIES
 
 SAME_OBJECT_SHARE = 0.3
 """Share of a proposal's points in an annotated model's box from which they are compared."""
@@ -70,7 +70,7 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
         shade = raw.scan.vertex_colours[keep][low] / 255.0
     axes.scatter(*vertices[low][:, :2].T, s=0.6, c=shade, alpha=0.5, linewidths=0)
     for k, proposal in enumerate(found.proposals):
-        colour = CATEGORY_COLOURS[proposal.category]
+        colour = CATEGORIES[proposal.category].preview_colour
         axes.add_patch(Polygon(box_corners(proposal), fill=False, edgecolor=colour, linewidth=2))
         text = f"{proposal.category} {proposal.confidence:.2f}"
         model = found.retrieved.get(k)
@@ -102,7 +102,7 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
         hull = MultiPoint(annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
         axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)
     shown = sorted({p.category for p in found.proposals})
-    handles = [Patch(facecolor="none", edgecolor=CATEGORY_COLOURS[c], label=c) for c in shown]
+    handles = [Patch(facecolor="none", edgecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
     handles.append(Patch(facecolor="none", edgecolor="black", linestyle=":", label="annotated model"))
     axes.legend(handles=handles, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
     axes.set_aspect("equal")

@@ -16,15 +16,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
-from converters.bodies.alignment import (
-    Alignment,
-    AlignmentError,
-    PoseDifference,
-    apply_alignment,
-    least_squares,
-    pose_difference,
-    upright,
-)
+from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
+from converters.bodies.placement import PoseDifference, pose_difference, upright
 from converters.propose.proposals import Proposal, bounds, box_iou
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder

@@ -12,16 +12,10 @@ import dataclasses
 import numpy as np
 
 from converters.records.cache import NOT_HASHED
+from scenes_mjcf.categories import TABLE
 
-# ShapeNet synset -> category. 02747177 is ShapeNet's trash bin, which the benchmark calls a basket.
-SYNSETS = {
-    "03001627": "chair",
-    "04256520": "sofa",
-    "04379243": "table",
-    "03179701": "desk",
-    "03221720": "door",
-    "02747177": "basket",
-}
+SYNSETS = {category.synset: category.name for category in TABLE if category.synset}
+"""ShapeNet synset -> category."""
 
 # NYU40 ids used by the stages (Gupta et al. 2013, the 40-class mapping that ScanNet labels with).
 UNLABELLED, WALL, FLOOR, CEILING, WINDOW, DOOR = 0, 1, 2, 22, 9, 8
@@ -30,14 +24,8 @@ STRUCTURE_LABELS = (WALL, FLOOR, DOOR, WINDOW, 11, 13, 16, 19, CEILING, 28, 30, 
 otherstructure."""
 SMALL_LABELS = (UNLABELLED, 18, 20, 21, 23, 26, 27, 29, 35, 37, 40)
 """Unlabelled, pillow, mat, clothes, books, paper, towel, box, lamp, bag, otherprop: may lie on furniture."""
-CATEGORY_LABELS = {
-    "chair": (5,),
-    "sofa": (6,),
-    "table": (7, 14),
-    "desk": (14, 7),
-    "door": (DOOR,),
-    "basket": (39, 40),
-}
+CATEGORY_LABELS = {category.name: category.labels for category in TABLE if category.labels}
+"""Category -> NYU40 ids."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -179,6 +179,15 @@ def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) ->
     return result
 
 
+def _grid_around(points_w: np.ndarray, yaw: float, resolution_m: float) -> Grid:
+    """The grid of whole cells over (n, 3) points, with a margin."""
+    used = points_w @ yaw_matrix(yaw)
+    low, high = used[:, :2].min(axis=0) - PAD_M, used[:, :2].max(axis=0) + PAD_M
+    low = np.floor(low / resolution_m) * resolution_m
+    columns, rows = np.ceil((high - low) / resolution_m).astype(int)
+    return Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), resolution_m)
+
+
 def make_floor_plan(
     vertices_w: np.ndarray,
     faces: np.ndarray,
@@ -202,13 +211,7 @@ def make_floor_plan(
     Raises:
         SceneRejected: no traversable cell.
     """
-    turn = yaw_matrix(yaw)
-    used = vertices_w[np.unique(faces)] @ turn
-    low, high = used[:, :2].min(axis=0) - PAD_M, used[:, :2].max(axis=0) + PAD_M
-    low = np.floor(low / resolution_m) * resolution_m
-    columns, rows = np.ceil((high - low) / resolution_m).astype(int)
-    grid = Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), resolution_m)
-
+    grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
     points, face = sample_faces(vertices_w, faces, resolution_m / 3)
     label, z = face_labels(labels, faces)[face], points[:, 2]
     floor_points = ((label == FLOOR) & (np.abs(z) < 0.2)) | ((label == UNLABELLED) & (np.abs(z) < NOISE_M))
@@ -220,8 +223,7 @@ def make_floor_plan(
     for line in (np.ones((1, 4)), np.ones((4, 1))):
         occupied |= ndimage.binary_closing(occupied, line)
 
-    under = np.zeros(grid.shape, bool)
-    swept = np.zeros(grid.shape, bool)
+    under, swept = np.zeros((2, *grid.shape), bool)
     for placed in objects:
         under |= _footprint(grid, placed)
         if placed.hinge is not None:
@@ -243,11 +245,16 @@ def make_floor_plan(
             "scan: no traversable floor is left (no floor label below 1.2 m of free height); "
             "check the floor's labels and height"
         )
-    heights = points[np.isin(label, STRUCTURE_LABELS) & (label != FLOOR) & (label != CEILING), 2]
-    tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
-    tall = round(tall, 3)
+    tall = _wall_height(points, label)
     height = _heights(grid, points, label, occupied, tall)
     return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, tall, leaf, height)
+
+
+def _wall_height(points: np.ndarray, label: np.ndarray) -> float:
+    """m, of the tallest structure but a few stray points."""
+    heights = points[np.isin(label, STRUCTURE_LABELS) & (label != FLOOR) & (label != CEILING), 2]
+    tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
+    return round(tall, 3)
 
 
 def _heights(grid: Grid, points: np.ndarray, label: np.ndarray, occupied: np.ndarray, tall_m: float) -> np.ndarray:

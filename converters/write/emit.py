@@ -22,18 +22,6 @@ DOOR_DAMPING = 2.0
 """N m s/rad: a pushed interior door stops after about a second."""
 DOOR_FRICTION = 0.4
 """N m: no latch, only this dry friction: keeps a door where it was left, half a newton at the handle."""
-CATEGORY_COLOURS = {
-    "chair": (0.90, 0.50, 0.15, 1.0),
-    "sofa": (0.30, 0.60, 0.30, 1.0),
-    "table": (0.55, 0.35, 0.75, 1.0),
-    "desk": (0.20, 0.50, 0.85, 1.0),
-    "door": (0.75, 0.20, 0.25, 1.0),
-    "basket": (0.15, 0.65, 0.65, 1.0),
-    "shoe": (0.85, 0.40, 0.65, 1.0),
-    "pot": (0.50, 0.50, 0.15, 1.0),
-    "toy": (0.95, 0.80, 0.20, 1.0),
-    "other": (0.60, 0.60, 0.60, 1.0),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,8 +139,22 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
         inline: True keeps hulls inside the spec and leaves visuals out (settling); False names files in
         `assets/`.
     """
+    spec = _empty_spec(parts.name)
+    _add_surroundings(spec, parts.walls)
+    _add_structure(spec, parts)
+    # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
+    for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
+        spec.add_text(name=f"class_{body}", data=category)
+    visuals = parts.object_visuals or (None,) * len(parts.objects)
+    for placed, physical, visual in zip(parts.objects, parts.physical, visuals, strict=True):
+        _add_movable(spec, placed, physical, visual, inline)
+    return spec
+
+
+def _empty_spec(name: str) -> mujoco.MjSpec:
+    """Options and default classes of every scene."""
     spec = mujoco.MjSpec()
-    spec.modelname = parts.name
+    spec.modelname = name
     spec.compiler.degree = False
     spec.compiler.autolimits = True
     spec.meshdir = spec.texturedir = "assets"
@@ -160,6 +162,11 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     _add_defaults(spec)
+    return spec
+
+
+def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[Box, ...]) -> None:
+    """Floor, and a light above the middle of the walls."""
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -167,7 +174,7 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
         friction=[1.0, 0.005, 0.0001],
         rgba=[0.6, 0.6, 0.6, 1.0],
     )
-    middle = np.mean([b.centre for b in parts.walls], axis=0) if parts.walls else np.zeros(3)
+    middle = np.mean([b.centre for b in walls], axis=0) if walls else np.zeros(3)
     spec.worldbody.add_light(
         name="light",
         pos=[round(float(middle[0]), 3), round(float(middle[1]), 3), 4.0],
@@ -177,6 +184,10 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
         diffuse=[0.6, 0.6, 0.6],
         ambient=[0.4, 0.4, 0.4],
     )
+
+
+def _add_structure(spec: mujoco.MjSpec, parts: SceneParts) -> None:
+    """The cleaned scan as a picture, and the wall boxes."""
     structure = spec.worldbody.add_body(name="structure")
     if parts.structure_visual is not None:
         _add_textured_mesh(spec, "structure_visual", "structure")
@@ -197,13 +208,6 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
             quat=np.round(_quaternion(wall.rotation), 9),
             friction=[0.6, 0.005, 0.0001],
         )
-    # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
-    for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
-        spec.add_text(name=f"class_{body}", data=category)
-    visuals = parts.object_visuals or (None,) * len(parts.objects)
-    for placed, physical, visual in zip(parts.objects, parts.physical, visuals, strict=True):
-        _add_movable(spec, placed, physical, visual, inline)
-    return spec
 
 
 def write_obj(

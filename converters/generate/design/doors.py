@@ -65,17 +65,12 @@ def door_leaf(
     width, height = doorway.width_m - 2 * DOOR_GAP_M, doorway.height_m - 0.02 - lift_m
     extents = 2 * model.half_extents
     scale = np.array([width / extents[0], height / extents[1], model.unit_m])
-    # The wall beside the hinge stops the leaf: behind the hinge only the margin to the corner is left.
     room = plan.rooms[doorway.rooms[int(high_side)]]
     corner = (room.x1, room.y1)[along] if high_jamb else (room.x0, room.y0)[along]
-    behind = abs(corner - hinge[along]) - wall_gap_m
-    most = math.pi / 2 + math.asin(min(max(behind, 0.0) / width, 0.5))
+    most = _widest_rad(abs(corner - hinge[along]) - wall_gap_m, width)
     open_rad = min(open_rad, most - AJAR_RAD)
-    leaf_half_thick = _leaf_half_thickness(model)
-    origin = (
-        float(model.bounds[0, 0]), float(model.bounds[0, 1]),
-        float(_leaf_centre_z(model) - sign * leaf_half_thick),
-    )  # fmt: skip
+    face_z = float(_leaf_centre_z(model) - sign * _leaf_half_thickness(model))
+    origin = (float(model.bounds[0, 0]), float(model.bounds[0, 1]), face_z)
     yaw = math.atan2(closed[1], closed[0]) + sign * open_rad
     yaw = math.atan2(math.sin(yaw), math.cos(yaw))
     swing = (-open_rad, most - open_rad) if sign > 0 else (-(most - open_rad), open_rad)
@@ -83,10 +78,18 @@ def door_leaf(
     offset = at_origin.to_floor(np.array([origin]))[0]
     position = np.array([hinge[0] - offset[0], hinge[1] - offset[1], lift_m - scale[1] * model.bounds[0, 1]])
     leaf = Instance(model, scale, yaw, position, Hinge((0.0, 1.0, 0.0), origin, swing))
-    start = math.atan2(closed[1], closed[0])
-    angles = start + sign * np.linspace(0.0, most, 24)
-    fan = hinge + (width + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return leaf, shapely.Polygon([hinge, *fan]).buffer(0.03)
+    return leaf, _swept_floor(hinge, math.atan2(closed[1], closed[0]) + sign * np.linspace(0.0, most, 24), width)
+
+
+def _widest_rad(behind_m: float, width_m: float) -> float:
+    """How far a leaf opens: the wall beside the hinge stops it, behind which only the margin to the corner is left."""
+    return math.pi / 2 + math.asin(min(max(behind_m, 0.0) / width_m, 0.5))
+
+
+def _swept_floor(hinge: np.ndarray, angles: np.ndarray, width_m: float) -> shapely.Polygon:
+    """The fan of a leaf that turns through the angles, with a margin."""
+    fan = hinge + (width_m + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return shapely.Polygon([hinge, *fan]).buffer(0.03)
 
 
 def wall_behind_m(doorway: Doorway, high_side: bool, high_jamb: bool, plan: Plan) -> float:

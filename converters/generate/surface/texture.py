@@ -164,6 +164,16 @@ def _tiles(p: np.ndarray, base: np.ndarray) -> np.ndarray:
     return base * (np.where(grout, 0.75, 0.96 + 0.06 * _hash(i, j)))[:, None]
 
 
+def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(n,) brightness: a lamp per room that falls off, shade by direction, darker in corners near the floor."""
+    away = lamp - points
+    far = np.linalg.norm(away, axis=1)
+    lambert = np.clip(np.einsum("ij,ij->i", normals, away) / far, 0, 1)
+    light = 0.72 + 0.34 * lambert / (0.6 + 0.25 * far)
+    light *= 1 - 0.12 * np.exp(-np.maximum(points[:, 2], 0) / 0.15) * (np.abs(normals[:, 2]) < 0.5)
+    return light * (1 + 0.03 * smooth_noise(points, 0.8, rng))
+
+
 def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np.ndarray, ids: np.ndarray,
           normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
     """Colours of points on the scan.
@@ -216,14 +226,8 @@ def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np
             weave = 1 + 0.05 * np.sin(90 * p[:, 0]) * np.sin(90 * p[:, 1] + 40 * p[:, 2])
             value = np.array(MATERIALS[name]) * weave[:, None]
         colour[here] = value
-    # Light: a lamp per room that falls off, a little shade by direction, darker in corners near the floor.
     lamp = np.column_stack([centres, np.full(len(rooms), 2.2)])[room]
-    away = lamp - points
-    far = np.linalg.norm(away, axis=1)
-    lambert = np.clip(np.einsum("ij,ij->i", normals[ids], away) / far, 0, 1)
-    light = 0.72 + 0.34 * lambert / (0.6 + 0.25 * far)
-    light *= 1 - 0.12 * np.exp(-np.maximum(points[:, 2], 0) / 0.15) * (np.abs(normals[ids, 2]) < 0.5)
-    light *= 1 + 0.03 * smooth_noise(points, 0.8, rng)
+    light = _light(points, normals[ids], lamp, rng)
     return np.clip(colour * light[:, None], 0, 1)
 
 

@@ -12,8 +12,8 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.check.preview import preview
-from converters.write.emit import CATEGORY_COLOURS
-from scenes_mjcf.schema import CATEGORIES, SceneError
+from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
+from scenes_mjcf.schema import SceneError
 
 
 def colours(path) -> np.ndarray:
@@ -57,10 +57,10 @@ def change(folder: Path, **values: str) -> None:
 
 
 def test_every_category_has_a_colour_of_its_own_and_is_drawn(scene):
-    assert sorted(CATEGORY_COLOURS) == sorted(CATEGORIES) and len(set(CATEGORY_COLOURS.values())) == len(CATEGORIES)
+    assert len({CATEGORIES[name].preview_colour for name in OBJECT_CATEGORIES}) == len(OBJECT_CATEGORIES)
     change(scene, category="shoe")
     preview(scene, scene / "p.png")
-    shoe = np.rint(255 * np.array(CATEGORY_COLOURS["shoe"][:3]))
+    shoe = np.rint(255 * np.array(CATEGORIES["shoe"].preview_colour))
     assert (np.abs(colours(scene / "p.png") - shoe).max(axis=2) <= 4).sum() > 50  # the legend's patch and the object
 
 

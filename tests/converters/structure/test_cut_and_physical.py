@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.bodies.alignment import upright
 from converters.bodies.objects import place_object
 from converters.bodies.physical import MATERIALS, physical_properties
+from converters.bodies.placement import upright
 from converters.geometry.boxes import Hull, convex_hull
 from converters.geometry.faces import face_labels
 from converters.read.scan2cad import read_scan2cad

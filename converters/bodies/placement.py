@@ -1,0 +1,116 @@
+"""Annotated poses in, upright placements and rows that compare them with the re-solved ones out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from converters.bodies.alignment import (
+    SYMMETRY_PERIOD_RAD,
+    Alignment,
+    AlignmentError,
+    apply_alignment,
+    gross_outliers,
+    solve_alignment,
+)
+from converters.records.raw import Annotation
+from interactive_nav_common.rotations import wrap_angle, yaw_matrix
+
+LYING_DEG = 15.0
+"""Annotated tilt from which a scene's report says that the object was stood upright."""
+
+
+def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
+    """Takes the small roll and pitch out of an annotated pose, turning about the object's own middle.
+
+    Args:
+        pose: (4, 4) CAD frame -> scan frame, with scale.
+        pivot_cad: (3,) point of the CAD frame that keeps its place (the middle of the bounding box).
+
+    Returns:
+        The upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
+    """
+    scale = np.linalg.norm(pose[:3, :3], axis=0)
+    turn = pose[:3, :3] / scale
+    yaw = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    place = pose[:3, :3] @ pivot_cad + pose[:3, 3]
+    translation = place - yaw_matrix(yaw) @ (scale * pivot_cad)
+    tilt = math.acos(float(np.clip(turn[2, 2], -1.0, 1.0)))
+    return Alignment(scale, translation, yaw, math.nan), tilt
+
+
+def compare(
+    annotation: Annotation, placed: Alignment, tilt_rad: float, pivot_cad: np.ndarray, name: str
+) -> dict[str, Any]:
+    """One row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
+
+    Args:
+        annotation: with its keypoints.
+        placed: the annotated pose, upright: the one that the scene uses.
+        tilt_rad: what `upright` removed.
+        pivot_cad: (3,) where the two poses' translations are compared.
+        name: body name.
+    """
+    row: dict[str, Any] = {
+        "name": name,
+        "cad_id": annotation.cad_id,
+        "n_keypoints": len(annotation.keypoints_cad),
+        "symmetry": annotation.symmetry,
+        "tilt_removed_deg": round(math.degrees(tilt_rad), 3),
+    }
+    if tilt_rad > math.radians(LYING_DEG):
+        degrees = math.degrees(tilt_rad)
+        row["note"] = f"annotated {degrees:.0f} degrees off the vertical; placed upright, yaw is the only rotation"
+    if len(annotation.keypoints_cad):
+        at = annotation.keypoints_cad @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+        distance2 = ((at - annotation.keypoints_scan) ** 2).sum(axis=1)
+        row["annotated_rms_m"] = round(float(np.sqrt(distance2.mean())), 5)
+    try:
+        solved = solve_alignment(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
+        outliers = gross_outliers(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
+    except AlignmentError as error:
+        return row | {"solved": False, "reason": str(error)}
+    difference = pose_difference(solved, placed, pivot_cad, annotation.symmetry)
+    return row | {
+        "solved": True,
+        "n_outliers": int(outliers.sum()),
+        "rms_m": round(solved.rms_m, 5),
+        "translation_difference_m": round(difference.translation_m, 5),
+        "yaw_difference_deg": round(math.degrees(difference.yaw_rad), 3),
+        "scale_ratio": [round(float(v), 4) for v in difference.scale_ratio],
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseDifference:
+    """How far one pose of a model is from another, modulo the model's symmetry."""
+
+    translation_m: float
+    yaw_rad: float
+    """In [0, pi]."""
+    scale_ratio: np.ndarray
+    """(3,) first / second along the second's axes."""
+
+
+def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, symmetry: str) -> PoseDifference:
+    """Compares two poses of the same model at the pivot; turns that the symmetry allows do not count.
+
+    Args:
+        one: the pose in question.
+        other: the reference.
+        pivot_cad: (3,) point of the CAD frame where translations are compared.
+        symmetry: Scan2CAD's word; unknown words count as none.
+    """
+    period = SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
+    at = [apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
+    yaw = abs(wrap_angle(one.yaw - other.yaw, period)) if period else 0.0
+    quarter_turns = (
+        round((wrap_angle(one.yaw - other.yaw) - wrap_angle(one.yaw - other.yaw, period)) / (math.pi / 2))
+        if period
+        else 0
+    )
+    scale = one.scale[[1, 0, 2]] if quarter_turns % 2 else one.scale
+    return PoseDifference(float(np.linalg.norm(at[0] - at[1])), yaw, scale / other.scale)
