@@ -1,4 +1,4 @@
-"""A scan with its patches in, faces that close the cracks between them out; and the measure of what stays open.
+"""A scan with its patches in, faces that close the cracks between them out.
 
 A crack is open border of a patch (edges that no second face has) that runs within `REACH_M` of the scan's, or of
 another patch's, open border. It is closed as a zip is: from where both borders meet, or from where they come closest,
@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
-import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 SAME_M = 1e-5
@@ -27,22 +26,8 @@ STEP_M = 0.04
 FACING = 2.0
 """Two places of the border face each other where the way along it is longer than this many times the straight one, as
 from side to side of a slit, and as in a corner of less than 60 degrees."""
-SPOT_M = 0.005
-"""Spacing of the places on the border that are looked at."""
 FOLDED = 0.95
 """Two faces whose directions away from their common edge have a greater cosine than this lie on one another."""
-
-
-@dataclasses.dataclass(frozen=True)
-class OpenBorder:
-    """How much of a patch's border no other face joins."""
-
-    border_m: float
-    """Length of the patches' whole border."""
-    open_m: float
-    """Of it, edges that only one face has."""
-    crack_m: float
-    """Of it, what other open border faces within `REACH_M`: a gap, and not the rim of what was scanned."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,12 +63,9 @@ def border_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         edges (k, 2), face (k,).
     """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    owner = np.tile(np.arange(len(faces)), 3)
-    key = np.sort(edges, axis=1)
-    _, inverse, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    single = count[inverse.reshape(-1)] == 1
-    return edges[single], owner[single]
+    every = edges_of(faces)
+    corner, owner = np.nonzero((every.count[every.of_face] == 1).T)
+    return np.stack([faces[owner, corner], faces[owner, (corner + 1) % 3]], axis=1), owner
 
 
 def on_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,7 +159,7 @@ def _fan(vertices: np.ndarray, ring: list[int]) -> list[tuple[int, int, int]]:
     return triangles
 
 
-def _points_on(vertices: np.ndarray, edges: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
+def points_on(vertices: np.ndarray, edges: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Points on edges at most so far apart, and the edge of each."""
     a, b = vertices[edges[:, 0]], vertices[edges[:, 1]]
     count = np.maximum(np.ceil(np.linalg.norm(b - a, axis=1) / spacing_m).astype(int), 1)
@@ -185,101 +167,6 @@ def _points_on(vertices: np.ndarray, edges: np.ndarray, spacing_m: float) -> tup
     step = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
     share = ((step + 0.5) / count[edge])[:, None]
     return a[edge] * (1 - share) + b[edge] * share, edge
-
-
-def open_border(
-    vertices: np.ndarray, faces: np.ndarray, patch_plane: np.ndarray, reach_m: float = REACH_M
-) -> dict[int, OpenBorder]:
-    """What stays open of the patches' borders, by plane.
-
-    A crack is open border that other open border faces within the reach: border that is at least `FACING` times as far
-    away along the border as it is straight across; and a hole that is no wider than the reach, whatever its shape. What
-    is near without that is the border's own continuation, as where the outline of the scan goes on beside the end of a
-    patch; and what a narrow patch itself lies between is no gap.
-
-    Args:
-        vertices: (n, 3) m.
-        faces: (m, 3) scan and patches, one mesh.
-        patch_plane: (m,) plane of each patch face, -1 for scan faces.
-        reach_m: open border this near to other border is a crack.
-    """
-    edges, owner = border_edges(faces)
-    plane = patch_plane[owner]
-    spots, of = _points_on(vertices, edges, SPOT_M)
-    whole = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    length = (whole / np.bincount(of, minlength=len(edges)))[of]
-    a, b, tip = vertices[edges[:, 0]], vertices[edges[:, 1]], vertices[faces[owner].sum(axis=1) - edges.sum(axis=1)]
-    along = (b - a) / np.maximum(whole, 1e-12)[:, None]
-    inward = (tip - a) - ((tip - a) * along).sum(axis=1, keepdims=True) * along
-    piece = edge_pieces(edges_of(faces))
-    floating = ~np.isin(piece, piece[patch_plane < 0])[owner]
-    surface = np.where(floating, plane.max(initial=0) + 1 + piece[owner], plane)
-    faced = _faced(vertices, edges, spots, of, surface, inward, reach_m)
-    result = {}
-    for k in np.unique(patch_plane[patch_plane >= 0]):
-        own = plane[of] == k
-        rim = border_edges(faces[patch_plane == k])[0]
-        total = float(np.linalg.norm(vertices[rim[:, 0]] - vertices[rim[:, 1]], axis=1).sum())
-        result[int(k)] = OpenBorder(total, float(length[own].sum()), float(length[own & faced].sum()))
-    return result
-
-
-def _faced(
-    vertices: np.ndarray,
-    edges: np.ndarray,
-    spots: np.ndarray,
-    of: np.ndarray,
-    surface: np.ndarray,
-    inward: np.ndarray,
-    reach_m: float,
-) -> np.ndarray:
-    """(n,) bool: which spots on patches' border other border faces over a gap.
-
-    The way along the border goes from spot to spot on an edge and over the vertices that edges share.
-
-    Args:
-        vertices: (v, 3) m.
-        edges: (k, 2) of the border.
-        spots: (n, 3) on them.
-        of: (n,) edge of each spot.
-        surface: (k,) plane of each edge's face, or number of its piece where that joins no scan; -1 for the scan's.
-        inward: (k, 3) from the edge into its face.
-        reach_m: how near.
-    """
-    asked = surface[of] >= 0
-    border = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(len(vertices),) * 2)
-    hole = connected_components(border, directed=False)[1][edges[:, 0]][of]
-    low, high = np.full((hole.max(initial=0) + 1, 3), np.inf), np.full((hole.max(initial=0) + 1, 3), -np.inf)
-    np.minimum.at(low, hole, spots)
-    np.maximum.at(high, hole, spots)
-    result = asked & (np.linalg.norm(high - low, axis=1)[hole] < reach_m)
-    asked_at = np.flatnonzero(asked & ~result)
-    if len(asked_at) == 0:
-        return result
-    near = np.asarray(KDTree(spots[asked_at]).query(spots, distance_upper_bound=2 * FACING * reach_m)[0]) < np.inf
-    n = len(spots)
-    along = np.flatnonzero(of[:-1] == of[1:])
-    start, end = (np.flatnonzero(np.r_[True, of[1:] != of[:-1]]), np.flatnonzero(np.r_[of[1:] != of[:-1], True]))
-    a = np.concatenate([along, start, end])
-    b = np.concatenate([along + 1, n + edges[of[start], 0], n + edges[of[end], 1]])
-    places = np.vstack([spots, vertices])
-    way = np.linalg.norm(places[a] - places[b], axis=1)
-    graph = coo_matrix((np.maximum(way, 1e-9), (a, b)), shape=(len(places),) * 2).tocsr()
-    used = np.concatenate([near, np.zeros(len(vertices), bool)])
-    used[n + np.unique(edges[of[near]])] = True
-    number = np.cumsum(used) - 1
-    graph = graph[used][:, used]
-    tree, here = KDTree(spots[near]), np.flatnonzero(near)
-    for block in np.array_split(asked_at, math.ceil(len(asked_at) / 200)):
-        along_m = dijkstra(graph, directed=False, indices=number[block], limit=FACING * reach_m)
-        for row, i in enumerate(block):
-            there = here[tree.query_ball_point(spots[i], reach_m)]
-            straight = np.linalg.norm(spots[there] - spots[i], axis=1)
-            # The other side of the same patch, with the patch between.
-            own = (surface[of[there]] == surface[of[i]]) & ((spots[there] - spots[i]) @ inward[of[i]] > 0)
-            # To the spots' spacing: what is nearer than that along the border is the spot's own neighbourhood.
-            result[i] = (along_m[row, number[there]] > FACING * straight + 2 * SPOT_M)[~own].any()
-    return result
 
 
 def cut_teeth(
@@ -298,7 +185,7 @@ def cut_teeth(
         vertices (n', 3) with the given ones first, faces (m', 3), and the given face (m',) that each is part of.
     """
     edges, owner = border_edges(faces)
-    spots, of = _points_on(vertices, edges, step_m)
+    spots, of = points_on(vertices, edges, step_m)
     near = np.zeros(len(spots), bool)
     surface = patch_plane[owner][of]
     for one in np.unique(surface):
@@ -451,14 +338,14 @@ def close_cracks(
     own = plane >= 0
     if not own.any() or len(np.unique(plane)) < 2:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    patch_spots, _ = _points_on(vertices, edges[own], STEP_M)
+    patch_spots, _ = points_on(vertices, edges[own], STEP_M)
     reach = np.asarray(KDTree(patch_spots).query(vertices[edges].mean(axis=1))[0]) < 2 * reach_m + STEP_M
     edges, owner, plane = edges[reach], owner[reach], plane[reach]
     active = np.zeros(len(vertices), bool)
     active[edges] = True
-    every = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    keys, count = np.unique(every[active[every].all(axis=1)], axis=0, return_counts=True)
-    used = {(int(a), int(b)): int(n) for (a, b), n in zip(keys, count, strict=True)}
+    every = edges_of(faces)
+    near = active[every.ends].all(axis=1)
+    used = {(int(a), int(b)): int(n) for (a, b), n in zip(every.ends[near], every.count[near], strict=True)}
     tips = faces[owner].sum(axis=1) - edges.sum(axis=1)
     sides = {
         _edge(int(a), int(b)): _Side(int(tip), int(p), int(p), bool(a < b))

@@ -136,6 +136,44 @@ def least_surface(points: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, flo
     return result, float(face_areas(points, result).sum())
 
 
+class _Borders:
+    """What lies at the edges of a mesh, for the loops that are closed in it."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, patch_plane: np.ndarray):
+        """Looks up, for each edge, its number, its first face and the highest plane of its faces."""
+        self.vertices, self.faces, self.edges = vertices, faces, edges_of(faces)
+        self.number = {(int(a), int(b)): k for k, (a, b) in enumerate(self.edges.ends)}
+        self.first = np.full(len(self.edges.ends), -1)
+        self.first[self.edges.of_face[::-1].ravel()] = np.repeat(np.arange(len(faces))[::-1], 3)
+        self.plane = np.full(len(self.edges.ends), -1)
+        np.maximum.at(self.plane, self.edges.of_face.ravel(), np.repeat(patch_plane, 3))
+
+    def cover(self, loop: np.ndarray) -> tuple[np.ndarray, int] | None:
+        """Faces over a loop, the last edge of which need not exist, and their plane; None where it is left."""
+        points = self.vertices[loop]
+        ring = list(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
+        k = np.array([self.number.get((min(a, b), max(a, b)), -1) for a, b in ring])
+        length = np.linalg.norm(points - np.roll(points, -1, axis=0), axis=1)
+        plane = np.where(k >= 0, self.plane[k], -1)
+        surrounded = k[-1] >= 0 and length[plane >= 0].sum() > HALF * length.sum()
+        most = max(HOLE_M2 if surrounded else 0.0, REACH_M * length.sum() / 2)
+        # No surface over a loop is smaller than its shadow.
+        shadow = np.cross(points - points.mean(axis=0), np.roll(points, -1, axis=0) - points.mean(axis=0)).sum(axis=0)
+        if np.linalg.norm(shadow) / 2 > most or len(loop) > MAX_EDGES:
+            return None
+        used = np.array([[(min(a, b), max(a, b)) in self.number for b in loop.tolist()] for a in loop.tolist()])
+        triangles, area = least_surface(points, used)
+        if area > most:
+            return None
+        # The new faces run along each edge against the face that is there.
+        single = np.where(k >= 0, self.edges.count[k], 0) == 1
+        against = sum(
+            length[i] * (1 if _runs(self.faces[self.first[k[i]]], *ring[i]) else -1) for i in np.flatnonzero(single)
+        )
+        values, counts = np.unique(plane[plane >= 0], return_counts=True)
+        return loop[triangles[:, ::-1] if against > 0 else triangles], int(values[np.argmax(counts)])
+
+
 def close_loops(
     vertices: np.ndarray, faces: np.ndarray, patch_plane: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -154,65 +192,39 @@ def close_loops(
     Returns:
         faces (m', 3), the given face (m',) that each is or is part of, -1 for new ones, plane (m',).
     """
-    edges = edges_of(faces)
-    key = {(int(a), int(b)): k for k, (a, b) in enumerate(edges.ends)}
-    first = np.full(len(edges.ends), -1)
-    first[edges.of_face[::-1].ravel()] = np.repeat(np.arange(len(faces))[::-1], 3)
-    plane_at = np.full(len(edges.ends), -1)
-    np.maximum.at(plane_at, edges.of_face.ravel(), np.repeat(patch_plane, 3))
-    piece = edge_pieces(edges)
+    at = _Borders(vertices, faces, patch_plane)
+    piece = edge_pieces(at.edges)
     own_outline = set(np.unique(piece[~np.isin(piece, piece[patch_plane < 0])]).tolist())
-    new: list[np.ndarray] = []
-    new_plane: list[int] = []
-
-    def close(loop: np.ndarray) -> bool:
-        """Lays faces over a loop, the last edge of which need not exist; False where it is left."""
-        points = vertices[loop]
-        ring = list(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
-        k = np.array([key.get((min(a, b), max(a, b)), -1) for a, b in ring])
-        length = np.linalg.norm(points - np.roll(points, -1, axis=0), axis=1)
-        plane = np.where(k >= 0, plane_at[k], -1)
-        surrounded = k[-1] >= 0 and length[plane >= 0].sum() > HALF * length.sum()
-        most = max(HOLE_M2 if surrounded else 0.0, REACH_M * length.sum() / 2)
-        # No surface over a loop is smaller than its shadow.
-        shadow = np.cross(points - points.mean(axis=0), np.roll(points, -1, axis=0) - points.mean(axis=0)).sum(axis=0)
-        if np.linalg.norm(shadow) / 2 > most or len(loop) > MAX_EDGES:
-            return False
-        used = np.array([[(min(a, b), max(a, b)) in key for b in loop.tolist()] for a in loop.tolist()])
-        triangles, area = least_surface(points, used)
-        if area > most:
-            return False
-        # The new faces run along each edge against the face that is there.
-        single = np.where(k >= 0, edges.count[k], 0) == 1
-        against = sum(length[i] * (1 if _runs(faces[first[k[i]]], *ring[i]) else -1) for i in np.flatnonzero(single))
-        new.append(loop[triangles[:, ::-1] if against > 0 else triangles])
-        values, counts = np.unique(plane[plane >= 0], return_counts=True)
-        new_plane.extend([int(values[np.argmax(counts)])] * len(triangles))
-        return True
+    new: list[tuple[np.ndarray, int]] = []
 
     loops = border_loops(faces)
     around = [float(np.linalg.norm(vertices[v] - np.roll(vertices[v], -1, axis=0), axis=1).sum()) for v in loops]
     for number in np.argsort(around, kind="stable")[::-1]:
         loop = loops[number]
         k = np.array(
-            [key[min(a, b), max(a, b)] for a, b in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)]
+            [at.number[min(a, b), max(a, b)] for a, b in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)]
         )
-        ours = (edges.count[k] == 1) & (plane_at[k] >= 0)
-        if piece[first[k[0]]] in own_outline:  # the longest comes first
-            own_outline.remove(piece[first[k[0]]])
+        ours = (at.edges.count[k] == 1) & (at.plane[k] >= 0)
+        if piece[at.first[k[0]]] in own_outline:  # the longest comes first
+            own_outline.remove(piece[at.first[k[0]]])
             continue
-        if not ours.any() or close(loop):
+        if not ours.any():
+            continue
+        if covered := at.cover(loop):
+            new.append(covered)
             continue
         rest = np.ones(len(loop), bool)
         for i, j in _pockets(vertices[loop], ours):
             inside = np.arange(i, j + 1 if i < j else j + 1 + len(loop)) % len(loop)
-            if rest[inside].all() and close(loop[inside]):
+            if rest[inside].all() and (covered := at.cover(loop[inside])):
+                new.append(covered)
                 rest[inside[1:-1]] = False
     if not new:
         return faces, np.arange(len(faces)), patch_plane
-    every = np.vstack([faces, *new])
+    new_plane = np.repeat([plane for _, plane in new], [len(laid) for laid, _ in new])
+    every = np.vstack([faces, *(laid for laid, _ in new)])
     source = np.concatenate([np.arange(len(faces)), np.full(len(new_plane), -1)])
-    plane = np.concatenate([patch_plane, np.array(new_plane, patch_plane.dtype)])
+    plane = np.concatenate([patch_plane, new_plane.astype(patch_plane.dtype)])
     return _flip_flat(vertices, every, source, plane)
 
 

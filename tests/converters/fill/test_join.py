@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.fill.join import REACH_M, border_edges, close_cracks, cut_teeth, open_border
+from benchmarks.cracks import open_border
+from converters.fill.join import REACH_M, border_edges, close_cracks, cut_teeth
 from converters.geometry.faces import face_areas
 
 

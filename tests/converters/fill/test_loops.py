@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.fill.join import border_edges, open_border
+from benchmarks.cracks import open_border
+from converters.fill.join import border_edges
 from converters.fill.loops import HOLE_M2, border_loops, close_loops, least_surface, without_dust, without_flaps
 from converters.geometry.faces import face_areas
 
