@@ -14,8 +14,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import custom_batching
 
+from interactive_nav.batching import one_of_batch
 from interactive_nav.scenes.contacts import combine
 
 TOUCH_FORCE_N = 1e-4
@@ -85,52 +85,12 @@ class Physics(abc.ABC):
         self, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array | float = 0.0
     ) -> tuple[PhysicsState, StepSignals]:
         """One environment's `step_batch`; under any number of `vmap`s all environments step in one call."""
-        return _step_single(self, scene, state, command, jnp.asarray(time_s, jnp.float32))
+        return one_of_batch(self.step_batch, (scene, state, command, jnp.asarray(time_s, jnp.float32)))
 
 
 def uncommitted(tree: Any) -> Any:
     """The tree with its arrays on no device in particular, as constants of a program on several must be."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)) if isinstance(x, jax.Array) else x, tree)
-
-
-def _flatten(tree, outer: int, inner: int):
-    return jax.tree.map(lambda x: x.reshape((outer * inner, *x.shape[2:])), tree)
-
-
-def _broadcast(tree, batched, size: int):
-    return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
-
-
-def _step_many(physics: Physics, *args):
-    """`step_batch`, which a further vmap flattens into a larger batch."""
-
-    @custom_batching.custom_vmap
-    def many(*args):
-        return physics.step_batch(*args)
-
-    @many.def_vmap
-    def rule(axis_size, in_batched, *args):
-        args = _broadcast(args, tuple(in_batched), axis_size)
-        inner = args[0].shape[1]
-        out = _step_many(physics, *_flatten(args, axis_size, inner))
-        out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
-        return out, jax.tree.map(lambda _: True, out)
-
-    return many(*args)
-
-
-def _step_single(physics: Physics, *args):
-    @custom_batching.custom_vmap
-    def single(*args):
-        out = _step_many(physics, *jax.tree.map(lambda x: x[None], args))
-        return jax.tree.map(lambda x: x[0], out)
-
-    @single.def_vmap
-    def rule(axis_size, in_batched, *args):
-        out = _step_many(physics, *_broadcast(args, tuple(in_batched), axis_size))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return single(*args)
 
 
 @dataclasses.dataclass(frozen=True)
