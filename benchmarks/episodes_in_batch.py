@@ -22,11 +22,11 @@ from typing import Any
 
 import jax
 
+from interactive_nav_common.config import overridden
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contest import Contest, Venue, load_networks, local_policy
 from topological_nav.evaluate.evaluation import NavigatorPlayer, Played, Tell, play
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.settings import overridden
 from topological_nav.weights.packaged import packaged_weights
 
 COMPILED = "/jax/core/compile/backend_compile_duration"

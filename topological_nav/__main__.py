@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.schema import SceneError
 from topological_nav.commands import adapt
@@ -35,7 +36,6 @@ from topological_nav.config import (
     passage_config,
     room_config,
 )
-from topological_nav.settings import overridden, refuse_unused, settings_help
 
 if TYPE_CHECKING:
     from topological_nav.evaluate.contest import Contest

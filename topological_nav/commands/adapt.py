@@ -7,11 +7,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from interactive_nav_common.config import field_docs
+from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES
-from topological_nav.settings import overridden, refuse_unused
 
 Asked = Callable[[], bool]
 

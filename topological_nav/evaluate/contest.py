@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rows import read_rows, write_parquet
@@ -54,7 +54,6 @@ from topological_nav.navigate.navigator import Navigator
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.simulation import Camera, Simulator, make_env, pose_camera, scene_camera
 from topological_nav.scenes.space import FreeSpace, free_space
-from topological_nav.settings import overlaid
 from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
 
@@ -182,7 +181,7 @@ class Venue:
         """How the navigator's images are drawn: as the networks learned, by the map's engine and lens."""
         assert self.networks is not None
         of_map = {k: v for k, v in self.map.about.get("data", {}).items() if k in ("engine", "fov_deg")}
-        drawn = overlaid(self.networks.camera, of_map, "map")
+        drawn = overlay(self.networks.camera, of_map, "map")
         drawn = dataclasses.replace(drawn, fov_deg=lens_of(drawn, self.robot).fov_deg)
         return drawn_for(drawn, self.contest.config.supersample)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings, lens_of
@@ -27,7 +27,6 @@ from topological_nav.maps.sight import NetworkSight, Sight
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
-from topological_nav.settings import overlaid
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""
@@ -79,7 +78,7 @@ def build_map(
     space = free_space(scene, robot.height_m)
     known = recorded_rooms(scene.digest)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
-    judged = overlaid(DataConfig(), detector.about["data"], str(detector_run))
+    judged = overlay(DataConfig(), detector.about["data"], str(detector_run))
     margin_m, points = judged.passage_margin_m, judged.passage_points
     xy, lacking = place_nodes(space, rooms, config, margin_m, points)
     if not len(xy):
@@ -204,7 +203,7 @@ def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
                 f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
                 "train both on one dataset"
             )
-    return overlaid(DataConfig(), first, "network.json")
+    return overlay(DataConfig(), first, "network.json")
 
 
 class _Pictures:

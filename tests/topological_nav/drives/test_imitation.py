@@ -10,6 +10,7 @@ import numpy as np
 import optax
 import pytest
 
+from interactive_nav_common.config import overridden
 from interactive_nav_common.metrics_file import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
@@ -19,7 +20,6 @@ from topological_nav.drives.driving import load_policy
 from topological_nav.drives.policy import Forward, Policy
 from topological_nav.errors import RunError
 from topological_nav.learn.learning import Learner
-from topological_nav.settings import overridden
 
 WORDS = (
     *("hidden=24", "projection=8", "forward_hidden=16", "steps=20", "overlap_s=1.5", "batch=8", "epochs=10"),

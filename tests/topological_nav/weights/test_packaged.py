@@ -12,6 +12,7 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import overlay
 from topological_nav.__main__ import main
 from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.passages import draw_passages
@@ -25,7 +26,6 @@ from topological_nav.ros.__main__ import parser as ros_parser
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.space import free_space
-from topological_nav.settings import overlaid
 from topological_nav.weights import packaged
 from topological_nav.weights.export import sizes_of
 from topological_nav.weights.packaged import choose, fitting_map, packaged_weights
@@ -218,7 +218,7 @@ def test_the_packaged_networks_tell_free_ways_from_blocked_ones():
     scene, robot = load_scene(ROOT / "scenes_mjcf" / "cedar"), get_robot(data.robot)
     space, known = free_space(scene, robot.height_m), recorded_rooms(scene.digest)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
-    asked = overlaid(DataConfig(), networks[1].about["data"], "network.json")
+    asked = overlay(DataConfig(), networks[1].about["data"], "network.json")
     ways = draw_passages(space, rooms, asked, np.random.default_rng(99))
     picked = np.concatenate(
         [
