@@ -35,7 +35,7 @@ from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
 from topological_nav.errors import DatasetError, SpaceError, readable
-from topological_nav.maps.graph import place_nodes
+from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.space import FreeSpace, free_space

@@ -20,9 +20,11 @@ from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings, lens_of
-from topological_nav.errors import MapError, SpaceError
-from topological_nav.learn.training import Trained, load_trained
-from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
+from topological_nav.errors import SpaceError
+from topological_nav.learn.pairs import camera_of
+from topological_nav.learn.training import load_trained
+from topological_nav.maps.graph import TopologicalMap, assemble, lengths
+from topological_nav.maps.nodes import place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import Rooms, find_rooms, recorded_rooms
@@ -33,8 +35,6 @@ CHUNK = 252
 Progress = Callable[[str, int, int], None]
 CPU_SUPERSAMPLE = 2
 """Beyond it drawing is what a CPU mostly does, and the networks answer nearly the same (docs/topological.md)."""
-SAME = ("robot", "engine", "width", "height", "fov_deg", "headings")
-"""What two networks' images must have in common to look through one camera."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +68,7 @@ def build_map(
         parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
 
     Raises:
-        RunError: a run is not finished.
-        MapError: the networks learned from different cameras, or the second judges no passages.
+        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
         SceneError, SpaceError: the scene cannot be used.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
@@ -186,24 +185,6 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
 def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
     """What draws a scene as a dataset's images were drawn."""
     return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
-
-
-def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
-    """The settings of the camera that both networks learned from.
-
-    Raises:
-        MapError: they learned from different cameras, or the second judges no passages.
-    """
-    if detector.about["task"] != "passages":
-        raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
-    first, second = ({**n.about["data"], "fov_deg": n.about["fov_deg"]} for n in (localiser, detector))
-    for name in SAME:
-        if first[name] != second[name]:
-            raise MapError(
-                f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
-                "train both on one dataset"
-            )
-    return overlay(DataConfig(), first, "network.json")
 
 
 class _Pictures:

@@ -18,8 +18,9 @@ from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.passages import draw_passages
 from topological_nav.drives.driving import load_policy
 from topological_nav.errors import RunError
+from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained
-from topological_nav.maps.build import camera_of, renderer_of
+from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.ros.__main__ import _journey
 from topological_nav.ros.__main__ import parser as ros_parser
@@ -164,7 +165,7 @@ def test_a_map_of_own_runs_is_made_but_never_written_over(made, here, capsys):
 @pytest.mark.heavy
 def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
     from topological_nav.config import EvaluationConfig
-    from topological_nav.evaluate.contest import Contest, venues_of
+    from topological_nav.evaluate.contest import Contest, contest_scenes
 
     asked = []
     for home in (made.rooms.parent, exported):
@@ -173,7 +174,7 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
             (made.scene,), ("dense",), made.map, EvaluationConfig(), map_files=files,
             localiser=home / "rooms", detector=home / "passages",
         )  # fmt: skip
-        asked.append(venues_of(contest)[0].asked("dense"))
+        asked.append(contest_scenes(contest)[0].asked("dense"))
     assert asked[0]["map"] == asked[1]["map"] and "localiser" not in asked[0]
     assert asked[1]["detector"] == f"{asked[0]['detector']}-fp16" and asked[1]["localiser"].endswith("-fp16")
 
