@@ -22,11 +22,12 @@ from typing import Any
 
 import jax
 
+from interactive_nav_common.config import overridden
 from topological_nav.config import EvaluationConfig
-from topological_nav.evaluate.contest import Contest, Venue, load_networks, local_policy
-from topological_nav.evaluate.evaluation import NavigatorPlayer, Played, Tell, play
+from topological_nav.evaluate.contenders import NavigatorPlayer
+from topological_nav.evaluate.contest import Contest, ContestScene, load_networks, local_policy
+from topological_nav.evaluate.evaluation import Played, Tell, play
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.settings import overridden
 from topological_nav.weights.packaged import packaged_weights
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -96,7 +97,7 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
     """
     clock, images = Clock(), 0
     began = time.perf_counter()
-    venue = Venue(contest.scenes[0], contest, load_networks(contest.localiser, contest.detector))
+    venue = ContestScene(contest.scenes[0], contest, load_networks(contest.localiser, contest.detector))
     made = venue.map_of("dense")
     real = venue.sight(made)
     distances, passage = clock.timed("networks", real.distances), clock.timed("networks", real.passage)
@@ -113,7 +114,7 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
         images += len(xy_w)
         return draw(xy_w, yaw_rad)
 
-    journeys = clock.timed("episodes drawn", lambda: venue.journeys)()
+    journeys = clock.timed("episodes drawn", lambda: venue.episodes)()
     player = NavigatorPlayer(Navigator(made, sight, policy, contest.config), simulator, camera, contest.config)
     played = clock.timed(REST, play)(player, simulator, journeys, contest.config, tell)
     return dict(clock.parts), played, images, time.perf_counter() - began

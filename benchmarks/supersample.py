@@ -20,8 +20,9 @@ import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import Trained, load_trained
-from topological_nav.maps.build import camera_of, renderer_of
+from topological_nav.maps.build import renderer_of
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import free_space
 from topological_nav.weights.packaged import packaged_weights

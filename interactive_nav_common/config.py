@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import difflib
@@ -12,7 +13,7 @@ import textwrap
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 
@@ -22,6 +23,27 @@ Config = TypeVar("Config")
 
 
 AUTO = "auto"  # how None ("chosen for you") is written in files and on the command line
+
+
+Seed = Annotated[int, (0, 2**32 - 1)]
+Count = Annotated[int, (1, 10**6)]
+Share = Annotated[float, (0.0, 1.0)]
+
+
+class Settings:
+    """Base of a frozen dataclass that refuses numbers out of their bounds, as in `p: Annotated[float, (0.0, 1.0)]`."""
+
+    def __post_init__(self) -> None:
+        for name, hint in _hints(type(self)).items():
+            value = getattr(self, name)
+            for low, high in getattr(hint, "__metadata__", ()) if value is not None else ():  # None: still to be chosen
+                if not low <= value <= high:
+                    raise ConfigError(f"{name} is {value!r}, expected between {low:g} and {high:g}")
+
+
+@functools.cache
+def _hints(config_type: type) -> dict[str, Any]:
+    return typing.get_type_hints(config_type, include_extras=True)
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -112,6 +134,45 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
         raise
     except ValueError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
         raise ConfigError(f"{where}: {prefix}{error}") from None
+
+
+def overridden(config: Config, words: Sequence[str]) -> Config:
+    """The config with `name=value` words laid over it; values are read as YAML.
+
+    Raises:
+        ConfigError: a word without `=`, an unknown name, or a value that the setting cannot have.
+    """
+    return overlay(config, read_words(words, "seed=1"), "setting")
+
+
+def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
+    """Refuses options and settings that were given but would change nothing.
+
+    Args:
+        arguments: of a command line, its `key=value` words in `settings`; what is None, False or empty was not given.
+        names: `--options` and settings.
+        why: with what they change nothing.
+
+    Raises:
+        ConfigError: one of them was given.
+    """
+    words = {word.partition("=")[0] for word in arguments.settings}
+    for name in names.split():
+        option = name.startswith("--")
+        if getattr(arguments, name[2:].replace("-", "_")) if option else name in words:
+            raise ConfigError(f"{name} has no effect {why}; leave it out")
+
+
+def settings_help(config: Any) -> str:
+    """One line a setting: name, default, meaning."""
+    docs, hints = field_docs(type(config)), typing.get_type_hints(type(config))
+    lines = []
+    for name, value in to_dict(config).items():
+        shown = ",".join(map(str, value)) if isinstance(value, list) else value
+        choice = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is Literal else ()
+        lines.append((f"{name}={shown}", docs[name] + (f" [{' | '.join(choice)}]" if choice else "")))
+    width = max(len(left) for left, _ in lines) + 2
+    return "\n".join(f"  {left:<{width}}{right}" for left, right in lines)
 
 
 def _convert(value: Any, kind: Any, where: str) -> Any:

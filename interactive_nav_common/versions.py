@@ -1,4 +1,4 @@
-"""What a result depends on: packages, device, commit, command."""
+"""What a result depends on: packages, device, cores, commit, command."""
 
 from __future__ import annotations
 
@@ -66,3 +66,8 @@ def commit() -> str | None:
         return None
     head = git("rev-parse", "HEAD")
     return head and head + ("+dirty" if git("status", "--porcelain") else "")
+
+
+def usable_cores() -> int:
+    """Of the machine, those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from interactive_nav_common.config import overridden
 from topological_nav.__main__ import parser
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import (
@@ -22,7 +23,6 @@ from topological_nav.config import (
     passage_config,
     room_config,
 )
-from topological_nav.settings import overridden
 from train.config_io import load
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ from topological_nav.data.dataset import load_plan
 from topological_nav.data.shards import read_shard
 from topological_nav.drives.dataset import _read as read_batch
 from topological_nav.drives.driving import load_policy
-from topological_nav.learn.runs import claim
+from topological_nav.learn.runs import claimed
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
 from topological_nav.weights.packaged import Choice, fitting_map
@@ -65,8 +65,8 @@ def test_cut_off_arrays(size, tmp_path):
 def test_settings_of_a_run_that_are_no_settings(tmp_path):
     for text in ("a: [", "just words", ""):
         (tmp_path / "config.yaml").write_text(text)
-        with pytest.raises(UserError) as error:
-            claim(tmp_path, {"seed": 1})
+        with pytest.raises(UserError) as error, claimed(tmp_path, {"seed": 1}):
+            pass
         assert "config.yaml" in told_once(error)
 
 

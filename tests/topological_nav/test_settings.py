@@ -2,10 +2,9 @@
 
 import pytest
 
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, overridden, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig, TrainConfig, passage_config, room_config
-from topological_nav.settings import overlaid, overridden, settings_help
 
 
 def test_words_are_read_by_the_types_of_the_settings():
@@ -40,7 +39,7 @@ def test_headings_must_leave_every_third_for_testing():
 def test_settings_written_down_are_read_back():
     config = DataConfig(seed=3, fov_deg=None, room_method="spectral")
     assert to_dict(config)["fov_deg"] == "auto"
-    assert overlaid(DataConfig(), to_dict(config), "file") == config
+    assert overlay(DataConfig(), to_dict(config), "file") == config
 
 
 def test_defaults_are_the_reports():

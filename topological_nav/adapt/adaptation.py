@@ -10,13 +10,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
-import flax.serialization
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -24,19 +22,14 @@ import numpy as np
 import optax
 
 from interactive_nav_common.config import to_dict
-from interactive_nav_common.files import whole_file, write_text
-from interactive_nav_common.metrics_file import read_metrics
-from interactive_nav_common.versions import versions
 from topological_nav.adapt.config import AdaptConfig
-from topological_nav.config import PITCHES
 from topological_nav.data.dataset import RoomImages, load_rooms, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.errors import RunError
 from topological_nav.learn.learning import compiled_epoch, initial
-from topological_nav.learn.localise import localisation_scores
 from topological_nav.learn.networks import Network, joined, normalised
-from topological_nav.learn.runs import METRICS, RESULTS, claimed, read_checkpoint, restored
-from topological_nav.learn.training import Trained, load_trained, save_trained
+from topological_nav.learn.runs import claimed, run_epochs, write_results
+from topological_nav.learn.training import Trained, load_trained, localisation, rows_by_scene, save_trained
 
 ROOMS_STREAM, PASSAGES_STREAM = 1, 2
 """Of chance in target images."""
@@ -186,23 +179,19 @@ def adapt_features(
     headers = [read_header(folder)[0] for folder in (source, target)]
     data = {name: digest_of(header) for name, header in zip(("source", "target"), headers, strict=True)}
     with claimed(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data}):
-        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
-        size = near.images.shape[3:]
-        learned = near.images[~near.test].reshape(-1, *size)
-        unlabelled = far.images[~far.test].reshape(-1, *far.images.shape[3:])
+        learned, unlabelled = (x.images[~x.test].reshape(-1, *x.images.shape[3:]) for x in (near, far))
         embedded = trained.embed(learned)
         state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
-        epoch = adversarial_epoch(trained.network, critic, config)
+        epoch: Any = adversarial_epoch(trained.network, critic, config)
         on_device = jnp.asarray(unlabelled), jnp.asarray(embedded)
-        state, done = resumable_epochs(
-            out, "features", state, lambda learner, key: epoch(learner, *on_device, key), config.epochs,
-            config.seed, tell, should_stop,
+        state = run_epochs(
+            out, "features", state, lambda learner, _, key: epoch(learner, *on_device, key), config.epochs,
+            epoch_keys(config), tell, should_stop, "checkpoint-features.msgpack",
         )  # fmt: skip
-        if not done:
+        if state is None:
             return None
         variables = {"params": state.params, "batch_stats": state.batch_stats}
-        about = {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
-        adapted = save_trained(out, Trained(trained.network, variables, about))
+        adapted = save_trained(out, Trained(trained.network, variables, adapted_about(trained, config)))
         fitted = target_statistics(trained, unlabelled, config.batch)
         same = headers[0]["scenes"] == headers[1]["scenes"]
         results = {
@@ -213,8 +202,17 @@ def adapt_features(
         for name, network in (("before", trained), ("statistics", fitted), ("after", adapted)):
             nodes = (trained, near) if same else (network, far)
             results[name] = localisation_between(*nodes, network, far)
-        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-        return results
+        return write_results(out, results)
+
+
+def epoch_keys(config: AdaptConfig) -> jax.Array:
+    """Chance of all epochs of adaptation."""
+    return jax.random.fold_in(jax.random.PRNGKey(config.seed), 3)
+
+
+def adapted_about(trained: Trained, config: AdaptConfig) -> dict[str, Any]:
+    """What network.json says of a network that was adapted from a trained one."""
+    return {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
 
 
 def digest_of(header: dict[str, Any]) -> str:
@@ -231,101 +229,18 @@ def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
 def localisation_between(
     node_network: Trained, node_rooms: RoomImages, query_network: Trained, query_rooms: RoomImages
 ) -> dict[str, Any]:
-    """Scores of queries of one domain on nodes of another, as `training.localisation` has them within one.
-
-    Training positions of `node_rooms` are nodes with all their level images; every third level image of the test
-    positions of `query_rooms` is a query. Scenes are those of both, by name; `mean` weighs them by queries.
-    """
-    level, rows, weights = PITCHES.index("level"), {}, []
-    scenes = [_scenes(rooms) for rooms in (node_rooms, query_rooms)]
-    for name in scenes[0]:
-        if name not in scenes[1]:
-            continue
-        nodes = scenes[0][name] & ~node_rooms.test
-        queries = scenes[1][name] & query_rooms.test
-        if not nodes.any() or not queries.any():
-            continue
-        shown, asked = node_rooms.images[nodes][:, level], query_rooms.images[queries][:, level, ::3]
-        embedded = node_network.embed(shown.reshape(-1, *shown.shape[2:])).reshape(*shown.shape[:2], -1)
-        each = asked.shape[1]
-        rows[name] = localisation_scores(
-            query_network.embed(asked.reshape(-1, *asked.shape[2:])),
-            np.repeat(query_rooms.xy_w[queries], each, 0),
-            np.repeat(query_rooms.label[queries], each),
-            embedded,
-            node_rooms.xy_w[nodes],
-            node_rooms.label[nodes],
-        )
-        weights.append(int(queries.sum()) * each)
-    if not rows:
-        raise RunError("source and target have no scene in common with positions for training and for testing")
-    keys = next(iter(rows.values()))
-    rows["mean"] = {k: float(np.average([r[k] for r in rows.values()], weights=weights)) for k in keys}
-    return {**rows, "queries": sum(weights)}
-
-
-def resumable_epochs(
-    out: Path,
-    name: str,
-    learner: Any,
-    epoch: Callable[[Any, jax.Array], tuple[Any, dict[str, jax.Array]]],
-    epochs: int,
-    seed: int,
-    tell: Tell,
-    should_stop: Asked,
-) -> tuple[Any, bool]:
-    """Epochs of one learner of a run folder; those that a checkpoint holds are not run again.
-
-    Args:
-        out: the run folder; `metrics.jsonl` there gets a line an epoch.
-        name: of the learner, of its checkpoint, and `phase` of its lines.
-        learner: as it starts.
-        epoch: learner and key to learner and means, `loss` among them.
-        epochs: in all.
-        seed: of the epochs' keys.
-        tell: told a line an epoch.
-        should_stop: asked after every epoch.
-
-    Returns:
-        The learner, and whether it is done.
+    """Scores of queries of one domain on nodes of another, as `training.localisation` has them; and their number.
 
     Raises:
-        RunError: a damaged checkpoint, or a loss that is not finite.
+        RunError: source and target have nothing in common to score.
     """
-    path, metrics = out / f"checkpoint-{name}.msgpack", out / METRICS
-    saved = read_checkpoint(path)
-    first = 0
-    if saved is not None:
-        first, learner = saved["epoch"], restored(learner, saved["learner"], path)
-    if metrics.is_file():
-        lines = read_metrics(metrics)
-        kept = [line for line in lines if line["phase"] != name or line["epoch"] <= first]
-        write_text(metrics, "".join(json.dumps(line) + "\n" for line in kept))
-    keys, began = jax.random.fold_in(jax.random.PRNGKey(seed), 3), time.perf_counter()
-    for number in range(first, epochs):
-        started = time.perf_counter()
-        learner, means = epoch(learner, jax.random.fold_in(keys, number))
-        line = {"phase": name, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
-        now = time.perf_counter()
-        if not np.isfinite(line["loss"]):
-            raise RunError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning rate")
-        with open(metrics, "a") as file:
-            file.write(json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
-        state = {"epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}
-        with whole_file(path) as partial:
-            partial.write_bytes(flax.serialization.msgpack_serialize(jax.device_get(state)))
-        left = (now - began) / (number + 1 - first) * (epochs - number - 1)
-        scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
-        tell(f"{name}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
-        if should_stop():
-            return learner, False
-    return learner, True
-
-
-def _scenes(rooms: RoomImages) -> dict[str, np.ndarray]:
-    """Scene name -> rows."""
-    names = [rooms.names[label].rpartition("/")[0] for label in rooms.label]
-    return {name: np.array([n == name for n in names]) for name in dict.fromkeys(names)}
+    rows = localisation(node_network, node_rooms, query_network, query_rooms)
+    if not rows:
+        raise RunError("source and target have no scene in common with positions for training and for testing")
+    places = sum(
+        int((mine & query_rooms.test).sum()) for name, mine in rows_by_scene(query_rooms).items() if name in rows
+    )
+    return {**rows, "queries": places * len(range(0, query_rooms.images.shape[2], 3))}
 
 
 def _optimisers(config: AdaptConfig):

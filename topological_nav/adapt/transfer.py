@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,18 +22,25 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import to_dict
-from interactive_nav_common.files import write_text
-from interactive_nav_common.versions import versions
-from topological_nav.adapt.adaptation import PASSAGES_STREAM, Asked, Tell, digest_of, resumable_epochs, target_rooms
+from topological_nav.adapt.adaptation import (
+    PASSAGES_STREAM,
+    Asked,
+    Tell,
+    adapted_about,
+    digest_of,
+    epoch_keys,
+    target_rooms,
+)
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES, DataConfig
 from topological_nav.data.dataset import headings, load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
-from topological_nav.errors import DatasetError, MapError, RunError
+from topological_nav.errors import DatasetError, MapError
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
 from topological_nav.learn.localise import localisation_scores
-from topological_nav.learn.runs import RESULTS, claimed
+from topological_nav.learn.pairs import need_task
+from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, length_scores, load_trained, save_trained
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import assemble, lengths, near_pairs
@@ -77,13 +83,11 @@ def passage_configurations(
         DatasetError, RunError: something cannot be used.
     """
     trained = load_trained(run)
-    if trained.about["task"] != "passages":
-        raise RunError(f"{run}: was trained for '{trained.about['task']}', expected a run of 'train passages'")
+    need_task(trained.about, "passages", f"{run}:")
     learned, tested = _labelled(target, trained.about["lengths_m"], config)
     header, _ = read_header(target)
     about = {"run": trained.about["digest"][:12], "target": digest_of(header)}
     with claimed(out, {"task": "transfer", **to_dict(config), **about}):
-        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
         network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
         fresh = make_learner(network, shape, tx, config.seed)
@@ -94,20 +98,18 @@ def passage_configurations(
             # A copy: an epoch gives its argument's memory away.
             learner = jax.tree.map(jnp.array, _of(trained, tx) if from_source else fresh)
             if tunes:
-                learner, done = resumable_epochs(
-                    out, name, learner, lambda state, key: epoch(state, images, labels, key), config.fine_tune_epochs,
-                    config.seed, tell, should_stop,
+                learner = run_epochs(
+                    out, name, learner, lambda state, _, key: epoch(state, images, labels, key),
+                    config.fine_tune_epochs, epoch_keys(config), tell, should_stop, f"checkpoint-{name}.msgpack",
                 )  # fmt: skip
-                if not done:
+                if learner is None:
                     return None
             variables = {"params": learner.params, "batch_stats": learner.batch_stats}
             tuned = Trained(network, variables, trained.about)
             results[name] = _scores(tuned, tested)
             if name == "D":
-                about = {"adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
-                save_trained(out, dataclasses.replace(tuned, about={**trained.about, **about}))
-        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-        return results
+                save_trained(out, dataclasses.replace(tuned, about=adapted_about(trained, config)))
+        return write_results(out, results)
 
 
 def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):
@@ -129,8 +131,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
         DatasetError, MapError, RunError: something cannot be used, or does not fit.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
-    if detector.about["task"] != "passages":
-        raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
+    need_task(detector.about, "passages", "the detector")
     scene = load_scene(scene_folder)
     header, data = read_header(target)
     index = next((i for i, s in enumerate(header["scenes"]) if s["digest"] == scene.digest), None)
@@ -153,7 +154,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
 
     if not len(near_pairs(xy, config.edge_m)):
         raise MapError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
-    embedded = localiser.embed(shown.reshape(-1, *shown.shape[2:])).reshape(*shown.shape[:2], -1)
+    embedded = localiser.embed(shown)
     judged = DataConfig(**{k: detector.about["data"][k] for k in ("passage_margin_m", "passage_points")})
     about = {
         "settings": to_dict(config),
@@ -181,14 +182,8 @@ def _map_scores(localiser, made, free, asked, rooms, held, label, config: AdaptC
         "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
     }
     if len(asked):
-        each = asked.shape[1]
         found = localisation_scores(
-            localiser.embed(asked.reshape(-1, *asked.shape[2:])),
-            np.repeat(rooms.xy_w[held], each, 0),
-            np.repeat(rooms.label[held], each),
-            made.embeddings,
-            made.xy_w,
-            label,
+            localiser.embed(asked), rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label
         )
         scores["held-out images localised"] = (
             f"nearest node {found['node']:.3f}, right room {found['room']:.3f}, "

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from interactive_nav_common.config import field_docs
+from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.signals import stop_signals
 from topological_nav.adapt.config import AdaptConfig
+from topological_nav.commands.progress import Stopped, say
 from topological_nav.config import PITCHES
-from topological_nav.settings import overridden, refuse_unused
 
 Asked = Callable[[], bool]
 
@@ -40,10 +40,11 @@ def add_to(command: Callable[[str, str, object], argparse.ArgumentParser], datas
     adapt.set_defaults(adapted=runs / "adapted", dataset=dataset)
 
 
-def run(arguments: argparse.Namespace, should_stop: Asked) -> bool:
-    """Runs the command; False: it was stopped before the end.
+def run(arguments: argparse.Namespace) -> None:
+    """Runs the command.
 
     Raises:
+        Stopped: a signal asked for it.
         TopologicalError, SceneError: something cannot be used.
     """
     config = overridden(AdaptConfig(), arguments.settings)
@@ -58,8 +59,10 @@ def run(arguments: argparse.Namespace, should_stop: Asked) -> bool:
     chosen = choose(arguments.localiser, arguments.detector, needs=needs)
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
     if chosen.said:
-        print(chosen.said, file=sys.stderr, flush=True)
-    return _RUNS[arguments.what](arguments, config, should_stop)
+        say(chosen.said)
+    with stop_signals() as stops:
+        if not _RUNS[arguments.what](arguments, config, lambda: bool(stops)):
+            raise Stopped(stops[0])
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:

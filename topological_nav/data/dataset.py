@@ -25,7 +25,7 @@ import numpy as np
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import CameraPose, Lens
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import CameraConfig, DataConfig
@@ -35,7 +35,6 @@ from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import Rooms, agreement, find_rooms, recorded_rooms
 from topological_nav.scenes.space import FreeSpace, free_space, spread
-from topological_nav.settings import overlaid
 
 FORMAT = 2
 """Of the folder; raised whenever older datasets would be read wrongly."""
@@ -253,7 +252,7 @@ def read_header(folder: Path) -> tuple[dict[str, Any], DataConfig]:
     path = Path(folder) / "dataset.json"
     none = f"{folder}: is no dataset (no dataset.json); make one: python -m topological_nav data ..."
     header = read_versioned(path, FORMAT, none, "make the dataset again")
-    return header, overlaid(DataConfig(), header["settings"], str(path))
+    return header, overlay(DataConfig(), header["settings"], str(path))
 
 
 def load_rooms(folder: Path) -> RoomImages:

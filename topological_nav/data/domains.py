@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Annotated
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from interactive_nav_common.config import Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
-from topological_nav.settings import require
 
 _GAMMA = 2.2
 """Between grey levels and light, for rendered images."""
@@ -22,43 +23,32 @@ _CHUNK = 256
 
 
 @dataclasses.dataclass(frozen=True)
-class DomainConfig:
+class DomainConfig(Settings):
     """A camera that is not the renderer's; the defaults change nothing."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Of noise and of what differs from image to image."""
-    zoom: float = 1.0
+    zoom: Annotated[float, (1.0, 10.0)] = 1.0
     """Focal length over the renderer's: 1.3 sees the middle 77 % of the picture's height."""
-    barrel: float = 0.0
+    barrel: Annotated[float, (0.0, 2.0)] = 0.0
     """Radial distortion: what is shown at radius r (1 in the corners) comes from r (1 + barrel r^2) / (1 + barrel): the
     middle bulges, as in wide lenses."""
-    vignette: float = 0.0
+    vignette: Share = 0.0
     """Share of light that the corners lose."""
-    blur_px: float = 0.0
+    blur_px: Annotated[float, (0.0, 1000.0)] = 0.0
     """Longest way of a point during the exposure, along the rows: a robot that turns. Images differ, from 0 to this."""
-    exposure_ev: float = 0.0
+    exposure_ev: Annotated[float, (-10.0, 10.0)] = 0.0
     """Stops brighter (+) or darker (-)."""
-    exposure_spread_ev: float = 0.0
+    exposure_spread_ev: Annotated[float, (0.0, 10.0)] = 0.0
     """Standard deviation of the exposure from image to image."""
-    warmth: float = 0.0
+    warmth: Annotated[float, (-0.9, 0.9)] = 0.0
     """White balance: red gains, and blue loses, this share of light."""
-    contrast: float = 1.0
+    contrast: Annotated[float, (0.1, 10.0)] = 1.0
     """Of the tone curve about middle grey, in grey levels."""
-    shot_noise: float = 0.0
+    shot_noise: Annotated[float, (0.0, 10.0)] = 0.0
     """Standard deviation of light at full scale, as a share of it; it goes with the root of the light."""
-    read_noise: float = 0.0
+    read_noise: Annotated[float, (0.0, 10.0)] = 0.0
     """Standard deviation of light in the dark, as a share of full scale."""
-
-    def __post_init__(self) -> None:
-        require(self, "seed", 0, 2**32 - 1)
-        require(self, "zoom", 1.0, 10.0)
-        require(self, "barrel", 0.0, 2.0)
-        require(self, "vignette", 0.0, 1.0)
-        require(self, "blur_px", 0.0, 1000.0)
-        require(self, "exposure_ev", -10.0, 10.0)
-        require(self, "exposure_spread_ev shot_noise read_noise", 0.0, 10.0)
-        require(self, "warmth", -0.9, 0.9)
-        require(self, "contrast", 0.1, 10.0)
 
 
 PRESETS: dict[str, DomainConfig] = {

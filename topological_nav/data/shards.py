@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.machine import usable_cores
+from interactive_nav_common.versions import usable_cores
 from topological_nav.errors import DatasetError, readable
 
 COLUMNS = 18

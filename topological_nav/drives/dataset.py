@@ -25,7 +25,7 @@ import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
@@ -35,11 +35,10 @@ from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
 from topological_nav.errors import DatasetError, SpaceError, readable
-from topological_nav.maps.graph import place_nodes
+from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
-from topological_nav.settings import overlaid
 
 FORMAT = 1
 """Of the folder; raised whenever older ones would be read wrongly."""
@@ -304,7 +303,7 @@ def read_drives_header(folder: Path) -> tuple[dict[str, Any], DriveConfig]:
     path = Path(folder) / "drives.json"
     none = f"{folder}: holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE..."
     header = read_versioned(path, FORMAT, none, "drive again")
-    return header, overlaid(DriveConfig(), header["settings"], str(path))
+    return header, overlay(DriveConfig(), header["settings"], str(path))
 
 
 def load_drives(folder: Path) -> Drives:

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from topological_nav.drives.imitation import fresh_params, load_networks
+from topological_nav.drives.imitation import fresh_params
 from topological_nav.drives.policy import Forward, Policy
 from topological_nav.errors import RunError
+from topological_nav.learn.pairs import load_pair, need_task
 from topological_nav.learn.runs import read_description, read_weights
 from topological_nav.learn.training import Trained
 
@@ -87,11 +88,10 @@ def load_policy(
     """
     run = Path(run_folder)
     about = read_description(run, "policy", "policy")
-    if about["task"] != "policy":
-        raise RunError(f"{run}: was trained for '{about['task']}', expected a run of 'train policy'")
+    need_task(about, "policy", f"{run}:")
     recorded = [run / network["run"] for network in about["networks"]]
     paths = [Path(given or there) for given, there in zip((localiser, detector), recorded, strict=True)]
-    networks = load_networks(*paths)
+    networks = load_pair(paths[0], paths[1])
     for path, network, learned in zip(paths, networks, about["networks"], strict=True):
         if learned["digest"] not in (network.about["digest"], network.about.get("adapted_from")):
             raise RunError(f"{path}: is not the network that {run} learned with; train the policy again")

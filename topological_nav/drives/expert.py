@@ -75,8 +75,7 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
     cost = 1.0 + config.near_cost * np.clip(1.0 - room / config.near_m, 0.0, 1.0)
     graph = _lattice(free, cost, space.resolution_m)
     _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
-    cell = np.floor((goals_w - space.origin_w) / space.resolution_m).astype(int)
-    column, row = np.clip(cell[:, 0], 0, columns - 1), np.clip(cell[:, 1], 0, rows - 1)
+    column, row = space.inner_cells(goals_w).T
     source = nearest[0][row, column] * columns + nearest[1][row, column]
     far = dijkstra(graph, directed=False, indices=source, limit=limit_m).reshape(-1, rows, columns)
     out = np.empty(far.shape, np.float32)

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
-import flax.serialization
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,10 +25,10 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav_common.config import to_dict
-from interactive_nav_common.files import whole_file, write_text
-from interactive_nav_common.versions import versions
-from topological_nav.config import DriveConfig, PolicyConfig
-from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
+from interactive_nav_common.files import write_text
+from topological_nav.config import PolicyConfig
+from topological_nav.drives.dataset import Drives
+from topological_nav.drives.frames import Frames
 from topological_nav.drives.policy import Forward, Policy, policy_loss, unrolled
 from topological_nav.drives.sequences import (
     Sequences,
@@ -42,135 +40,13 @@ from topological_nav.drives.sequences import (
     turning_share,
 )
 from topological_nav.errors import RunError
-from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, in_batches, initial
-from topological_nav.learn.runs import (
-    CHECKPOINT,
-    DESCRIPTION,
-    RESULTS,
-    WEIGHTS,
-    claimed,
-    cut_metrics,
-    read_checkpoint,
-    restored,
-    run_epochs,
-)
-from topological_nav.learn.training import Trained, load_trained
+from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, initial
+from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
 """alpha and lambda of the report's table."""
-SAME = ("robot", "engine", "width", "height", "fov_deg")
-"""What drives and networks must have in common to look through one camera."""
 LEAST_SPREAD = 0.3
 """Features are scaled by their standard deviation, at least this share of the mean one."""
-_TOLD_EVERY = 10
-"""Files of images between two lines about embedding."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Frames:
-    """Drives of a folder and the embeddings of their images."""
-
-    drives: Drives
-    config: DriveConfig
-    header: dict[str, Any]
-    features: np.ndarray
-    """[F or 2 F, D] f16 of all control steps, 0 where nothing was drawn; then the same of mirrored images."""
-    networks: tuple[Trained, Trained]
-    """Of rooms and of passages."""
-    runs: tuple[Path, Path]
-
-    @property
-    def mirrored(self) -> bool:
-        """Whether there are mirrored ones."""
-        return len(self.features) > len(self.drives.command)
-
-
-def load_networks(localiser_run: Path, detector_run: Path) -> tuple[Trained, Trained]:
-    """The networks that embed the policy's images.
-
-    Raises:
-        RunError: one is not finished, or they learned from different cameras.
-    """
-    networks = load_trained(localiser_run), load_trained(detector_run)
-    for run, network, task in zip((localiser_run, detector_run), networks, ("rooms", "passages"), strict=True):
-        if network.about["task"] != task:
-            raise RunError(f"{run}: was trained for '{network.about['task']}', expected a run of 'train {task}'")
-    seen = [{**n.about["data"], "fov_deg": n.about["fov_deg"]} for n in networks]
-    for name in SAME:
-        if seen[0][name] != seen[1][name]:
-            raise RunError(
-                f"the localiser learned from images with {name} = {seen[0][name]!r}, the detector {seen[1][name]!r}; "
-                "train both on one dataset"
-            )
-    return networks
-
-
-def embed_drives(
-    folder: Path,
-    localiser_run: Path,
-    detector_run: Path,
-    mirror: bool,
-    tell: Callable[[str], None] = lambda _: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> Frames | None:
-    """Embeds the images of all kept drives.
-
-    Args:
-        folder: of the drives.
-        localiser_run: run folder of a room classifier.
-        detector_run: of a passage detector.
-        mirror: embed mirrored images too.
-        tell: told now and then how far it is.
-        should_stop: asked after every file of images.
-
-    Returns:
-        None where it was stopped.
-
-    Raises:
-        DatasetError, RunError: drives or networks cannot be used, or do not fit each other.
-    """
-    header, config = read_drives_header(folder)
-    drives, networks = load_drives(folder), load_networks(localiser_run, detector_run)
-    mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, networks[0].about
-    for name in SAME:
-        expected = theirs["fov_deg"] if name == "fov_deg" else theirs["data"][name]
-        if mine[name] != expected:
-            raise RunError(
-                f"{folder}: images have {name} = {mine[name]!r}, the networks learned from {expected!r}; drive again "
-                f"with {name}={expected}"
-            )
-    count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
-    features: np.ndarray | None = None
-    embed = _embedder(networks, mirror)
-    for i, (rows, images) in enumerate(drive_images(folder)):
-        at, part = drives.rows(rows), in_batches(embed, images)
-        if features is None:
-            features = np.zeros((part.shape[1] * count, part.shape[2]), np.float16)
-        for side in range(part.shape[1]):
-            features[at + side * count] = part[:, side]
-        done += len(images)
-        if i % _TOLD_EVERY == 0 or done == total:
-            tell(f"embedded {done:,} of {total:,} images")
-        if should_stop():
-            return None
-    if features is None:
-        raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
-    return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
-
-
-def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
-    """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
-    modules, weights = [network.network for network in networks], [network.variables for network in networks]
-
-    @jax.jit
-    def embedded(weights: Any, images: jax.Array) -> jax.Array:
-        sides = []
-        for shown in (images, images[:, :, ::-1]) if mirror else (images,):
-            parts = [m.apply(w, shown, method="embed") for m, w in zip(modules, weights, strict=True)]
-            sides.append(jnp.concatenate(parts, -1))  # type: ignore[arg-type]
-        return jnp.stack(sides, 1).astype(jnp.float16)
-
-    return functools.partial(embedded, weights)
 
 
 def train_policy(
@@ -197,7 +73,40 @@ def train_policy(
     """
     if config.mirror and not frames.mirrored:
         raise RunError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
-    drives, values = frames.drives, class_values(config, frames.config.linear_m_s, frames.config.angular_rad_s)
+    values = class_values(config, frames.config.linear_m_s, frames.config.angular_rad_s)
+    split = _split(frames.drives, config, values)
+    digests = [network.about["digest"] for network in frames.networks]
+    with claimed(out, {"task": "policy", "dataset": frames.header, "networks": digests, **to_dict(config)}):
+        policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
+        forward = Forward(config.forward_hidden)
+        params = fresh_params(policy, forward, frames.features.shape[1], config.seed)
+        scale = _scale(frames.features[np.unique(split.learned.rows)])
+        learner = Learner(params, scale, optax.adam(config.learning_rate).init(params))
+        alone = math.ceil(config.alone * config.epochs - 1e-9)
+        weights = {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)}
+        shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(split.learned))
+        epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(split.learned))  # type: ignore[arg-type]
+
+        def one(learner: Learner, number: int, key: jax.Array):
+            return epoch(learner, shown, {**truth, **weights, "jointly": jnp.float32(number >= alone)}, key)
+
+        key = jax.random.PRNGKey(config.seed)
+        learner = run_epochs(out, "policy", learner, one, config.epochs, key, tell, should_stop)
+        return learner and _finish(frames, out, config, values, learner, policy, forward, split)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Split:
+    """Sequences of drives."""
+
+    every: Sequences
+    """Of those to learn from."""
+    learned: Sequences
+    """Of them those that are learned from: thinned, and mirrored where asked for."""
+    held_out: Sequences
+
+
+def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray]) -> _Split:
     every = make_sequences(drives, np.flatnonzero(drives.kept & ~drives.test), config, values, config.overlap_s)
     held_out = make_sequences(drives, np.flatnonzero(drives.kept & drives.test), config, values, 0.0)
     learned = thinned(every, config)
@@ -205,43 +114,15 @@ def train_policy(
         raise RunError(f"no sequence to learn from in {len(drives)} drives; drive more or set straight_kept=1")
     if config.mirror:
         learned = joined([learned, mirrored(learned, len(drives.command), config)])
-    digests = [network.about["digest"] for network in frames.networks]
-    with claimed(out, {"task": "policy", "dataset": frames.header, "networks": digests, **to_dict(config)}):
-        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+    return _Split(every, learned, held_out)
 
-        policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
-        forward = Forward(config.forward_hidden)
-        tx, width = optax.adam(config.learning_rate), frames.features.shape[1]
-        params = fresh_params(policy, forward, width, config.seed)
-        used = frames.features[np.unique(learned.rows)].astype(np.float32)
-        spread = used.std(0)
-        # Features that hardly vary here must not become large where they do.
-        scale = {
-            "mean": jnp.asarray(used.mean(0)),
-            "deviation": jnp.asarray(np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)),
-        }
-        learner = Learner(params, scale, tx.init(params))
-        saved = read_checkpoint(out / CHECKPOINT)
-        cut_metrics(out, ("policy",), saved)
-        first = 0
-        if saved:
-            first, learner = saved["epoch"], restored(learner, saved["learner"], out / CHECKPOINT)
-        alone = math.ceil(config.alone * config.epochs - 1e-9)
-        shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(learned))
-        epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]
-        keys, weights = (
-            jax.random.PRNGKey(config.seed),
-            {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)},
-        )
 
-        def one(learner, number):
-            labels = {**truth, **weights, "jointly": jnp.float32(number >= alone)}
-            return epoch(learner, shown, labels, jax.random.fold_in(keys, number))
-
-        learner, done = run_epochs("policy", learner, one, range(first, config.epochs), out, tell, should_stop)
-        if not done:
-            return None
-        return _finish(frames, out, config, values, learner, policy, forward, every, learned, held_out)
+def _scale(features: np.ndarray) -> dict[str, jax.Array]:
+    """How features [F, D] are scaled: those that hardly vary here must not become large where they do."""
+    used = features.astype(np.float32)
+    spread = used.std(0)
+    deviation = np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)
+    return {"mean": jnp.asarray(used.mean(0)), "deviation": jnp.asarray(deviation)}
 
 
 def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dict[str, Any]:
@@ -314,15 +195,10 @@ def _finish(
     learner: Learner,
     policy: Policy,
     forward: Forward,
-    every: Sequences,
-    learned: Sequences,
-    held_out: Sequences,
+    split: _Split,
 ) -> dict[str, Any]:
     """Writes weights, description and scores."""
     kept = {"params": learner.params["policy"], "scale": learner.batch_stats}
-    weights = flax.serialization.to_bytes(jax.device_get(kept))
-    with whole_file(out / WEIGHTS) as partial:
-        partial.write_bytes(weights)
     about = {
         "task": "policy",
         "hidden": config.hidden,
@@ -335,22 +211,20 @@ def _finish(
             for run, network in zip(frames.runs, frames.networks, strict=True)
         ],
         "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params["policy"]))),
-        "digest": hashlib.sha256(weights).hexdigest(),
     }
-    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
+    write_network(out, kept, about)
     results: dict[str, Any] = {
         "task": "policy",
         "alpha": config.alpha,
         "lambda": config.lam,
         "parameters": about["parameters"],
-        "sequences": len(learned),
-        "nearly_straight": float((turning_share(every, config) < config.straight_share).mean()),
+        "sequences": len(split.learned),
+        "nearly_straight": float((turning_share(split.every, config) < config.straight_share).mean()),
         "classes": {"linear": about["linear_m_s"], "angular": about["angular_rad_s"]},
     }
-    if len(held_out):
-        results["test"] = _scores(frames.features, learner, policy, forward, held_out, config)
-    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-    return results
+    if len(split.held_out):
+        results["test"] = _scores(frames.features, learner, policy, forward, split.held_out, config)
+    return write_results(out, results)
 
 
 @functools.cache

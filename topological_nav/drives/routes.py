@@ -41,9 +41,7 @@ def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config:
         config: lengths.
     """
     edges = near_pairs(nodes_w, config.edge_m)
-    rows, columns = space.clearance_m.shape
-    cell = np.floor((nodes_w - space.origin_w) / space.resolution_m).astype(int)
-    column, row = np.clip(cell[:, 0], 0, columns - 1), np.clip(cell[:, 1], 0, rows - 1)
+    column, row = space.inner_cells(nodes_w).T
     way = to_go_m[edges[:, 1], row[edges[:, 0]], column[edges[:, 0]]]
     straight = np.linalg.norm(nodes_w[edges[:, 0]] - nodes_w[edges[:, 1]], axis=1)
     return edges[way <= config.detour * straight]

@@ -1,60 +1,37 @@
-"""Scenes and contenders in, a folder of rows out, one file a batch of episodes; a contest that was stopped goes on.
-
-OUT/rows/<scene>-<contender>-<digest>-<first episode>.parquet   one row an episode (`evaluation.columns`)
-    tracks/<the same>.npz                                       where the robots went
-    <scene>.png, summary.md                                     drawn and told at the end
-
-The digest is of everything that decides the rows: scene, episodes, settings, map, networks, policy. Another question
-adds files; the same one finds its own and plays what is missing.
-"""
+"""A contest in words, and each of its scenes with what is asked of it: episodes, maps, networks, contenders."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import hashlib
-import json
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-import pyarrow as pa
+from rich.console import Console
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.files import whole_file
-from interactive_nav_common.rows import read_rows, write_parquet
-from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.dataset import lens_of
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.errors import RunError
-from topological_nav.evaluate.evaluation import (
-    Contender,
-    Journeys,
-    NavigatorPlayer,
-    columns,
-    count_of,
-    draw_journeys,
-    expert,
-    learned,
-    play,
-)
+from topological_nav.evaluate.contenders import Contender, NavigatorPlayer, expert, learned
+from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
+from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import Trained, load_trained
-from topological_nav.maps.build import camera_of, drawn_for, renderer_of, true_map
+from topological_nav.maps.build import drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
 from topological_nav.maps.sight import NetworkSight, PassagePolicy, Sight, TrueSight
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.simulation import Camera, Simulator, make_env, pose_camera, scene_camera
 from topological_nav.scenes.space import FreeSpace, free_space
-from topological_nav.settings import overlaid
 from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
 
@@ -62,9 +39,6 @@ CONTENDERS = ("dense", "sparse", "expert", "ppo")
 """The navigator on its map, and on the same thinned out; an expert with the plan; a learned policy told the goal."""
 NOT_ASKED = ("batch", "episodes", "supersample")
 """Settings that decide no row, or of which it is told otherwise."""
-CPU_BATCH = 8
-"""Episodes played at a time on a CPU unless asked otherwise."""
-Tell = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,14 +91,13 @@ def load_networks(localiser: Path, detector: Path) -> Networks:
     """The networks of two finished runs.
 
     Raises:
-        RunError: a run is not finished.
-        MapError: they learned from different cameras, or the second judges no passages.
+        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
     """
     pair = load_trained(localiser), load_trained(detector)
     return Networks(*pair, camera_of(*pair))
 
 
-class Venue:
+class ContestScene:
     """One scene of a contest; what is costly is made when it is first asked for."""
 
     def __init__(self, folder: Path, contest: Contest, networks: Networks | None):
@@ -144,10 +117,10 @@ class Venue:
         return find_rooms(self.space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
 
     @functools.cached_property
-    def journeys(self) -> Journeys:
+    def episodes(self) -> Episodes:
         """All episodes of the scene."""
         config = self.contest.config
-        return draw_journeys(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)
+        return draw_episodes(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)
 
     @functools.cached_property
     def simulator(self) -> Simulator:
@@ -182,7 +155,7 @@ class Venue:
         """How the navigator's images are drawn: as the networks learned, by the map's engine and lens."""
         assert self.networks is not None
         of_map = {k: v for k, v in self.map.about.get("data", {}).items() if k in ("engine", "fov_deg")}
-        drawn = overlaid(self.networks.camera, of_map, "map")
+        drawn = overlay(self.networks.camera, of_map, "map")
         drawn = dataclasses.replace(drawn, fov_deg=lens_of(drawn, self.robot).fov_deg)
         return drawn_for(drawn, self.contest.config.supersample)
 
@@ -274,19 +247,18 @@ def _digest_of(policy: str) -> str:
 
 
 def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulator, Any]:
+    from train.runs.run import config_to_play
     from train.runs.run import make_env as make_trained_env
     from train.scoring.evaluation import load_policy
 
-    folder = RunFolder(run)
-    made = folder.read_config()
-    backend = made.env.backend if config.backend == "auto" else config.backend
-    env_config = dataclasses.replace(made.env, scenes=(str(scene.path),), backend=backend)
-    env = make_trained_env(env_config)
-    policy, _ = load_policy(folder, dataclasses.replace(made, env=env_config), env, "best", deterministic=False)
+    folder, words = RunFolder(run), [f"env.backend={config.backend}"] if config.backend != "auto" else []
+    made = config_to_play(folder, words, [str(scene.path)], Console(stderr=True))
+    env = make_trained_env(made.env)
+    policy, _ = load_policy(folder, made, env, "best", deterministic=False)
     return Simulator(env), policy
 
 
-def venues_of(contest: Contest) -> list[Venue]:
+def contest_scenes(contest: Contest) -> list[ContestScene]:
     """The scenes, with the networks where somebody looks through them.
 
     Raises:
@@ -294,112 +266,4 @@ def venues_of(contest: Contest) -> list[Venue]:
     """
     navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
     networks = load_networks(contest.localiser, contest.detector) if navigates else None
-    return [Venue(folder, contest, networks) for folder in contest.scenes]
-
-
-def hold(contest: Contest, venues: Sequence[Venue], tell: Tell = lambda *_: None) -> pa.Table:
-    """Plays what is missing, and returns all rows.
-
-    Args:
-        contest: who plays what.
-        venues: of `venues_of`.
-        tell: told who plays where, episodes over and episodes in all, after every control step; may raise to stop,
-            which loses the batch that is being played.
-
-    Raises:
-        TopologicalError, SceneError, TrainError: something cannot be used.
-    """
-    # Everything that can be refused is refused before the first episode.
-    plan = [(venue, name, _stem(venue, name)) for venue in venues for name in contest.contenders]
-    missing = [_missing(contest.out, stem, len(venue.journeys)) for venue, _, stem in plan]
-    total = sum(len(venue.journeys) for venue, _, _ in plan)
-    done = total - sum(map(len, missing))
-    cpu = jax.default_backend() == "cpu"
-    for (venue, name, stem), numbers in zip(plan, missing, strict=True):
-        if not len(numbers):
-            continue
-        contender, simulator = venue.contender(name)
-        size = contest.config.batch or (CPU_BATCH if cpu else len(numbers))
-        for first in range(0, len(numbers), size):
-            rows = numbers[first : first + size]
-            told = functools.partial(_tell, tell, f"{venue.scene.name} {name}", done, total)
-            _play(venue, contest.out, name, stem, contender, simulator, rows, told)
-            done += len(rows)
-            tell(f"{venue.scene.name} {name}", done, total)
-    return pa.concat_tables([_rows(contest.out, stem, len(venue.journeys)) for venue, _, stem in plan])
-
-
-def _tell(tell: Tell, what: str, before: int, total: int, over: int, _: float) -> None:
-    tell(what, min(before + over, total - 1), total)
-
-
-def _stem(venue: Venue, contender: str) -> str:
-    asked = json.dumps(venue.asked(contender), sort_keys=True)
-    return f"{venue.scene.name}-{contender}-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
-
-
-def _files(out: Path, stem: str) -> list[Path]:
-    return sorted((out / "rows").glob(f"{stem}-*.parquet"))
-
-
-def _missing(out: Path, stem: str, count: int) -> np.ndarray:
-    """Numbers of the episodes that no file has."""
-    there = _rows(out, stem, count)["episode"].to_numpy() if _files(out, stem) else np.zeros(0, int)
-    return np.setdiff1d(np.arange(count), there)
-
-
-def _rows(out: Path, stem: str, count: int) -> pa.Table:
-    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for."""
-    rows = read_rows(_files(out, stem)).sort_by("episode")
-    return rows.filter(pa.array(rows["episode"].to_numpy() < count))
-
-
-def _play(
-    venue: Venue,
-    out: Path,
-    name: str,
-    stem: str,
-    contender: Contender,
-    simulator: Simulator,
-    rows: np.ndarray,
-    tell: Callable[[int, float], None],
-) -> None:
-    config = venue.contest.config
-    journeys = venue.journeys.take(rows)
-    began = time.perf_counter()
-    played = play(contender, simulator, journeys, config, tell)
-    here = versions()
-    navigates = name in ("dense", "sparse")
-    constants = {
-        "contender": name,
-        "sight": ("truth" if venue.networks is None else "networks") if navigates else "none",
-        "domain": venue.contest.domain if navigates else "none",
-        "policy": venue.contest.policy if navigates else name,
-        "scene": venue.scene.name,
-        "split": venue.scene.split,
-        "robot": simulator.env.robot.name,
-        "seed": config.seed,
-        "backend": simulator.env.backend,
-        "device": here["device"]["kind"],
-        "commit": here["commit"],
-        "wall_s": time.perf_counter() - began,
-    }
-    table = {key: [value] * len(rows) for key, value in constants.items()}
-    table |= {"episode": journeys.number, **columns(journeys, played, config)}
-    file = f"{stem}-{rows[0]:04d}"
-    tracks = out / "tracks" / f"{file}.npz"
-    with whole_file(tracks) as partial, open(partial, "wb") as handle:
-        named: dict[str, Any] = {str(n): np.asarray(t, np.float32) for n, t in zip(rows, played.track_w, strict=True)}
-        np.savez_compressed(handle, **named)
-    # Rows last: an episode counts as played once its row is there.
-    notes = {"asked": json.dumps(venue.asked(name)), "versions": json.dumps(here["packages"])}
-    write_parquet(pa.table(table), out / "rows" / f"{file}.parquet", notes)
-
-
-def tracks_of(contest: Contest, venue: Venue, contender: str) -> dict[int, np.ndarray]:
-    """Episode number -> [t, 2] m, of what has been played."""
-    found: dict[int, np.ndarray] = {}
-    for path in sorted((contest.out / "tracks").glob(f"{_stem(venue, contender)}-*.npz")):
-        with np.load(path) as stored:
-            found |= {int(number): stored[number] for number in stored.files}
-    return found
+    return [ContestScene(folder, contest, networks) for folder in contest.scenes]

@@ -10,11 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from interactive_nav_common.errors import ConfigError
-from topological_nav.evaluate.contest import Contest, venues_of
-from topological_nav.evaluate.evaluation import Journeys, NavigatorPlayer, Played, play
+from topological_nav.evaluate.contenders import NavigatorPlayer
+from topological_nav.evaluate.contest import Contest, contest_scenes
+from topological_nav.evaluate.episodes import Episodes
+from topological_nav.evaluate.evaluation import Played, play
 from topological_nav.figures.episode_figures import episode_figure, plan_picture, video_frame, write_video
 from topological_nav.maps.graph import TopologicalMap
-from topological_nav.navigate.navigator import FACE, PHASES, Events, State
+from topological_nav.navigate.state import FACE, PHASES, Events, State
 from topological_nav.scenes.simulation import Seen
 from topological_nav.scenes.space import FreeSpace
 
@@ -32,7 +34,7 @@ class Driven:
     number: int
     space: FreeSpace
     map: TopologicalMap
-    journey: Journeys
+    journey: Episodes
     played: Played
     goal_node: int
     passable: float
@@ -88,12 +90,12 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     Raises:
         ConfigError: the scene has no such episode.
     """
-    (venue,) = venues_of(contest)
-    if not 0 <= number < len(venue.journeys):
+    (venue,) = contest_scenes(contest)
+    if not 0 <= number < len(venue.episodes):
         raise ConfigError(
-            f"episode is {number}, expected 0 to {len(venue.journeys) - 1}; episodes=N makes more of the scene"
+            f"episode is {number}, expected 0 to {len(venue.episodes) - 1}; episodes=N makes more of the scene"
         )
-    journey = venue.journeys.take(np.array([number]))
+    journey = venue.episodes.take(np.array([number]))
     navigator = venue.navigator(contest.contenders[0])
     made = navigator.map
     seen_at: list[tuple[float, np.ndarray, float, int]] = []

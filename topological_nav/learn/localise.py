@@ -34,7 +34,7 @@ def localisation_scores(
     """How well `nearest_node` does in one scene.
 
     Args:
-        queries: [Q, D].
+        queries: [Q, K, D] of K images at each of Q places.
         query_xy_w: [Q, 2] m, where they were taken.
         query_room: [Q].
         nodes: [N, K, D].
@@ -45,7 +45,9 @@ def localisation_scores(
         `node`: share of queries given the node that is nearest in truth; `room`: share given a node of their own
         room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
     """
-    found, _ = nearest_node(queries, nodes)
+    each = queries.shape[1]
+    query_xy_w, query_room = np.repeat(query_xy_w, each, 0), np.repeat(query_room, each)
+    found, _ = nearest_node(queries.reshape(-1, queries.shape[-1]), nodes)
     away = np.linalg.norm(query_xy_w[:, None] - node_xy_w, axis=-1)
     return {
         "node": float((found == away.argmin(1)).mean()),

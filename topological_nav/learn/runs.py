@@ -7,9 +7,9 @@ import hashlib
 import json
 import lzma
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import flax.serialization
 import jax
@@ -20,92 +20,120 @@ import yaml
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.versions import versions
 from topological_nav.errors import RunError, readable
-from topological_nav.learn.learning import Learner
 
 CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
 WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
 PACKED_WEIGHTS = f"{WEIGHTS}.xz"
 """Of an exported run."""
+State = TypeVar("State")
+"""What an epoch changes: a tree of arrays, such as `learning.Learner`."""
 SAVE_EVERY_S = 60.0
 """Between two checkpoints; one is written at the end of a phase and on a stop as well."""
 
 
 @contextlib.contextmanager
 def claimed(out: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """A run folder for the block: of these settings (see `claim`), and of this process alone."""
+    """A run folder for the block: of these settings, written to config.yaml, and of this process alone.
+
+    Raises:
+        RunError: the run there has other settings.
+    """
+    path = out / CONFIG
     with alone_in(out):
-        claim(out, settings)
+        if path.is_file():
+            _compare(path, settings)
+        else:
+            write_text(path, yaml.safe_dump(settings, sort_keys=False))
+        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
         yield
 
 
-def claim(out: Path, settings: dict[str, Any]) -> None:
-    """Writes config.yaml of a new run, or checks that the run there has the same settings.
-
-    Raises:
-        RunError: it has others.
-    """
-    path = out / CONFIG
-    if path.is_file():
-        with readable(path, RunError, "choose another folder (-o) or delete it"):
-            there = dict(yaml.safe_load(path.read_text()))
-        for name, value in settings.items():
-            if there.get(name) != value:
-                shown = (there.get(name), value) if not isinstance(value, dict) else ("another", "this one")
-                raise RunError(
-                    f"{out}: the run there has {name} = {shown[0]!r}, this one {shown[1]!r}; "
-                    "choose another folder (-o) or delete it"
-                )
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(path, yaml.safe_dump(settings, sort_keys=False))
+def _compare(path: Path, settings: dict[str, Any]) -> None:
+    with readable(path, RunError, "choose another folder (-o) or delete it"):
+        there = dict(yaml.safe_load(path.read_text()))
+    for name, value in settings.items():
+        if there.get(name) != value:
+            shown = (there.get(name), value) if not isinstance(value, dict) else ("another", "this one")
+            raise RunError(
+                f"{path.parent}: the run there has {name} = {shown[0]!r}, this one {shown[1]!r}; "
+                "choose another folder (-o) or delete it"
+            )
 
 
 def run_epochs(
-    phase: str,
-    learner: Learner,
-    epoch: Callable[[Learner, int], tuple[Learner, dict[str, jax.Array]]],
-    epochs: range,
     out: Path,
+    phase: str,
+    learner: State,
+    epoch: Callable[[State, int, jax.Array], tuple[State, dict[str, jax.Array]]],
+    epochs: int,
+    key: jax.Array,
     tell: Callable[[str], None],
     should_stop: Callable[[], bool],
-) -> tuple[Learner, bool]:
-    """Epochs of one phase; False where a stop was asked for before the last.
+    checkpoint: str = CHECKPOINT,
+) -> State | None:
+    """Epochs of one phase of a run; those that the checkpoint holds are not run again.
 
     Args:
+        out: the run folder; `metrics.jsonl` there gets a line an epoch.
         phase: its name in the metrics.
         learner: what it starts with.
-        epoch: the learner and the epoch's number from 0 to the learner and means over the epoch, `loss` among them.
-        epochs: numbers of those to run.
-        out: the run folder.
+        epoch: learner, the epoch's number from 0 and its key to learner and means over the epoch, `loss` among them.
+        epochs: in all.
+        key: of all epochs.
         tell: told one line an epoch.
         should_stop: asked after every epoch.
+        checkpoint: its file; one that holds another phase is written over.
+
+    Returns:
+        The learner; None where a stop was asked for.
 
     Raises:
-        RunError: the loss is not finite.
+        RunError: a damaged checkpoint, or a loss that is not finite.
     """
+    saved, first = read_checkpoint(out / checkpoint), 0
+    if saved and saved.get("phase", phase) == phase:
+        first, learner = saved["epoch"], _restored(learner, saved["learner"], out / checkpoint)
+    _cut_metrics(out / METRICS, phase, first)
     began = saved_at = time.perf_counter()
-    for number in epochs:
+    for number in range(first, epochs):
         started = time.perf_counter()
-        learner, means = epoch(learner, number)
+        learner, means = epoch(learner, number, jax.random.fold_in(key, number))
         line = {"phase": phase, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
         now = time.perf_counter()
         if not np.isfinite(line["loss"]):
             raise RunError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning_rate")
         with open(out / METRICS, "a") as file:
             file.write(json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
-        left = (now - began) / (number + 1 - epochs.start) * (epochs.stop - number - 1)
+        left = (now - began) / (number + 1 - first) * (epochs - number - 1)
         scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
-        tell(f"{phase}: epoch {number + 1} of {epochs.stop}  {scores}  {now - started:.1f} s  {left:.0f} s left")
-        last, stop = number + 1 == epochs.stop, should_stop()
-        if last or stop or now - saved_at > SAVE_EVERY_S:
+        tell(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
+        stop = should_stop()
+        if number + 1 == epochs or stop or now - saved_at > SAVE_EVERY_S:
             state = {"phase": phase, "epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}
-            with whole_file(out / CHECKPOINT) as partial:
+            with whole_file(out / checkpoint) as partial:
                 partial.write_bytes(flax.serialization.msgpack_serialize(jax.device_get(state)))
             saved_at = now
         if stop:
-            return learner, False
-    return learner, True
+            return None
+    return learner
+
+
+def write_network(out: Path, variables: Any, about: dict[str, Any]) -> dict[str, Any]:
+    """Writes weights and their description; returns this with the weights' digest."""
+    weights = flax.serialization.to_bytes(jax.device_get(variables))
+    about = {**about, "digest": hashlib.sha256(weights).hexdigest()}
+    with whole_file(out / WEIGHTS) as partial:
+        partial.write_bytes(weights)
+    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
+    return about
+
+
+def write_results(out: Path, results: dict[str, Any]) -> dict[str, Any]:
+    """Writes results.json; returns its content."""
+    write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
+    return results
 
 
 def packed(content: bytes) -> bytes:
@@ -177,7 +205,7 @@ def read_checkpoint(path: Path) -> dict[str, Any] | None:
         return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
 
 
-def restored(template: Learner, state: Any, path: Path) -> Learner:
+def _restored(template: State, state: Any, path: Path) -> State:
     """A learner as the checkpoint at a path holds it.
 
     Raises:
@@ -190,10 +218,8 @@ def restored(template: Learner, state: Any, path: Path) -> Learner:
     return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
 
 
-def cut_metrics(out: Path, phases: Sequence[str], saved: dict[str, Any] | None) -> None:
-    """Drops the lines after the checkpoint that a run goes on from: their epochs are run again."""
-    path = out / METRICS
+def _cut_metrics(path: Path, phase: str, last: int) -> None:
+    """Drops a phase's lines after its last epoch that a checkpoint holds: these epochs are run again."""
     if path.is_file():
-        until = (phases.index(saved["phase"]), saved["epoch"]) if saved else (-1, 0)
-        kept = [line for line in read_metrics(path) if (phases.index(line["phase"]), line["epoch"]) <= until]
+        kept = [line for line in read_metrics(path) if line["phase"] != phase or line["epoch"] <= last]
         write_text(path, "".join(json.dumps(line) + "\n" for line in kept))

@@ -13,13 +13,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import flax.serialization
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,8 +24,6 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav_common.config import to_dict
-from interactive_nav_common.files import whole_file, write_text
-from interactive_nav_common.versions import versions
 from topological_nav.config import PITCHES, TrainConfig
 from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
@@ -47,15 +42,13 @@ from topological_nav.learn.networks import Contrast, Network
 from topological_nav.learn.runs import (
     CHECKPOINT,
     DESCRIPTION,
-    RESULTS,
-    WEIGHTS,
     claimed,
-    cut_metrics,
     read_checkpoint,
     read_description,
     read_weights,
-    restored,
     run_epochs,
+    write_network,
+    write_results,
 )
 
 
@@ -74,7 +67,7 @@ class Trained:
         return self.about["digest"] + (f"-{self.about['export']['precision']}" if "export" in self.about else "")
 
     def logits(self, images: np.ndarray) -> np.ndarray:
-        """[N, outputs] of images [N, H, W, 3] u8, of the size that it learned from.
+        """[..., outputs] of images [..., H, W, 3] u8, of the size that it learned from.
 
         Raises:
             RunError: images of another size.
@@ -91,17 +84,18 @@ class Trained:
         return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 
     def embed(self, images: np.ndarray) -> np.ndarray:
-        """[N, D] localisation embeddings of images [N, H, W, 3] u8; see `Network.embed`."""
+        """[..., D] localisation embeddings of images [..., H, W, 3] u8; see `Network.embed`."""
         return self._rows(images, "embed")
 
     def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
         expected = (self.about["data"]["height"], self.about["data"]["width"], 3)
-        if images.shape[1:] != expected:
+        if images.shape[-3:] != expected:
             raise RunError(
-                f"images are {images.shape[1:]}, expected {expected}, the size that the network learned from"
+                f"images are {images.shape[-3:]}, expected {expected}, the size that the network learned from"
             )
         method_of = _applied(self.network, method)  # type: ignore[arg-type]  (flax modules are hashable)
-        return in_batches(functools.partial(method_of, self.variables), images)
+        found = in_batches(functools.partial(method_of, self.variables), images.reshape(-1, *expected))
+        return found.reshape(*images.shape[:-3], *found.shape[1:])
 
 
 @functools.cache
@@ -164,72 +158,75 @@ def train(
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
     with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
-        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
         shape = (data.height, data.width)
         network = Network(task, config.network, config.width, config.hidden, work.outputs)
         tx = optax.adam(config.learning_rate)
         learner = make_learner(network, shape, tx, config.seed)
-        phases: list[tuple[str, int]] = [("labels", config.epochs)]
         if config.init == "selfsup":
-            phases.insert(0, ("pairs", config.selfsup_epochs))
+            learner = _learned_without_labels(learner, work.places, out, config, tell, should_stop)
         elif config.init != "scratch":
             learner = _started_from(learner, Path(config.init))
-        saved = read_checkpoint(out / CHECKPOINT)
-        cut_metrics(out, ("pairs", "labels"), saved)
-        for phase, epochs in phases:
-            if phase == "pairs":
-                contrast, contrast_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
-                current = make_learner(contrast, shape, contrast_tx, config.seed)
-                epoch = paired_epoch(contrast, contrast_tx, config.selfsup_batch)
-                images, labels = work.places, np.zeros(0, np.int32)
-            else:
-                current, images, labels = learner, work.images, work.labels
-                epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
-            first = 0
-            if saved and saved["phase"] == phase:
-                first, current = saved["epoch"], restored(current, saved["learner"], out / CHECKPOINT)
-            elif saved and phase == "pairs":
-                continue  # a checkpoint of the later phase holds this one's outcome
-            shown, truth = jnp.asarray(images), jnp.asarray(labels)
-            keys = jax.random.fold_in(jax.random.PRNGKey(config.seed), {"pairs": 1, "labels": 2}[phase])
-
-            def one(learner, number, epoch=epoch, shown=shown, truth=truth, keys=keys):
-                return epoch(learner, shown, truth, jax.random.fold_in(keys, number))
-
-            current, done = run_epochs(phase, current, one, range(first, epochs), out, tell, should_stop)
-            if not done:
-                return None
-            if phase == "pairs":
-                learner = with_backbone(learner, {"params": current.params, "batch_stats": current.batch_stats})
-            else:
-                learner = current
+        if learner is None:
+            return None
+        epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
+        shown, truth, key = jnp.asarray(work.images), jnp.asarray(work.labels), _key(config, 2)
+        learner = run_epochs(
+            out, "labels", learner, lambda state, _, key: epoch(state, shown, truth, key), config.epochs, key, tell,
+            should_stop,
+        )  # fmt: skip
+        if learner is None:
+            return None
         variables = {"params": learner.params, "batch_stats": learner.batch_stats}
-        about = {
-            "task": task,
-            "backbone": config.network,
-            "width": config.width,
-            "hidden": config.hidden,
-            "outputs": work.outputs,
-            "names": list(work.names),
-            **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
-            "data": header["settings"],
-            "fov_deg": header["fov_deg"],
-            "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
-        }
-        results = _scores(save_trained(out, Trained(network, variables, about)), work)
-        write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
-        return results
+        trained = save_trained(out, Trained(network, variables, _about(header, work, config, learner)))
+        return write_results(out, _scores(trained, work))
+
+
+def _key(config: TrainConfig, phase: int) -> jax.Array:
+    return jax.random.fold_in(jax.random.PRNGKey(config.seed), phase)
+
+
+def _learned_without_labels(
+    learner: Learner,
+    places: np.ndarray,
+    out: Path,
+    config: TrainConfig,
+    tell: Callable[[str], None],
+    should_stop: Callable[[], bool],
+) -> Learner | None:
+    """The learner with a backbone that learned from pairs of images; None where it was stopped."""
+    saved = read_checkpoint(out / CHECKPOINT)
+    if saved and saved["phase"] != "pairs":
+        return learner  # a checkpoint of the later phase holds this one's outcome
+    contrast, tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
+    epoch = paired_epoch(contrast, tx, config.selfsup_batch)
+    shown, none = jnp.asarray(places), jnp.zeros(0, jnp.int32)
+    paired = run_epochs(
+        out, "pairs", make_learner(contrast, places.shape[2:4], tx, config.seed),
+        lambda state, _, key: epoch(state, shown, none, key), config.selfsup_epochs, _key(config, 1), tell, should_stop,
+    )  # fmt: skip
+    return paired and with_backbone(learner, {"params": paired.params, "batch_stats": paired.batch_stats})
+
+
+def _about(header: dict[str, Any], work: _Work, config: TrainConfig, learner: Learner) -> dict[str, Any]:
+    """Content of network.json, but for the digest."""
+    return {
+        "task": work.task,
+        "backbone": config.network,
+        "width": config.width,
+        "hidden": config.hidden,
+        "outputs": work.outputs,
+        "names": list(work.names),
+        **({"lengths_m": list(work.lengths_m)} if work.task == "passages" else {}),
+        "data": header["settings"],
+        "fov_deg": header["fov_deg"],
+        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
+    }
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:
     """Writes a network as `load_trained` reads it; returns it with the digest of its weights in `about`."""
-    weights = flax.serialization.to_bytes(jax.device_get(trained.variables))
     kept = {name: value for name, value in trained.about.items() if name != "export"}
-    about = {**kept, "digest": hashlib.sha256(weights).hexdigest()}
-    with whole_file(out / WEIGHTS) as partial:
-        partial.write_bytes(weights)
-    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
-    return dataclasses.replace(trained, about=about)
+    return dataclasses.replace(trained, about=write_network(out, trained.variables, kept))
 
 
 def load_trained(run: Path) -> Trained:
@@ -318,35 +315,39 @@ def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[floa
     ]
 
 
-def localisation(trained: Trained, rooms: RoomImages) -> dict[str, Any]:
-    """Scores of the embedding: training positions as nodes, every third level image of test positions as queries.
+def localisation(
+    trained: Trained, rooms: RoomImages, asked_by: Trained | None = None, asked: RoomImages | None = None
+) -> dict[str, Any]:
+    """Scores of an embedding: training positions as nodes, every third level image of test positions as queries.
 
     Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`.
+
+    Args:
+        trained: embeds the nodes' images.
+        rooms: the nodes'.
+        asked_by: embeds the queries; None: the same network.
+        asked: the queries'; None: the same images. Scenes are those of both, by name.
     """
-    level, size = PITCHES.index("level"), rooms.images.shape[3:]
-    rows, weights = {}, []
-    for scene in np.unique(rooms.scene):
-        nodes, queries = ((rooms.scene == scene) & (rooms.test == held) for held in (False, True))
-        if not nodes.any() or not queries.any():
-            continue
-        shown = rooms.images[nodes][:, level]
-        embedded = trained.embed(shown.reshape(-1, *size)).reshape(*shown.shape[:2], -1)
-        asked = rooms.images[queries][:, level, ::3]
-        each = asked.shape[1]
-        name = rooms.names[rooms.label[nodes][0]].rpartition("/")[0]
-        rows[name] = localisation_scores(
-            trained.embed(asked.reshape(-1, *size)),
-            np.repeat(rooms.xy_w[queries], each, 0),
-            np.repeat(rooms.label[queries], each),
-            embedded,
-            rooms.xy_w[nodes],
-            rooms.label[nodes],
-        )
-        weights.append(int(queries.sum()))
+    asked_by, asked = asked_by or trained, asked or rooms
+    level, rows, weights, there = PITCHES.index("level"), {}, [], rows_by_scene(asked)
+    for name, mine in rows_by_scene(rooms).items():
+        nodes, queries = mine & ~rooms.test, there.get(name, np.zeros_like(asked.test)) & asked.test
+        if nodes.any() and queries.any():
+            rows[name] = localisation_scores(
+                asked_by.embed(asked.images[queries][:, level, ::3]), asked.xy_w[queries], asked.label[queries],
+                trained.embed(rooms.images[nodes][:, level]), rooms.xy_w[nodes], rooms.label[nodes],
+            )  # fmt: skip
+            weights.append(int(queries.sum()))
     if rows:
         keys = next(iter(rows.values()))
         rows["mean"] = {k: float(np.average([r[k] for r in rows.values()], weights=weights)) for k in keys}
     return rows
+
+
+def rows_by_scene(rooms: RoomImages) -> dict[str, np.ndarray]:
+    """Scene name -> [P] bool."""
+    names = np.array([rooms.names[label].rpartition("/")[0] for label in rooms.label])
+    return {str(name): names == name for name in dict.fromkeys(names.tolist())}
 
 
 def _started_from(learner: Learner, run: Path) -> Learner:

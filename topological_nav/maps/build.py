@@ -16,26 +16,25 @@ import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings, lens_of
-from topological_nav.errors import MapError, SpaceError
-from topological_nav.learn.training import Trained, load_trained
-from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
+from topological_nav.errors import SpaceError
+from topological_nav.learn.pairs import camera_of
+from topological_nav.learn.training import load_trained
+from topological_nav.maps.graph import TopologicalMap, assemble, lengths
+from topological_nav.maps.nodes import place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import Rooms, find_rooms, recorded_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
-from topological_nav.settings import overlaid
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""
 Progress = Callable[[str, int, int], None]
 CPU_SUPERSAMPLE = 2
 """Beyond it drawing is what a CPU mostly does, and the networks answer nearly the same (docs/topological.md)."""
-SAME = ("robot", "engine", "width", "height", "fov_deg", "headings")
-"""What two networks' images must have in common to look through one camera."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +68,7 @@ def build_map(
         parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
 
     Raises:
-        RunError: a run is not finished.
-        MapError: the networks learned from different cameras, or the second judges no passages.
+        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
         SceneError, SpaceError: the scene cannot be used.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
@@ -79,7 +77,7 @@ def build_map(
     space = free_space(scene, robot.height_m)
     known = recorded_rooms(scene.digest)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
-    judged = overlaid(DataConfig(), detector.about["data"], str(detector_run))
+    judged = overlay(DataConfig(), detector.about["data"], str(detector_run))
     margin_m, points = judged.passage_margin_m, judged.passage_points
     xy, lacking = place_nodes(space, rooms, config, margin_m, points)
     if not len(xy):
@@ -187,24 +185,6 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
 def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
     """What draws a scene as a dataset's images were drawn."""
     return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
-
-
-def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
-    """The settings of the camera that both networks learned from.
-
-    Raises:
-        MapError: they learned from different cameras, or the second judges no passages.
-    """
-    if detector.about["task"] != "passages":
-        raise MapError(f"the detector was trained for '{detector.about['task']}', expected a run of 'train passages'")
-    first, second = ({**n.about["data"], "fov_deg": n.about["fov_deg"]} for n in (localiser, detector))
-    for name in SAME:
-        if first[name] != second[name]:
-            raise MapError(
-                f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
-                "train both on one dataset"
-            )
-    return overlaid(DataConfig(), first, "network.json")
 
 
 class _Pictures:

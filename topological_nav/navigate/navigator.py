@@ -18,7 +18,6 @@ sees a position, and looks at images only through `sight.Sight`. `Pilot` keeps t
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import numpy as np
@@ -30,102 +29,27 @@ from topological_nav.drives.driving import LocalPolicy
 from topological_nav.learn.learning import padded_size
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.maps.sight import Sight
+from topological_nav.navigate.state import (
+    ARRIVED,
+    DRIVE,
+    FACE,
+    LEAN,
+    LOCALISE,
+    STOPPED,
+    SWING,
+    TIMED_OUT,
+    TURNING,
+    Events,
+    State,
+    Work,
+)
 
-LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
-PHASES = ("localise", "face", "swing", "lean", "drive", "arrived", "stopped", "timed out")
-TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
 PENALTY = 3.0
 """Added to the weight of an edge that proved blocked: as if it were free with a probability 20 times less."""
 GOLDEN_RAD = np.pi * (3.0 - np.sqrt(5.0))
 """Where the map has no way, headings are tried that are this far apart: never the same twice."""
 SLACK_S = 1e-3
 """Clocks of simulators are sums of steps."""
-
-
-@dataclasses.dataclass(frozen=True)
-class State:
-    """What a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
-
-    phase: np.ndarray
-    """i8, one of `PHASES`."""
-    goal: np.ndarray
-    """i32 node."""
-    node: np.ndarray
-    """i32 node of the last localisation, -1 before the first."""
-    edge: np.ndarray
-    """i32 edge that is followed; -1 where the map has no way, or none is planned yet."""
-    began_s: np.ndarray
-    """When the episode began; NaN before its first step."""
-    looks: np.ndarray
-    """i32 images taken in this localisation."""
-    evidence: np.ndarray
-    """[B, N] what they say: sums, or least, of distances."""
-    base_rad: np.ndarray
-    """The edge's angle; in a localisation, the first heading."""
-    target_rad: np.ndarray
-    """Heading to reach."""
-    swing: np.ndarray
-    """i32 headings asked since the edge was planned."""
-    best_p: np.ndarray
-    best_rad: np.ndarray
-    """The most open of them, for `NavigatorConfig.clear_m`."""
-    penalty: np.ndarray
-    """[B, E] added to the edges' weights."""
-    driven: np.ndarray
-    """i32 edge that was driven since the robot was last found, -1: none."""
-    lost: np.ndarray
-    """i32 times that the map had no way."""
-    integral: np.ndarray
-    """PID: integral term, rad/s."""
-    error_rad: np.ndarray
-    """PID: error of the step before; NaN where it starts."""
-    clock_s: np.ndarray
-    """Time of the step before."""
-    run: np.ndarray
-    """i32 runs done since the robot last looked about."""
-    run_end_s: np.ndarray
-    watch_s: np.ndarray
-    """Next time to look, within a run, whether the edge's head is passed."""
-    least: np.ndarray
-    """Least distance to the head in this run, as `Sight.distances` tells it."""
-    acts: np.ndarray
-    """i32 control steps of this run."""
-    linear: np.ndarray
-    """m/s, the last command."""
-    angular: np.ndarray
-    """rad/s."""
-    hidden: Any
-    """The local policy's."""
-
-    def take(self, rows: np.ndarray) -> State:
-        """Those rows of the batch."""
-        return jax.tree.map(lambda x: np.asarray(x)[rows], self)
-
-    @property
-    def over(self) -> np.ndarray:
-        """[B] bool: arrived, stopped or out of time."""
-        return self.phase >= ARRIVED
-
-
-jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(State)], [])
-
-
-@dataclasses.dataclass(frozen=True)
-class Events:
-    """What happened in a step, [B] bool each; whose run ended may be told to stop by those who know better."""
-
-    localised: np.ndarray
-    """Turned about, and `State.node` is new."""
-    glanced: np.ndarray
-    """Saw a neighbour of the last node after a run, and `State.node` is new."""
-    lost: np.ndarray
-    """The map has no way from there."""
-    blocked: np.ndarray
-    """No heading near the edge's is open."""
-    run_started: np.ndarray
-    run_ended: np.ndarray
-    arrived: np.ndarray
-    timed_out: np.ndarray
 
 
 class Navigator:
@@ -232,7 +156,7 @@ class Navigator:
         batch = len(state.phase)
         heading = np.asarray(heading_rad, float)
         time = np.broadcast_to(np.asarray(time_s, float), (batch,))
-        s = _Work(state, batch)
+        s = Work(state, batch)
         fresh = np.isnan(s.began_s)
         s.began_s[fresh] = time[fresh]
         late = ~state.over & (time - s.began_s >= self.config.limit_s - SLACK_S)
@@ -259,19 +183,19 @@ class Navigator:
     def _no_evidence(self, batch: int) -> np.ndarray:
         return np.full((batch, len(self.map.xy_w)), 0.0 if self.sight.summed else np.inf)
 
-    def _reached(self, s: _Work, heading: np.ndarray, *phases: int) -> np.ndarray:
+    def _reached(self, s: Work, heading: np.ndarray, *phases: int) -> np.ndarray:
         """Rows in one of the phases whose heading is reached."""
         return np.flatnonzero(
             _any_of(s.phase, phases) & (np.abs(wrap_angle(s.target_rad - heading)) <= self._tolerance)
         )
 
-    def _watches(self, s: State | _Work, time: np.ndarray) -> np.ndarray:
+    def _watches(self, s: State | Work, time: np.ndarray) -> np.ndarray:
         """[B] bool: who looks now, within a run, whether the edge's head is passed."""
         if not self.config.glance or not self.config.watch_s:
             return np.zeros(len(s.phase), bool)
         return (s.phase == DRIVE) & (s.edge >= 0) & (time >= s.watch_s - SLACK_S)
 
-    def _localise(self, s: _Work, images: np.ndarray, heading: np.ndarray) -> None:
+    def _localise(self, s: Work, images: np.ndarray, heading: np.ndarray) -> None:
         rows = self._reached(s, heading, LOCALISE)
         if not len(rows):
             return
@@ -285,7 +209,7 @@ class Navigator:
         s.localised[done] = True
         self._decide(s, done, heading)
 
-    def _found(self, s: _Work, rows: np.ndarray, node: np.ndarray) -> None:
+    def _found(self, s: Work, rows: np.ndarray, node: np.ndarray) -> None:
         """Where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
         s.node[rows] = node
         edge = s.driven[rows]
@@ -294,13 +218,13 @@ class Navigator:
         s.penalty[rows[failed], edge[failed]] += self.config.retry_cost
         s.driven[rows] = -1
 
-    def _decide(self, s: _Work, rows: np.ndarray, heading: np.ndarray) -> None:
+    def _decide(self, s: Work, rows: np.ndarray, heading: np.ndarray) -> None:
         """Where to go from the nodes found."""
         there = rows[s.node[rows] == s.goal[rows]]
         s.phase[there], s.arrived[there] = ARRIVED, True
         self._plan(s, rows[s.node[rows] != s.goal[rows]], heading)
 
-    def _plan(self, s: _Work, rows: np.ndarray, heading: np.ndarray) -> None:
+    def _plan(self, s: Work, rows: np.ndarray, heading: np.ndarray) -> None:
         for i in rows:
             edge = self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i])
             s.edge[i] = edge
@@ -315,7 +239,7 @@ class Navigator:
         s.swing[rows], s.best_p[rows] = 0, -1.0
         s.restart_pid(rows)
 
-    def _face(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
+    def _face(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
         self._begin_drive(s, self._reached(s, heading, LEAN), time)
         rows = self._reached(s, heading, FACE, SWING)
         if not len(rows):
@@ -346,18 +270,18 @@ class Navigator:
         asked = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
         s.phase[asked], s.target_rad[asked] = LEAN, s.best_rad[asked]
 
-    def _begin_drive(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
+    def _begin_drive(self, s: Work, rows: np.ndarray, time: np.ndarray) -> None:
         s.phase[rows], s.driven[rows] = DRIVE, s.edge[rows]
         self._begin_run(s, rows, time)
 
-    def _begin_run(self, s: _Work, rows: np.ndarray, time: np.ndarray) -> None:
+    def _begin_run(self, s: Work, rows: np.ndarray, time: np.ndarray) -> None:
         if len(rows):
             s.run_end_s[rows], s.acts[rows] = time[rows] + self.config.run_s, 0
             s.watch_s[rows], s.least[rows] = time[rows] + self.config.watch_s, np.inf
             s.run_started[rows] = True
             s.put_hidden(rows, self.policy.start(len(rows)))
 
-    def _drive(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
+    def _drive(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
         over = (time >= s.run_end_s - SLACK_S) | self._passed(s, images, heading, time)
         ended = np.flatnonzero((s.phase == DRIVE) & over)
         if len(ended):
@@ -391,7 +315,7 @@ class Navigator:
             s.angular[acting] = np.asarray(angular)[: len(acting)]
         s.acts[s.phase == DRIVE] += 1
 
-    def _passed(self, s: _Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
+    def _passed(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
         """[B] bool: of all nodes in question the edge's head is nearest, and it is getting farther."""
         passed = np.zeros(len(s.phase), bool)
         rows = np.flatnonzero(self._watches(s, time))
@@ -405,14 +329,14 @@ class Navigator:
             s.least[rows] = np.minimum(s.least[rows], there)
         return passed
 
-    def _begin_localise(self, s: _Work, rows: np.ndarray) -> None:
+    def _begin_localise(self, s: Work, rows: np.ndarray) -> None:
         s.phase[rows], s.looks[rows], s.edge[rows], s.run[rows] = LOCALISE, 0, -1, 0
         s.target_rad[rows] = np.nan
         s.evidence[rows] = self._no_evidence(len(rows))
         s.linear[rows] = s.angular[rows] = 0.0
         s.restart_pid(rows)
 
-    def _turn(self, s: _Work, heading: np.ndarray, time: np.ndarray) -> None:
+    def _turn(self, s: Work, heading: np.ndarray, time: np.ndarray) -> None:
         """PID to the target heading, as `simple_pid.PID` computes it."""
         rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
         config, most = self.config, self.config.max_turn_rad_s
@@ -446,37 +370,6 @@ class Pilot:
         """Images [B, ...], headings [B] and time to linear [B] and angular [B] velocity, and events."""
         self.state, linear, angular, events = self.navigator.step(self.state, images, heading_rad, time_s)
         return linear, angular, events
-
-
-class _Work:
-    """A copy of a state that a step writes into, and its events."""
-
-    def __init__(self, state: State, batch: int):
-        self._names = [f.name for f in dataclasses.fields(State)]
-        for name in self._names:
-            value = getattr(state, name)
-            setattr(self, name, value if name == "hidden" else value.copy())
-        self._events = {"lost": "lost_now"}
-        for field in dataclasses.fields(Events):
-            setattr(self, self._events.get(field.name, field.name), np.zeros(batch, bool))
-
-    def restart_pid(self, rows: np.ndarray) -> None:
-        self.integral[rows], self.error_rad[rows] = 0.0, np.nan
-
-    def put_hidden(self, rows: np.ndarray, new: Any) -> None:
-        def put(old: Any, value: Any) -> np.ndarray:
-            out = np.array(old)
-            out[rows] = np.asarray(value)
-            return out
-
-        self.hidden = jax.tree.map(put, self.hidden, new)
-
-    def state(self) -> State:
-        return State(**{name: getattr(self, name) for name in self._names})
-
-    def events(self) -> Events:
-        names = [f.name for f in dataclasses.fields(Events)]
-        return Events(**{name: getattr(self, self._events.get(name, name)) for name in names})
 
 
 def _asked_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:

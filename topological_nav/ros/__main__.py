@@ -16,13 +16,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.schema import SceneError
 from topological_nav.config import RUNS, NavigatorConfig
 from topological_nav.ros import debian, launch
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
-from topological_nav.settings import overridden, refuse_unused, settings_help
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
 """Driver -> its settings."""

@@ -13,8 +13,8 @@ from interactive_nav.robots import get_robot
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
 from topological_nav.data.dataset import lens_of
+from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained
-from topological_nav.maps.build import camera_of
 from topological_nav.maps.graph import load_map
 from topological_nav.maps.sight import NetworkSight, PassagePolicy
 from topological_nav.navigate.navigator import Navigator, Pilot

@@ -20,7 +20,7 @@ from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
-from interactive_nav_common.machine import usable_cores
+from interactive_nav_common.versions import usable_cores
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 
 Camera = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -33,14 +33,20 @@ class FreeSpace:
         """[n, 2] m, world: centres of the cells with at least this clearance, row by row."""
         return cell_centres(self.clearance_m >= max(least_m, _FREE_M), self.resolution_m, self.origin_w)
 
+    def cells(self, xy_w: np.ndarray) -> np.ndarray:
+        """[..., 2] int, column and row of the cells that hold points [..., 2], inside the map or not."""
+        return np.floor((np.asarray(xy_w, float) - self.origin_w) / self.resolution_m).astype(int)
+
+    def inner_cells(self, xy_w: np.ndarray) -> np.ndarray:
+        """The same, of the map's cells nearest to them."""
+        rows, columns = self.clearance_m.shape
+        return np.clip(self.cells(xy_w), 0, (columns - 1, rows - 1))
+
     def at(self, xy_w: np.ndarray) -> np.ndarray:
         """[...] m: clearance of the cells that hold points [..., 2]; 0 outside the map."""
-        cell = np.floor((np.asarray(xy_w, float) - self.origin_w) / self.resolution_m).astype(int)
-        rows, columns = self.clearance_m.shape
-        column, row = cell[..., 0], cell[..., 1]
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        found = self.clearance_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        return np.where(inside, found, 0.0)
+        cell = self.inner_cells(xy_w)
+        inside = (cell == self.cells(xy_w)).all(-1)
+        return np.where(inside, self.clearance_m[cell[..., 1], cell[..., 0]], 0.0)
 
     def segment_free(self, start_w: np.ndarray, end_w: np.ndarray, points: int, margin_m: float) -> np.ndarray:
         """Whether straight ways are free: every looked-up point has the margin.

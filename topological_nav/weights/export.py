@@ -35,9 +35,10 @@ from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.errors import MapError, RunError
 from topological_nav.learn.localise import nearest_node
+from topological_nav.learn.pairs import SAME, camera_of, load_pair
 from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
 from topological_nav.learn.training import Trained, load_trained
-from topological_nav.maps.build import CHUNK, camera_of, renderer_of
+from topological_nav.maps.build import CHUNK, renderer_of
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import free_space
@@ -107,7 +108,7 @@ def export(
     files = sorted(Path(maps).glob("*.npz")) if maps else []
     if maps and not files:
         raise MapError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
-    networks = _networks(runs["rooms"], runs["passages"])
+    networks = load_pair(runs["rooms"], runs["passages"], (*SAME, "headings"))
     driver = load_policy(policy, localiser, detector) if policy else None
     total = len(runs) + len(files) + 1
     with whole_folder(out, overwrite=True) as made:
@@ -265,14 +266,6 @@ def level_images(
         progress(scene.name, first, len(poses[0]))
         drawn.append(renderer.draw(camera_pose(robot, where, heading, np.zeros(len(where)))))
     return np.concatenate(drawn).reshape(len(xy), len(around), *drawn[0].shape[1:])
-
-
-def _networks(localiser: Path, detector: Path) -> tuple[Trained, Trained]:
-    networks = load_trained(localiser), load_trained(detector)
-    if networks[0].about["task"] != "rooms":
-        raise RunError(f"{localiser}: was trained for '{networks[0].about['task']}', expected a run of 'train rooms'")
-    camera_of(*networks)
-    return networks
 
 
 def _driven(policy: TrainedPolicy, images: np.ndarray) -> Iterator[np.ndarray]:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import overridden
 from tests.topological_nav.conftest import WORDS
 from topological_nav.config import DataConfig
 from topological_nav.data import dataset
 from topological_nav.errors import DatasetError
 from topological_nav.scenes.space import free_space
-from topological_nav.settings import overridden
 
 CONFIG = overridden(DataConfig(), WORDS)
 

@@ -11,6 +11,7 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import overridden
 from interactive_nav_common.errors import UserError
 from tests.topological_nav.conftest import DRIVEN
 from topological_nav.__main__ import main
@@ -20,7 +21,6 @@ from topological_nav.drives import dataset as driving
 from topological_nav.drives.fleet import make_env
 from topological_nav.errors import DatasetError
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
-from topological_nav.settings import overridden
 
 CONFIG = overridden(DriveConfig(), DRIVEN)
 CUBES = [shapely.box(1.2, -0.7, 1.6, -0.3), shapely.box(-1.7, 0.3, -1.3, 0.7), shapely.box(-0.05, -2.0, 0.05, 1.0)]

@@ -10,16 +10,17 @@ import numpy as np
 import optax
 import pytest
 
+from interactive_nav_common.config import overridden
 from interactive_nav_common.metrics_file import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
 from topological_nav.drives import imitation
 from topological_nav.drives.dataset import drive_images
 from topological_nav.drives.driving import load_policy
+from topological_nav.drives.frames import embed_drives
 from topological_nav.drives.policy import Forward, Policy
 from topological_nav.errors import RunError
 from topological_nav.learn.learning import Learner
-from topological_nav.settings import overridden
 
 WORDS = (
     *("hidden=24", "projection=8", "forward_hidden=16", "steps=20", "overlap_s=1.5", "batch=8", "epochs=10"),
@@ -30,7 +31,7 @@ CONFIG = overridden(PolicyConfig(), WORDS)
 
 @pytest.fixture(scope="module")
 def frames(made, driven):
-    return imitation.embed_drives(driven, made.rooms, made.passages, True)
+    return embed_drives(driven, made.rooms, made.passages, True)
 
 
 @pytest.fixture(scope="module")
@@ -162,4 +163,4 @@ def test_drives_seen_through_another_camera_are_refused(made, driven, tmp_path):
     with pytest.raises(
         RunError, match="images have width = 48, the networks learned from 32; drive again with width=32"
     ):
-        imitation.embed_drives(copy, made.rooms, made.passages, False)
+        embed_drives(copy, made.rooms, made.passages, False)

@@ -16,14 +16,15 @@ from topological_nav.__main__ import main
 from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.errors import RunError
-from topological_nav.evaluate import contest as contests
-from topological_nav.evaluate.contest import Contest, local_policy, venues_of
-from topological_nav.evaluate.evaluation import NavigatorPlayer, play
+from topological_nav.evaluate import rows
+from topological_nav.evaluate.contenders import NavigatorPlayer
+from topological_nav.evaluate.contest import Contest, contest_scenes, local_policy
+from topological_nav.evaluate.evaluation import play
 from topological_nav.learn.runs import WEIGHTS
 from topological_nav.learn.training import load_trained, save_trained
 from topological_nav.maps.build import drawn_for
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.navigate.navigator import DRIVE
+from topological_nav.navigate.state import DRIVE
 from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
@@ -69,7 +70,7 @@ class Recorded:
 def watched(contest):
     """One episode of runs of 2 s played with everything recorded; nowhere is near enough to the goal to end it."""
     config = dataclasses.replace(CONFIG, episodes=1, batch=1, run_s=2.0, success_m=0.01, glance=False)
-    (venue,) = venues_of(dataclasses.replace(contest, config=config))
+    (venue,) = contest_scenes(dataclasses.replace(contest, config=config))
     navigator = venue.navigator("dense")
     navigator.policy = Recorded(navigator.policy)
     steps = []
@@ -78,7 +79,7 @@ def watched(contest):
         steps.append((time_s, seen, state, events, len(navigator.policy.calls)))
 
     player = NavigatorPlayer(navigator, venue.simulator, venue.camera, venue.contest.config, watch)
-    played = play(player, venue.simulator, venue.journeys, venue.contest.config)
+    played = play(player, venue.simulator, venue.episodes, venue.contest.config)
     return venue, navigator.policy, steps, played
 
 
@@ -113,7 +114,7 @@ def test_it_is_shown_level_images_of_where_the_robot_is_and_its_words_are_comman
 
 
 def test_its_memory_stays_with_its_episode_when_others_are_over(contest):
-    (venue,) = venues_of(contest)
+    (venue,) = contest_scenes(contest)
     navigator = venue.navigator("dense")
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (60, 3, 32, 32, 3), np.uint8)
@@ -165,14 +166,14 @@ def test_other_weights_of_the_policy_are_another_question(contest, steered, tmp_
             weights = bytearray((other / WEIGHTS).read_bytes())
             weights[-1] ^= 1
             (other / WEIGHTS).write_bytes(bytes(weights))
-        (venue,) = venues_of(dataclasses.replace(contest, policy=name or str(other)))
-        stems.add(contests._stem(venue, "dense"))
+        (venue,) = contest_scenes(dataclasses.replace(contest, policy=name or str(other)))
+        stems.add(rows._stem(venue, "dense"))
     assert len(stems) == 3
 
 
 def test_everything_that_the_navigator_sees_goes_through_the_other_camera(contest, monkeypatch):
-    (clean,), (venue,) = (venues_of(dataclasses.replace(contest, domain=name)) for name in ("clean", "camera"))
-    journeys, rng = venue.journeys, np.random.default_rng(0)
+    (clean,), (venue,) = (contest_scenes(dataclasses.replace(contest, domain=name)) for name in ("clean", "camera"))
+    journeys, rng = venue.episodes, np.random.default_rng(0)
     xy, yaw = rng.uniform(-1, 1, (3, 2)), rng.uniform(-3, 3, 3)
     plain, seen = clean.camera(xy, yaw), venue.camera(xy, yaw)
     assert (seen == as_seen_from(plain, preset("camera"), xy, yaw)).all() and (seen != plain).mean() > 0.5
@@ -186,7 +187,7 @@ def test_everything_that_the_navigator_sees_goes_through_the_other_camera(contes
         clean.camera(journeys.goal_xy_w, np.zeros(2)), preset("camera"), journeys.goal_xy_w, np.zeros(2)
     )
     assert looked[0].shape == (2, 6, 32, 32, 3) and (looked[0][:, 0] == goals).all()
-    assert contests._stem(clean, "dense") != contests._stem(venue, "dense")
+    assert rows._stem(clean, "dense") != rows._stem(venue, "dense")
 
 
 def test_a_map_collected_in_the_target_domain_is_driven_on_there(contest, made, steered, tmp_path, capsys):
@@ -206,12 +207,12 @@ def test_a_map_collected_in_the_target_domain_is_driven_on_there(contest, made, 
     (row,) = read_rows(sorted((tmp_path / "out" / "rows").glob("*.parquet"))).to_pylist()
     assert (row["domain"], row["policy"], row["sight"]) == ("light", str(steered), "networks") and row["runs"] >= 1
     there = dataclasses.replace(contest, maps=maps, localiser=adapted, domain="light")
-    (venue,) = venues_of(there)
+    (venue,) = contest_scenes(there)
     policy = venue.navigator("dense").policy
     assert policy._networks[0].about["digest"] == saved.about["digest"]  # type: ignore[attr-defined]
     # Not through others that it never met.
     saved = save_trained(adapted, dataclasses.replace(saved, about={**about, "adapted_from": "another"}))
-    (venue,) = venues_of(there)
+    (venue,) = contest_scenes(there)
     with pytest.raises(RunError, match="is not the network that .* learned with"):
         local_policy(there, None, venue.networks)  # type: ignore[arg-type]
 
@@ -220,10 +221,10 @@ def test_images_are_drawn_by_the_maps_engine_and_lens(contest, made, tmp_path):
     read = load_map(made.map)
     about = {**read.about, "data": {**read.about["data"], "engine": "gl", "fov_deg": 70.0}}
     save_map(dataclasses.replace(read, about=about), tmp_path / "painted.npz")
-    (venue,), (other,) = (venues_of(dataclasses.replace(contest, maps=maps)) for maps in (contest.maps, tmp_path))
+    (venue,), (other,) = (contest_scenes(dataclasses.replace(contest, maps=maps)) for maps in (contest.maps, tmp_path))
     assert venue.networks is not None and venue.drawn == venue.networks.camera
     assert (other.drawn.engine, other.drawn.fov_deg) == ("gl", 70.0)
-    assert contests._stem(venue, "dense") != contests._stem(other, "dense")
+    assert rows._stem(venue, "dense") != rows._stem(other, "dense")
 
 
 def test_a_cpu_draws_images_at_most_twice_as_large(contest, monkeypatch):
@@ -231,8 +232,8 @@ def test_a_cpu_draws_images_at_most_twice_as_large(contest, monkeypatch):
     assert drawn_for(learned, None) == dataclasses.replace(learned, supersample=2)
     assert drawn_for(learned, 5) == learned and drawn_for(learned, 7).supersample == 7
     assert drawn_for(dataclasses.replace(learned, supersample=1), None).supersample == 1
-    (venue,) = venues_of(contest)
-    (finer,) = venues_of(dataclasses.replace(contest, config=dataclasses.replace(CONFIG, supersample=2)))
+    (venue,) = contest_scenes(contest)
+    (finer,) = contest_scenes(dataclasses.replace(contest, config=dataclasses.replace(CONFIG, supersample=2)))
     assert (venue.drawn.supersample, finer.drawn.supersample) == (1, 2)
     assert "drawn" not in venue.asked("dense") and finer.asked("dense")["drawn"][-1] == 2
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

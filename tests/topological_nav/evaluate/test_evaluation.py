@@ -1,6 +1,7 @@
 """Bookkeeping of episodes by hand, then the whole machinery in simulation with the truth in the place of networks."""
 
 import dataclasses
+import importlib.util
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,12 +22,18 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
-from topological_nav.evaluate.contest import Contest, Venue, hold, venues_of
-from topological_nav.evaluate.evaluation import Journeys, Marks, count_of, draw_journeys, learned, play
+from topological_nav.evaluate.contenders import Marks, learned
+from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
+from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
+from topological_nav.evaluate.evaluation import play
+from topological_nav.evaluate.rows import _stem, play_contest
 from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.rooms import find_rooms
 from topological_nav.scenes.simulation import Seen, Simulator
 from topological_nav.weights import packaged
+from train.config import EnvConfig, TrainConfig
+from train.config_io import to_yaml
+from train.runs.run_folder import RunFolder
 from train.scoring.policies import make_follower
 
 APARTMENT = "scenes_mjcf/apartment_0"
@@ -71,11 +78,11 @@ class Line:
         return (x + 0.2 * (at < 10) * ~over, step + 1, number), marks
 
 
-def line_journeys(goals) -> Journeys:
+def line_journeys(goals) -> Episodes:
     n = len(goals)
     goal = np.stack([np.array(goals, float), np.zeros(n)], -1)
     zero = np.zeros(n)
-    return Journeys(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float))
+    return Episodes(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float))
 
 
 def test_an_episode_is_won_where_a_run_ends_near_the_goal():
@@ -126,19 +133,19 @@ def rooms():
 def test_episodes_lead_from_room_to_room_and_are_fixed(rooms):
     space, labels = rooms
     config = EvaluationConfig(seed=3)
-    found = draw_journeys("ab" * 32, space, labels, 20, config)
+    found = draw_episodes("ab" * 32, space, labels, 20, config)
     assert (found.start_room != found.goal_room).all() and found.number.tolist() == list(range(20))
     assert (np.linalg.norm(found.start_xy_w - found.goal_xy_w, axis=1) > 2.5).all()
     assert (space.at(found.start_xy_w) >= 0.35).all() and (space.at(found.goal_xy_w) >= 0.35).all()
-    fewer = draw_journeys("ab" * 32, space, labels, 5, config)
+    fewer = draw_episodes("ab" * 32, space, labels, 5, config)
     assert (fewer.start_xy_w == found.start_xy_w[:5]).all() and (fewer.yaw_rad == found.yaw_rad[:5]).all()
-    assert (draw_journeys("ab" * 32, space, labels, 5, EvaluationConfig(seed=4)).yaw_rad != fewer.yaw_rad).any()
-    assert (draw_journeys("cd" * 32, space, labels, 5, config).yaw_rad != fewer.yaw_rad).any()
+    assert (draw_episodes("ab" * 32, space, labels, 5, EvaluationConfig(seed=4)).yaw_rad != fewer.yaw_rad).any()
+    assert (draw_episodes("cd" * 32, space, labels, 5, config).yaw_rad != fewer.yaw_rad).any()
 
 
 def test_the_shortest_way_is_as_long_as_over_eight_neighbours_or_shorter(rooms):
     space, labels = rooms
-    found = draw_journeys("ab" * 32, space, labels, 6, EvaluationConfig())
+    found = draw_episodes("ab" * 32, space, labels, 6, EvaluationConfig())
     free = space.clearance_m >= 0.25
     index = np.arange(free.size).reshape(free.shape)
     a, b, w = [], [], []
@@ -167,7 +174,7 @@ def test_the_shortest_way_is_as_long_as_over_eight_neighbours_or_shorter(rooms):
 def test_a_scene_without_such_episodes_is_refused(rooms):
     space, labels = rooms
     with pytest.raises(SpaceError, match="0 of 3 episodes .* more than 50.0 m apart"):
-        draw_journeys("ab" * 32, space, labels, 3, EvaluationConfig(min_goal_m=50.0))
+        draw_episodes("ab" * 32, space, labels, 3, EvaluationConfig(min_goal_m=50.0))
 
 
 @pytest.fixture(scope="module")
@@ -193,8 +200,8 @@ def numbers(rows: pa.Table) -> dict[str, np.ndarray]:
 def first(toy, tmp_path_factory):
     """The toy's contest, played in one go."""
     contest = held(toy, tmp_path_factory.mktemp("first"))
-    venues = venues_of(contest)
-    return contest, venues, hold(contest, venues)
+    scenes = contest_scenes(contest)
+    return contest, scenes, play_contest(contest, scenes)
 
 
 def test_with_true_sight_the_navigator_finds_the_other_room(first):
@@ -209,7 +216,7 @@ def test_with_true_sight_the_navigator_finds_the_other_room(first):
 
 @pytest.mark.heavy
 def test_who_else_is_in_the_batch_does_not_matter_and_a_stopped_contest_goes_on(first, toy, tmp_path):
-    contest, venues, expected = first
+    contest, scenes, expected = first
     other = dataclasses.replace(contest, out=tmp_path, config=dataclasses.replace(contest.config, batch=2))
 
     class Enough(Exception):
@@ -220,12 +227,12 @@ def test_who_else_is_in_the_batch_does_not_matter_and_a_stopped_contest_goes_on(
             raise Enough
 
     with pytest.raises(Enough):
-        hold(other, venues, stop)
+        play_contest(other, scenes, stop)
     kept = sorted((tmp_path / "rows").glob("*.parquet"))
     assert 2 <= len(read_rows(kept)) < 8  # whole batches only
     times = {path: path.stat().st_mtime_ns for path in kept}
     told = []
-    rows = hold(other, venues, lambda what, done, total: told.append((done, total)))
+    rows = play_contest(other, scenes, lambda what, done, total: told.append((done, total)))
     assert told[0][0] >= len(read_rows(kept)) and told[-1] == (8, 8)
     assert {path: path.stat().st_mtime_ns for path in kept} == times
     ours, theirs = numbers(rows), numbers(expected)
@@ -235,19 +242,19 @@ def test_who_else_is_in_the_batch_does_not_matter_and_a_stopped_contest_goes_on(
     assert rows.select(["runs", "localisations", "episode", "contender"]).equals(
         expected.select(["runs", "localisations", "episode", "contender"])
     )
-    assert hold(other, venues, lambda *_: pytest.fail("played again")).equals(rows)
+    assert play_contest(other, scenes, lambda *_: pytest.fail("played again")).equals(rows)
 
 
 def test_another_question_is_played_anew(first, toy, tmp_path):
     contest, (venue,), _ = first
-    names = {contests._stem(venue, "dense")}
+    names = {_stem(venue, "dense")}
     for change in ({"seed": 1}, {"passable": 0.6}, {"thinned": 0.9}):
         changed = dataclasses.replace(contest, config=dataclasses.replace(contest.config, **change))
-        names.add(contests._stem(Venue(toy, changed, None), "dense"))
-    names.add(contests._stem(venue, "sparse"))
+        names.add(_stem(ContestScene(toy, changed, None), "dense"))
+    names.add(_stem(venue, "sparse"))
     assert len(names) == 5
     bigger = dataclasses.replace(contest, config=dataclasses.replace(contest.config, batch=1, episodes=9))
-    assert contests._stem(Venue(toy, bigger, None), "dense") in names
+    assert _stem(ContestScene(toy, bigger, None), "dense") in names
 
 
 def test_the_commands_draw_and_tell(first, toy, capsys, tmp_path):
@@ -290,22 +297,37 @@ def test_mistakes_are_one_line(words, told, capsys, monkeypatch, tmp_path):
     assert error.startswith("topological_nav: ") and told in error and error.count("\n") == 1
 
 
+def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, monkeypatch, capsys):
+    """Unless the settings themselves ask for what is not here."""
+    trained = TrainConfig(env=EnvConfig(backend="warp"))
+    RunFolder(tmp_path).config.write_text(to_yaml(trained))
+    usual = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
+    monkeypatch.setattr("train.evaluate.load_policy", lambda folder, config, *_, **__: (config.env, None))
+    scene = load_scene(toy)
+    simulator, env = contests._learned(tmp_path, scene, EvaluationConfig())
+    assert (simulator.env.backend, env.backend, env.scenes) == ("native", "native", (str(scene.path),))
+    assert "trained with backend warp, which is not here; played with native" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="backend is 'warp'"):
+        contests._learned(tmp_path, scene, EvaluationConfig(backend="warp"))
+
+
 def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
     contest = dataclasses.replace(held(toy, tmp_path), policy=str(tmp_path / "gone"))
     with pytest.raises(RunError, match="gone: holds no trained policy"):
-        hold(contest, venues_of(contest))
+        play_contest(contest, contest_scenes(contest))
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "policy.json").write_text("{}")
     with pytest.raises(ConfigError, match="looks at images, --truth has none"):
         contest = dataclasses.replace(contest, policy=str(tmp_path / "there"))
-        hold(contest, venues_of(contest))
+        play_contest(contest, contest_scenes(contest))
 
 
 @pytest.mark.heavy
 def test_in_a_real_home_true_sight_finds_most_goals(tmp_path):
     config = EvaluationConfig(backend="native", episodes=8, limit_s=600.0, batch=8)
     contest = Contest((Path(APARTMENT),), ("dense",), tmp_path, config, truth=True)
-    rows = hold(contest, venues_of(contest))
+    rows = play_contest(contest, contest_scenes(contest))
     assert np.mean(rows["success"].to_numpy()) >= 0.85
     assert np.mean(rows["spl"].to_numpy()) >= 0.6
     assert np.mean(rows["within"].to_numpy()) >= 0.85
@@ -317,7 +339,7 @@ def test_a_policy_told_the_goal_plays_the_same_episodes(first, toy):
     contest, (venue,), _ = first
     env = interactive_nav.make("ttbot", [toy], control_mode="twist", backend="native", num_objects=1)
     simulator = Simulator(env)
-    journeys = venue.journeys
+    journeys = venue.episodes
     found = play(learned(simulator, make_follower(env), contest.config), simulator, journeys, contest.config)
     assert found.success.all() and (found.goal_m < 1.5).all() and not found.localisations.any()
     # Runs follow each other: an episode lasts whole runs.
@@ -355,5 +377,5 @@ def test_the_expert_passes_where_furniture_leaves_a_quarter_of_a_metre(tmp_path)
     """A table closes a room of maple to the expert's grid: it stood still in 18 of 60 episodes."""
     config = EvaluationConfig(backend="native", episodes=8, batch=8, limit_s=90.0)
     contest = Contest((Path("scenes_mjcf/maple"),), ("expert",), tmp_path, config)
-    rows = hold(contest, venues_of(contest)).to_pylist()
+    rows = play_contest(contest, contest_scenes(contest)).to_pylist()
     assert [r["success"] for r in rows] == [1.0] * 8 and min(r["path_m"] for r in rows) > 2.5

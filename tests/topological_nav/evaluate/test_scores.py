@@ -8,13 +8,14 @@ import pytest
 
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate import scores
-from topological_nav.evaluate.evaluation import Journeys, Played, columns
+from topological_nav.evaluate.episodes import Episodes
+from topological_nav.evaluate.evaluation import Played, columns
 
 
-def journeys(shortest) -> Journeys:
+def journeys(shortest) -> Episodes:
     n = len(shortest)
     zero = np.zeros(n)
-    return Journeys(
+    return Episodes(
         np.arange(n),
         np.zeros((n, 2)),
         zero,

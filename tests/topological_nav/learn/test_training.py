@@ -7,13 +7,13 @@ import jax
 import numpy as np
 import pytest
 
+from interactive_nav_common.config import overridden
 from interactive_nav_common.metrics_file import read_metrics
 from topological_nav.config import TrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.errors import RunError
 from topological_nav.learn import training
 from topological_nav.learn.learning import compiled_epoch, in_batches, padded_size
-from topological_nav.settings import overridden
 
 WORDS = ("network=alexnet", "width=4", "hidden=16", "epochs=2", "batch=32", "learning_rate=1e-3")
 """AlexNet compiles in a third of ResNet-18's time."""

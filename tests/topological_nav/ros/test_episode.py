@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from interactive_nav_common.config import overridden
 from tests.toys import write_room
 from topological_nav.ros import debian, messages, topics
 from topological_nav.ros.__main__ import main
 from topological_nav.ros.config import SimulatorConfig
-from topological_nav.settings import overridden
 
 PROGRAM = [sys.executable, "-m", "topological_nav.ros"]
 START = (-2.0, 0.5, 0.8)

@@ -12,20 +12,21 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import overlay
 from topological_nav.__main__ import main
 from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.passages import draw_passages
 from topological_nav.drives.driving import load_policy
 from topological_nav.errors import RunError
+from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained
-from topological_nav.maps.build import camera_of, renderer_of
+from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.ros.__main__ import _journey
 from topological_nav.ros.__main__ import parser as ros_parser
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.space import free_space
-from topological_nav.settings import overlaid
 from topological_nav.weights import packaged
 from topological_nav.weights.export import sizes_of
 from topological_nav.weights.packaged import choose, fitting_map, packaged_weights
@@ -164,7 +165,7 @@ def test_a_map_of_own_runs_is_made_but_never_written_over(made, here, capsys):
 @pytest.mark.heavy
 def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
     from topological_nav.config import EvaluationConfig
-    from topological_nav.evaluate.contest import Contest, venues_of
+    from topological_nav.evaluate.contest import Contest, contest_scenes
 
     asked = []
     for home in (made.rooms.parent, exported):
@@ -173,7 +174,7 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
             (made.scene,), ("dense",), made.map, EvaluationConfig(), map_files=files,
             localiser=home / "rooms", detector=home / "passages",
         )  # fmt: skip
-        asked.append(venues_of(contest)[0].asked("dense"))
+        asked.append(contest_scenes(contest)[0].asked("dense"))
     assert asked[0]["map"] == asked[1]["map"] and "localiser" not in asked[0]
     assert asked[1]["detector"] == f"{asked[0]['detector']}-fp16" and asked[1]["localiser"].endswith("-fp16")
 
@@ -218,7 +219,7 @@ def test_the_packaged_networks_tell_free_ways_from_blocked_ones():
     scene, robot = load_scene(ROOT / "scenes_mjcf" / "cedar"), get_robot(data.robot)
     space, known = free_space(scene, robot.height_m), recorded_rooms(scene.digest)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
-    asked = overlaid(DataConfig(), networks[1].about["data"], "network.json")
+    asked = overlay(DataConfig(), networks[1].about["data"], "network.json")
     ways = draw_passages(space, rooms, asked, np.random.default_rng(99))
     picked = np.concatenate(
         [

@@ -1,0 +1,152 @@
+"""`data` and `train`: scenes in, datasets out; datasets in, networks and policies out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from interactive_nav_common.config import overridden, refuse_unused
+from interactive_nav_common.signals import stop_signals
+from topological_nav.commands.progress import Stopped, bar, stopping
+from topological_nav.config import (
+    DATASET,
+    DRIVES,
+    RUNS,
+    DataConfig,
+    DriveConfig,
+    PolicyConfig,
+    passage_config,
+    room_config,
+)
+
+TASKS = {"rooms": room_config, "passages": passage_config}
+
+
+def data(arguments: argparse.Namespace) -> None:
+    """Renders a dataset, or drives of the expert."""
+    if arguments.drives:
+        return _drives(arguments)
+    config = overridden(DataConfig(), arguments.settings)
+    out = arguments.out or DATASET
+    from topological_nav.data.dataset import dataset_bytes, make_dataset
+    from topological_nav.figures.maps import dataset_figure, save
+
+    with stop_signals() as stops, bar() as tell:
+        header = make_dataset([Path(s) for s in arguments.scenes], out, config, stopping(tell, stops))
+    save(dataset_figure(out), out / "preview.png")
+    images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
+    for s in header["scenes"]:
+        rand = "" if s["rooms_agreement"] is None else f", adjusted Rand index {s['rooms_agreement']:.2f}"
+        print(
+            f"{s['name']}: {s['rooms']} rooms ({s['rooms_chosen_by']}{rand}), {s['positions']} positions "
+            f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
+        )
+    size = dataset_bytes(out)
+    print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+
+
+def _drives(arguments: argparse.Namespace) -> None:
+    config = overridden(DriveConfig(), arguments.settings)
+    out, scenes = arguments.out or DRIVES, [Path(s) for s in arguments.scenes]
+    from topological_nav.drives.dataset import draw_drives, drives_bytes, simulate_drives, summary
+    from topological_nav.figures.drive_figures import drives_figure
+    from topological_nav.figures.maps import save
+
+    with stop_signals() as stops:
+        with bar() as tell:
+            drives = simulate_drives(scenes, out, config, stopping(tell, stops))
+        with bar() as tell:
+            draw_drives(scenes, out, stopping(tell, stops))
+    save(drives_figure(scenes, out), out / "preview.png")
+    row = summary(drives)
+    print(
+        f"{row['drives']:,} drives: reached {row['reached']:.3f}, in contact {row['touched']:.3f} "
+        f"({row['contact_s']:.2f} s a drive), kept {int(drives.kept.sum()):,}; {row['seconds']:.1f} s long, "
+        f"{row['m_s']:.2f} m/s, turning in {row['turning']:.2f} of the steps"
+    )
+    images = int(drives.steps[drives.kept].sum())
+    size = drives_bytes(out)
+    print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """Trains a network or a local policy."""
+    if arguments.task == "policy":
+        return _policy(arguments)
+    refuse_unused(arguments, "--localiser --detector --grid", f"in 'train {arguments.task}'")
+    if arguments.task == "passages":
+        refuse_unused(arguments, "hidden pitch label_smoothing", "in 'train passages'")
+    config = overridden(TASKS[arguments.task](), arguments.settings)
+    if config.init != "selfsup":
+        refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
+    out = arguments.out or RUNS / arguments.task
+    from interactive_nav_common.metrics_file import read_metrics
+    from topological_nav.figures.maps import curves_figure, save
+    from topological_nav.learn.training import train as train_network
+
+    with stop_signals() as stops:
+        results = train_network(
+            arguments.task,
+            arguments.data or DATASET,
+            out,
+            config,
+            lambda line: print(line, flush=True),
+            lambda: bool(stops),
+        )
+        if results is None:
+            raise Stopped(stops[0])
+    save(curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+    for name, row in results.get("groups", {}).items():
+        print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
+    if rows := results.get("lengths"):
+        print("ahead:  " + ",  ".join(f"{row['ahead_m']:g} m {row['accuracy']:.3f}" for row in rows) + "  right")
+    if mean := results["localisation"].get("mean"):
+        print(
+            f"localisation: nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
+            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
+        )
+    print(f"{out}: {results['parameters']:,} parameters")
+
+
+def _policy(arguments: argparse.Namespace) -> None:
+    config = overridden(PolicyConfig(), arguments.settings)
+    if arguments.grid:
+        refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
+    out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
+    from interactive_nav_common.metrics_file import read_metrics
+    from topological_nav.drives.frames import embed_drives
+    from topological_nav.drives.imitation import grid_table, train_grid, train_policy
+    from topological_nav.figures.drive_figures import policy_figure
+    from topological_nav.figures.maps import save
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+
+    with stop_signals() as stops:
+        halt = lambda: bool(stops)  # noqa: E731
+        runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
+        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell, halt)
+        learn = train_grid if arguments.grid else train_policy
+        results = None if frames is None else learn(frames, out, config, tell, halt)
+        if results is None:
+            raise Stopped(stops[0])
+    if isinstance(results, list):
+        for row in results:
+            folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"
+            save(policy_figure(read_metrics(folder / "metrics.jsonl"), row), folder / "curves.png")
+        print(grid_table(results), end="")
+        return
+    save(policy_figure(read_metrics(out / "metrics.jsonl"), results), out / "curves.png")
+    for name in ("linear", "angular") if "test" in results else ():
+        row = results["test"][name]
+        print(
+            f"{name:<8} {results['test']['steps']:,} held-out steps  accuracy {row['accuracy']:.3f} "
+            f"(the commonest class {row['commonest']:.3f})  macro F1 {row['macro_f1']:.3f}"
+        )
+    if "test" in results:
+        test = results["test"]
+        print(f"forward model: error {test['forward']:.4f}, of no change {test['no_change']:.4f}")
+    print(
+        f"{out}: {results['sequences']:,} sequences ({results['nearly_straight']:.2f} of all are nearly straight), "
+        f"{results['parameters']:,} parameters"
+    )

@@ -1,0 +1,63 @@
+"""How far a command is, on the terminal; and how a signal stops it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Tell = Callable[[str, int, int], None]
+"""Told what is done, how much of it, and of how much."""
+
+
+class Stopped(Exception):
+    """A signal asked to stop; carries its number."""
+
+
+def stopping(tell: Tell, stops: list[int]) -> Tell:
+    """The same, which raises `Stopped` before the end once `stops` has a signal (see `signals.stop_signals`)."""
+
+    def told(what: str, done: int, total: int) -> None:
+        tell(what, done, total)
+        if stops and done < total:
+            raise Stopped(stops[0])
+
+    return told
+
+
+def say(line: str) -> None:
+    """A line to stderr, at once."""
+    print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def bar():
+    """A bar with the time left on a terminal, a line every tenth elsewhere."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:<14}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as shown:
+        task, tenths = shown.add_task("starting", total=None), 0
+        # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
+        first: tuple[float, int] | None = None
+
+        def tell(what: str, done: int, total: int) -> None:
+            nonlocal tenths, first
+            first = first or (time.perf_counter(), done)
+            shown.update(task, description=what, completed=done, total=total)
+            if not console.is_terminal and done * 10 // max(total, 1) > tenths:
+                tenths, (began, before), left = done * 10 // total, first, ""
+                if done > before:
+                    left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
+                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
+
+        yield tell

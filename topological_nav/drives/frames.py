@@ -1,0 +1,109 @@
+"""A folder of drives and two trained networks in, the embeddings of all images of the drives out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from topological_nav.config import DriveConfig
+from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
+from topological_nav.errors import RunError
+from topological_nav.learn.learning import in_batches
+from topological_nav.learn.pairs import SAME, load_pair, seen_by
+from topological_nav.learn.training import Trained
+
+_TOLD_EVERY = 10
+"""Files of images between two lines about embedding."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Drives of a folder and the embeddings of their images."""
+
+    drives: Drives
+    config: DriveConfig
+    header: dict[str, Any]
+    features: np.ndarray
+    """[F or 2 F, D] f16 of all control steps, 0 where nothing was drawn; then the same of mirrored images."""
+    networks: tuple[Trained, Trained]
+    """Of rooms and of passages."""
+    runs: tuple[Path, Path]
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether there are mirrored ones."""
+        return len(self.features) > len(self.drives.command)
+
+
+def embed_drives(
+    folder: Path,
+    localiser_run: Path,
+    detector_run: Path,
+    mirror: bool,
+    tell: Callable[[str], None] = lambda _: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Frames | None:
+    """Embeds the images of all kept drives.
+
+    Args:
+        folder: of the drives.
+        localiser_run: run folder of a room classifier.
+        detector_run: of a passage detector.
+        mirror: embed mirrored images too.
+        tell: told now and then how far it is.
+        should_stop: asked after every file of images.
+
+    Returns:
+        None where it was stopped.
+
+    Raises:
+        DatasetError, RunError: drives or networks cannot be used, or do not fit each other.
+    """
+    header, config = read_drives_header(folder)
+    drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
+    mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, seen_by(networks[0])
+    for name in SAME:
+        if mine[name] != theirs[name]:
+            raise RunError(
+                f"{folder}: images have {name} = {mine[name]!r}, the networks learned from {theirs[name]!r}; drive "
+                f"again with {name}={theirs[name]}"
+            )
+    count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
+    features: np.ndarray | None = None
+    embed = _embedder(networks, mirror)
+    for i, (rows, images) in enumerate(drive_images(folder)):
+        at, part = drives.rows(rows), in_batches(embed, images)
+        if features is None:
+            features = np.zeros((part.shape[1] * count, part.shape[2]), np.float16)
+        for side in range(part.shape[1]):
+            features[at + side * count] = part[:, side]
+        done += len(images)
+        if i % _TOLD_EVERY == 0 or done == total:
+            tell(f"embedded {done:,} of {total:,} images")
+        if should_stop():
+            return None
+    if features is None:
+        raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
+    return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
+
+
+def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
+    """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
+    modules, weights = [network.network for network in networks], [network.variables for network in networks]
+
+    @jax.jit
+    def embedded(weights: Any, images: jax.Array) -> jax.Array:
+        sides = []
+        for shown in (images, images[:, :, ::-1]) if mirror else (images,):
+            parts = [m.apply(w, shown, method="embed") for m, w in zip(modules, weights, strict=True)]
+            sides.append(jnp.concatenate(parts, -1))  # type: ignore[arg-type]
+        return jnp.stack(sides, 1).astype(jnp.float16)
+
+    return functools.partial(embedded, weights)

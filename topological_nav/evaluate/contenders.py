@@ -1,0 +1,171 @@
+"""Who plays episodes: the navigator through a camera, an expert with the plan, a learned policy told the goal."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from topological_nav.config import EvaluationConfig
+from topological_nav.evaluate.episodes import Episodes
+from topological_nav.navigate.navigator import Navigator
+from topological_nav.navigate.state import Events, State
+from topological_nav.scenes.simulation import Camera, Seen, Simulator
+from train.scoring.planners import Planner
+
+EXPERT_WEIGHT = 1.0
+"""Of path against effort: objects are pushed only where no way is free."""
+
+
+class Contender(Protocol):
+    """Plays a batch; everything it remembers can be thinned out."""
+
+    def begin(self, episodes: Episodes) -> None:
+        """Fresh episodes."""
+        ...
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Only these episodes go on."""
+        ...
+
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+        """The state after one control step, and what the contender says of the step before it."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Marks:
+    """[B] bool each."""
+
+    run_started: np.ndarray
+    run_ended: np.ndarray
+    arrived: np.ndarray
+    timed_out: np.ndarray
+    localised: np.ndarray
+    blocked: np.ndarray
+    lost: np.ndarray
+
+
+class NavigatorPlayer:
+    """The navigator, seeing through a camera."""
+
+    def __init__(
+        self,
+        navigator: Navigator,
+        simulator: Simulator,
+        camera: Camera,
+        config: EvaluationConfig,
+        watch: Callable[[float, Seen, State, Events], None] = lambda *_: None,
+    ):
+        """Takes its parts.
+
+        Args:
+            navigator: of the scene.
+            simulator: of the scene.
+            camera: what the navigator's sight understands.
+            config: of the evaluation.
+            watch: told time, poses, new state and events of every step.
+        """
+        self._navigator, self._simulator, self._camera, self._config = navigator, simulator, camera, config
+        self._watch = watch
+        self.state: State | None = None
+
+    def begin(self, episodes: Episodes) -> None:
+        """Takes the goals' images, along as many headings as a localisation's."""
+        count = self._config.images
+        around = 2 * np.pi * np.arange(count) / count
+        n = len(episodes)
+        images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n))
+        images = images.reshape(n, count, *images.shape[1:])
+        self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
+        self._images = images[:, 0].copy()
+
+    def keep(self, rows: np.ndarray) -> None:
+        """See `Contender`."""
+        assert self.state is not None
+        self.state, self._images = self.state.take(rows), self._images[rows]
+
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+        """See `Contender`."""
+        assert self.state is not None
+        seen = self._simulator.seen(state)
+        mind = self._navigator.stop(self.state, over)
+        looks = np.flatnonzero(self._navigator.looks(mind, seen.yaw_rad, time_s))
+        if len(looks):  # the others keep an old image, which nobody looks at
+            self._images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
+        self.state, linear, angular, events = self._navigator.step(mind, self._images, seen.yaw_rad, time_s)
+        self._watch(time_s, seen, self.state, events)
+        marks = Marks(
+            events.run_started,
+            events.run_ended,
+            events.arrived,
+            events.timed_out,
+            events.localised,
+            events.blocked,
+            events.lost,
+        )
+        return self._simulator.drive(state, linear, angular), marks
+
+
+Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
+"""State, episode numbers [B], which of them run [B] and control steps done to actions [B, A]."""
+
+
+class ActionPlayer:
+    """Whoever acts on the environment's own state: its runs follow each other without a break."""
+
+    def __init__(self, simulator: Simulator, make_act: Callable[[], Act], config: EvaluationConfig):
+        """Takes what acts.
+
+        Args:
+            simulator: of the environment.
+            make_act: called for every batch of episodes.
+            config: of the evaluation.
+        """
+        self._simulator, self._make_act, self._config = simulator, make_act, config
+
+    def begin(self, episodes: Episodes) -> None:
+        """See `Contender`."""
+        self._episode, self._act = episodes.number, self._make_act()
+
+    def keep(self, rows: np.ndarray) -> None:
+        """See `Contender`."""
+        self._episode = self._episode[rows]
+
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+        """See `Contender`."""
+        step = round(time_s / self._simulator.dt_s)
+        every = max(1, round(self._config.run_s / self._simulator.dt_s))
+        edge = np.full(len(over), step % every == 0)
+        none = np.zeros(len(over), bool)
+        late = ~over & (time_s >= self._config.limit_s - 1e-3)
+        marks = Marks(edge & ~over, edge & ~over & (step > 0), none, late, none, none, none)
+        action = self._act(state, self._episode, ~over, step)
+        return self._simulator.act(state, action), marks
+
+
+def expert(simulator: Simulator, config: EvaluationConfig) -> ActionPlayer:
+    """The planner of `train.scoring.planners` that has the map and all poses: it goes round everything where it can.
+
+    Where its grid leaves no way between an object and a wall, it takes the one through the least of objects: episodes
+    are joined by ways 0.25 m from everything, which is nearer than it goes on its own account.
+    """
+    return ActionPlayer(simulator, lambda: Planner(simulator.env, EXPERT_WEIGHT).act, config)
+
+
+def learned(simulator: Simulator, policy: Any, config: EvaluationConfig) -> ActionPlayer:
+    """A policy of `train`, told the goal's position as in its own observations."""
+
+    @jax.jit
+    def chosen(obs: Any, episode: jax.Array, step: jax.Array) -> jax.Array:
+        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(config.seed), i), step))
+        return jax.vmap(policy)(obs, keys(episode))
+
+    def act(state: Any, episode: np.ndarray, _: np.ndarray, step: int) -> Any:
+        return chosen(state.obs, jnp.asarray(episode), jnp.asarray(step))
+
+    return ActionPlayer(simulator, lambda: act, config)

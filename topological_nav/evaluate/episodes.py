@@ -1,0 +1,102 @@
+"""A scene's free space in, its fixed episodes out: starts, goals, and the shortest ways between them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import label as components
+
+from interactive_nav.scenes.scene import Scene
+from topological_nav.config import EvaluationConfig
+from topological_nav.errors import SpaceError
+from topological_nav.scenes.rooms import Rooms
+from topological_nav.scenes.space import FreeSpace
+from train.scoring.planners import PathGrid
+
+CONNECTED_M = 0.25
+"""Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""
+LEAST, MOST, PER_M2 = 25, 60, 0.5
+"""Episodes a scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """Fixed episodes of one scene."""
+
+    number: np.ndarray
+    """[n] i32, theirs in the scene."""
+    start_xy_w: np.ndarray
+    """[n, 2] m."""
+    yaw_rad: np.ndarray
+    """[n] heading at the start."""
+    goal_xy_w: np.ndarray
+    """[n, 2] m."""
+    start_room: np.ndarray
+    goal_room: np.ndarray
+    """[n] i32."""
+    shortest_m: np.ndarray
+    """[n] length of the shortest way round walls and furniture, for half of the robot's width."""
+
+    def take(self, rows: Any) -> Episodes:
+        """Some of them."""
+        return Episodes(**{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
+
+    def __len__(self) -> int:
+        return len(self.yaw_rad)
+
+
+def count_of(scene: Scene, config: EvaluationConfig) -> int:
+    """Episodes of a scene: as set, or by its floor's area."""
+    return config.episodes or int(np.clip(round(PER_M2 * scene.manifest.floor_area_m2), LEAST, MOST))
+
+
+def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, config: EvaluationConfig) -> Episodes:
+    """Draws episodes: number i depends on seed and scene alone, however many there are.
+
+    Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
+
+    Raises:
+        SpaceError: the scene has no such pair.
+    """
+    parts, _ = components(space.clearance_m >= CONNECTED_M)  # type: ignore[misc]
+    places = space.centres(config.clearance_m)
+    if len(places) < 2:
+        raise SpaceError(f"{len(places)} places are {config.clearance_m} m from obstacles; ask for less clearance_m")
+    column, row = space.cells(places).T
+    part, room = parts[row, column], rooms.of(places)
+    rng = np.random.default_rng([config.seed, 17, int(digest[:8], 16)])
+    pairs, yaws, tries = [], [], 0
+    while len(pairs) < count:
+        a, b = rng.integers(len(places), size=2)
+        yaw = rng.uniform(-np.pi, np.pi)
+        tries += 1
+        if tries > 2000 * (len(pairs) + 1):
+            raise SpaceError(
+                f"after {tries:,} draws {len(pairs)} of {count} episodes have start and goal in different rooms, more "
+                f"than {config.min_goal_m} m apart and joined by a way; ask for less clearance_m or min_goal_m"
+            )
+        if part[a] != part[b] or not part[a] or room[a] == room[b]:
+            continue
+        if np.linalg.norm(places[a] - places[b]) > config.min_goal_m:
+            pairs.append((a, b))
+            yaws.append(yaw)
+    a, b = np.array(pairs).T
+    ways = _Ways(space)
+    shortest = np.array([ways.shortest_m(places[i], places[j]) for i, j in pairs])
+    return Episodes(np.arange(count), places[a], np.array(yaws), places[b], room[a], room[b], shortest)
+
+
+class _Ways:
+    """Shortest ways over a grid of 16 directions: at most 2.7 % too long."""
+
+    def __init__(self, space: FreeSpace):
+        self._space, free = space, space.clearance_m >= CONNECTED_M
+        self._grid = PathGrid(free, np.ones(free.shape))
+
+    def shortest_m(self, start: np.ndarray, goal: np.ndarray) -> float:
+        """Between two places [2], m."""
+        a, b = self._space.cells(start), self._space.cells(goal)
+        way = self._grid.path((a[1], a[0]), (b[1], b[0]))
+        return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum() * self._space.resolution_m)

@@ -1,0 +1,143 @@
+"""Scenes and contenders in, a folder of rows out, one file a batch of episodes; a contest that was stopped goes on.
+
+OUT/rows/<scene>-<contender>-<digest>-<first episode>.parquet   one row an episode (`evaluation.columns`)
+    tracks/<the same>.npz                                       where the robots went
+    <scene>.png, summary.md                                     drawn and told at the end
+
+The digest is of everything that decides the rows: scene, episodes, settings, map, networks, policy. Another question
+adds files; the same one finds its own and plays what is missing.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pyarrow as pa
+
+from interactive_nav_common.files import whole_file
+from interactive_nav_common.rows import read_rows, write_parquet
+from interactive_nav_common.versions import versions
+from topological_nav.evaluate.contenders import Contender
+from topological_nav.evaluate.contest import Contest, ContestScene
+from topological_nav.evaluate.evaluation import columns, play
+from topological_nav.scenes.simulation import Simulator
+
+CPU_BATCH = 8
+"""Episodes played at a time on a CPU unless asked otherwise."""
+Tell = Callable[[str, int, int], None]
+
+
+def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Tell = lambda *_: None) -> pa.Table:
+    """Plays what is missing, and returns all rows.
+
+    Args:
+        contest: who plays what.
+        scenes: of `contest_scenes`.
+        tell: told who plays where, episodes over and episodes in all, after every control step; may raise to stop,
+            which loses the batch that is being played.
+
+    Raises:
+        TopologicalError, SceneError, TrainError: something cannot be used.
+    """
+    # Everything that can be refused is refused before the first episode.
+    plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]
+    missing = [_missing(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan]
+    total = sum(len(scene.episodes) for scene, _, _ in plan)
+    done = total - sum(map(len, missing))
+    cpu = jax.default_backend() == "cpu"
+    for (scene, name, stem), numbers in zip(plan, missing, strict=True):
+        if not len(numbers):
+            continue
+        contender, simulator = scene.contender(name)
+        size = contest.config.batch or (CPU_BATCH if cpu else len(numbers))
+        for first in range(0, len(numbers), size):
+            rows = numbers[first : first + size]
+            told = functools.partial(_tell, tell, f"{scene.scene.name} {name}", done, total)
+            _play(scene, contest.out, name, stem, contender, simulator, rows, told)
+            done += len(rows)
+            tell(f"{scene.scene.name} {name}", done, total)
+    return pa.concat_tables([_rows(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan])
+
+
+def _tell(tell: Tell, what: str, before: int, total: int, over: int, _: float) -> None:
+    tell(what, min(before + over, total - 1), total)
+
+
+def _stem(scene: ContestScene, contender: str) -> str:
+    asked = json.dumps(scene.asked(contender), sort_keys=True)
+    return f"{scene.scene.name}-{contender}-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
+
+
+def _files(out: Path, stem: str) -> list[Path]:
+    return sorted((out / "rows").glob(f"{stem}-*.parquet"))
+
+
+def _missing(out: Path, stem: str, count: int) -> np.ndarray:
+    """Numbers of the episodes that no file has."""
+    there = _rows(out, stem, count)["episode"].to_numpy() if _files(out, stem) else np.zeros(0, int)
+    return np.setdiff1d(np.arange(count), there)
+
+
+def _rows(out: Path, stem: str, count: int) -> pa.Table:
+    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for."""
+    rows = read_rows(_files(out, stem)).sort_by("episode")
+    return rows.filter(pa.array(rows["episode"].to_numpy() < count))
+
+
+def _play(
+    scene: ContestScene,
+    out: Path,
+    name: str,
+    stem: str,
+    contender: Contender,
+    simulator: Simulator,
+    rows: np.ndarray,
+    tell: Callable[[int, float], None],
+) -> None:
+    config = scene.contest.config
+    episodes = scene.episodes.take(rows)
+    began = time.perf_counter()
+    played = play(contender, simulator, episodes, config, tell)
+    here = versions()
+    navigates = name in ("dense", "sparse")
+    constants = {
+        "contender": name,
+        "sight": ("truth" if scene.networks is None else "networks") if navigates else "none",
+        "domain": scene.contest.domain if navigates else "none",
+        "policy": scene.contest.policy if navigates else name,
+        "scene": scene.scene.name,
+        "split": scene.scene.split,
+        "robot": simulator.env.robot.name,
+        "seed": config.seed,
+        "backend": simulator.env.backend,
+        "device": here["device"]["kind"],
+        "commit": here["commit"],
+        "wall_s": time.perf_counter() - began,
+    }
+    table = {key: [value] * len(rows) for key, value in constants.items()}
+    table |= {"episode": episodes.number, **columns(episodes, played, config)}
+    file = f"{stem}-{rows[0]:04d}"
+    tracks = out / "tracks" / f"{file}.npz"
+    with whole_file(tracks) as partial, open(partial, "wb") as handle:
+        named: dict[str, Any] = {str(n): np.asarray(t, np.float32) for n, t in zip(rows, played.track_w, strict=True)}
+        np.savez_compressed(handle, **named)
+    # Rows last: an episode counts as played once its row is there.
+    notes = {"asked": json.dumps(scene.asked(name)), "versions": json.dumps(here["packages"])}
+    write_parquet(pa.table(table), out / "rows" / f"{file}.parquet", notes)
+
+
+def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int, np.ndarray]:
+    """Episode number -> [t, 2] m, of what has been played."""
+    found: dict[int, np.ndarray] = {}
+    for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
+        with np.load(path) as stored:
+            found |= {int(number): stored[number] for number in stored.files}
+    return found

@@ -1,0 +1,136 @@
+"""What a batch of navigators remembers, what happened to it in a step, and a copy of it that a step writes into."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
+PHASES = ("localise", "face", "swing", "lean", "drive", "arrived", "stopped", "timed out")
+TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
+
+    phase: np.ndarray
+    """i8, one of `PHASES`."""
+    goal: np.ndarray
+    """i32 node."""
+    node: np.ndarray
+    """i32 node of the last localisation, -1 before the first."""
+    edge: np.ndarray
+    """i32 edge that is followed; -1 where the map has no way, or none is planned yet."""
+    began_s: np.ndarray
+    """When the episode began; NaN before its first step."""
+    looks: np.ndarray
+    """i32 images taken in this localisation."""
+    evidence: np.ndarray
+    """[B, N] what they say: sums, or least, of distances."""
+    base_rad: np.ndarray
+    """The edge's angle; in a localisation, the first heading."""
+    target_rad: np.ndarray
+    """Heading to reach."""
+    swing: np.ndarray
+    """i32 headings asked since the edge was planned."""
+    best_p: np.ndarray
+    best_rad: np.ndarray
+    """The most open of them, for `NavigatorConfig.clear_m`."""
+    penalty: np.ndarray
+    """[B, E] added to the edges' weights."""
+    driven: np.ndarray
+    """i32 edge that was driven since the robot was last found, -1: none."""
+    lost: np.ndarray
+    """i32 times that the map had no way."""
+    integral: np.ndarray
+    """PID: integral term, rad/s."""
+    error_rad: np.ndarray
+    """PID: error of the step before; NaN where it starts."""
+    clock_s: np.ndarray
+    """Time of the step before."""
+    run: np.ndarray
+    """i32 runs done since the robot last looked about."""
+    run_end_s: np.ndarray
+    watch_s: np.ndarray
+    """Next time to look, within a run, whether the edge's head is passed."""
+    least: np.ndarray
+    """Least distance to the head in this run, as `Sight.distances` tells it."""
+    acts: np.ndarray
+    """i32 control steps of this run."""
+    linear: np.ndarray
+    """m/s, the last command."""
+    angular: np.ndarray
+    """rad/s."""
+    hidden: Any
+    """The local policy's."""
+
+    def take(self, rows: np.ndarray) -> State:
+        """Those rows of the batch."""
+        return jax.tree.map(lambda x: np.asarray(x)[rows], self)
+
+    @property
+    def over(self) -> np.ndarray:
+        """[B] bool: arrived, stopped or out of time."""
+        return self.phase >= ARRIVED
+
+
+jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(State)], [])
+
+
+@dataclasses.dataclass(frozen=True)
+class Events:
+    """What happened in a step, [B] bool each; whose run ended may be told to stop by those who know better."""
+
+    localised: np.ndarray
+    """Turned about, and `State.node` is new."""
+    glanced: np.ndarray
+    """Saw a neighbour of the last node after a run, and `State.node` is new."""
+    lost: np.ndarray
+    """The map has no way from there."""
+    blocked: np.ndarray
+    """No heading near the edge's is open."""
+    run_started: np.ndarray
+    run_ended: np.ndarray
+    arrived: np.ndarray
+    timed_out: np.ndarray
+
+
+class Work:
+    """A copy of a state that a step writes into, and its events."""
+
+    def __init__(self, state: State, batch: int):
+        """Copies the state of a batch."""
+        self._names = [f.name for f in dataclasses.fields(State)]
+        for name in self._names:
+            value = getattr(state, name)
+            setattr(self, name, value if name == "hidden" else value.copy())
+        self._events = {"lost": "lost_now"}
+        for field in dataclasses.fields(Events):
+            setattr(self, self._events.get(field.name, field.name), np.zeros(batch, bool))
+
+    def restart_pid(self, rows: np.ndarray) -> None:
+        """A new target: errors of before say nothing."""
+        self.integral[rows], self.error_rad[rows] = 0.0, np.nan
+
+    def put_hidden(self, rows: np.ndarray, new: Any) -> None:
+        """Rows of the local policy's state."""
+
+        def put(old: Any, value: Any) -> np.ndarray:
+            out = np.array(old)
+            out[rows] = np.asarray(value)
+            return out
+
+        self.hidden = jax.tree.map(put, self.hidden, new)
+
+    def state(self) -> State:
+        """What it has become."""
+        return State(**{name: getattr(self, name) for name in self._names})
+
+    def events(self) -> Events:
+        """What happened."""
+        names = [f.name for f in dataclasses.fields(Events)]
+        return Events(**{name: getattr(self, self._events.get(name, name)) for name in names})
