@@ -173,11 +173,7 @@ def convert_object(
         category = _category(config, (item.name, path.stem), source)
         for warning in source.warnings:
             warn(warning)
-        low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
-        if not 0.005 < (high - low).max() < 10.0:
-            raise SceneRejected(
-                f"{path}: is {(high - low).max():g} m long, expected 0.5 cm to 10 m; give --scale for another unit"
-            )
+        low, high = _bounds(item, path)
         hulls, hull_source = _hulls(item, path, config, source, cache)
         base = np.array([*(low + high)[:2] / 2, min(float(h.vertices[:, 2].min()) for h in hulls)])
         foot = FOOT_SHARE * float(high[2] - low[2])
@@ -186,26 +182,10 @@ def convert_object(
         volume, com, inertia = mass_moments(hulls)
         mass, mass_source = _mass(item, category, volume, config)
         friction, friction_source = _friction(item, category, config)
-        placed = PlacedObject(
-            name=target.name,
-            category=category,
-            cad_id=item.name,
-            vertices_b=item.surface.vertices - base,
-            faces=item.surface.faces,
-            face_colours=colours_of_faces(item.surface),
-            hulls_b=hulls,
-            boxes_b=tuple(fit_box(h, 0.0) for h in hulls),
-            position_w=np.zeros(3),
-            quaternion_w=np.array([1.0, 0.0, 0.0, 0.0]),
-            hinge=None,
-        )
         physical = Physical(mass, com, inertia * mass / volume, friction, volume, False)
-        settled = settle(SceneParts(target.name, (placed,), (physical,), ()))
-        parts = dataclasses.replace(settled.parts, object_visuals=(visual,))
-        rest = _rest(settled.parts)
-        about = {
+        parts = _at_rest(_at_origin(target.name, category, item, base, hulls), physical)
+        about = _origin(item, source) | {
             "name": target.name,
-            "source_name": item.name,
             "category": category,
             "mass_kg": round(mass, 5),
             "mass_source": mass_source,
@@ -215,16 +195,55 @@ def convert_object(
             "hull_source": hull_source,
             "hull_volume_m3": round(volume, 8),
             "size_m": [round(float(v), 4) for v in high - low],
-            "rest": rest,
-            "source": {"sha256": dict(sorted(source.sha256.items()))},
-            "warnings": source.warnings,
-            "versions": {name: version(name) for name in PACKAGES},
+            "rest": _rest(parts),
         }
-        _write(parts, folder)
-        (folder / "object.json").write_text(
-            json.dumps(about, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8"
-        )
+        _write(dataclasses.replace(parts, object_visuals=(visual,)), about, folder)
     return about
+
+
+def _at_rest(placed: PlacedObject, physical: Physical) -> SceneParts:
+    return settle(SceneParts(placed.name, (placed,), (physical,), ())).parts
+
+
+def _origin(item: RigidObject, source: SourceFolder) -> dict[str, Any]:
+    """What object.json says of where the object comes from."""
+    return {
+        "source_name": item.name,
+        "source": {"sha256": dict(sorted(source.sha256.items()))},
+        "warnings": source.warnings,
+        "versions": {name: version(name) for name in PACKAGES},
+    }
+
+
+def _bounds(item: RigidObject, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner of the surface, m.
+
+    Raises:
+        SceneRejected: no plausible size.
+    """
+    low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
+    if not 0.005 < (high - low).max() < 10.0:
+        raise SceneRejected(
+            f"{path}: is {(high - low).max():g} m long, expected 0.5 cm to 10 m; give --scale for another unit"
+        )
+    return low, high
+
+
+def _at_origin(name: str, category: str, item: RigidObject, base: np.ndarray, hulls: tuple[Hull, ...]) -> PlacedObject:
+    """The object with the point `base` of its file at the world's origin, unturned."""
+    return PlacedObject(
+        name=name,
+        category=category,
+        cad_id=item.name,
+        vertices_b=item.surface.vertices - base,
+        faces=item.surface.faces,
+        face_colours=colours_of_faces(item.surface),
+        hulls_b=hulls,
+        boxes_b=tuple(fit_box(h, 0.0) for h in hulls),
+        position_w=np.zeros(3),
+        quaternion_w=np.array([1.0, 0.0, 0.0, 0.0]),
+        hinge=None,
+    )
 
 
 def _moved(mesh: TexturedMesh, by: np.ndarray) -> TexturedMesh:
@@ -287,8 +306,8 @@ def _rest(parts: SceneParts) -> dict[str, Any]:
     return result
 
 
-def _write(parts: SceneParts, folder: Path) -> None:
-    """`assets/` and `object.xml`: the scene writer's file without floor, light and structure."""
+def _write(parts: SceneParts, about: dict[str, Any], folder: Path) -> None:
+    """`object.json`, `assets/` and `object.xml`: the scene writer's file without floor, light and structure."""
     (placed,) = parts.objects
     centred = dataclasses.replace(placed, position_w=placed.position_w * [0.0, 0.0, 1.0])
     write_scene(dataclasses.replace(parts, objects=(centred,)), folder)
@@ -304,3 +323,5 @@ def _write(parts: SceneParts, folder: Path) -> None:
     spec.compile()
     path.unlink()
     (folder / "object.xml").write_text(spec.to_xml(), encoding="utf-8")
+    text = json.dumps(about, indent=1, sort_keys=True, allow_nan=False)
+    (folder / "object.json").write_text(text + "\n", encoding="utf-8")

@@ -8,6 +8,7 @@ cannot be interrupted from Python. A model is decomposed once, unscaled: scaling
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import hashlib
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -147,38 +148,51 @@ def decompose_all(
     # The largest first: the tail of the stage is then short.
     waiting.sort(key=lambda item: -len(meshes[item[1]][1]))
     total = len(set(keys.values()))
+    tell = progress or (lambda share: None)
+    tell(len(done) / max(total, 1))
+    with contextlib.closing(_results(waiting, meshes, configs, max(jobs, 1), config.timeout_s)) as results:
+        for key, name, hulls, reason in results:
+            if hulls is None:
+                if strict:
+                    raise StageFailed(f"decompose: {reason}")
+                hulls, failed[key] = (convex_hull(meshes[name][0]),), reason
+            else:
+                _store(cache / f"{key}.npz", hulls)
+            done[key] = hulls
+            tell(len(done) / max(total, 1))
+    return Decomposition(
+        {name: done[key] for name, key in keys.items()},
+        {name: failed[key] for name, key in keys.items() if key in failed},
+    )
+
+
+def _results(
+    waiting: list[tuple[str, str]],
+    meshes: dict[str, tuple[np.ndarray, np.ndarray]],
+    configs: Mapping[str, DecomposeConfig],
+    jobs: int,
+    timeout_s: float,
+) -> Generator[tuple[str, str, tuple[Hull, ...] | None, str], None, None]:
+    """Key, name, hulls and what `_finish` says of each that waits, as they end; closed early, it ends what runs."""
     running: list[_Job] = []
     with tempfile.TemporaryDirectory(prefix="hulls-") as scratch:
         try:
             while waiting or running:
-                while waiting and len(running) < max(jobs, 1):
+                while waiting and len(running) < jobs:
                     key, name = waiting.pop(0)
                     running.append(_start(key, name, *meshes[name], configs[name], Path(scratch)))
                 for job in list(running):
-                    late = time.monotonic() - job.started > config.timeout_s
-                    if job.process.poll() is None and not late:
-                        continue
-                    hulls, reason = _finish(job, config.timeout_s)
-                    running.remove(job)
-                    if hulls is None:
-                        if strict:
-                            raise StageFailed(f"decompose: {reason}")
-                        hulls, failed[job.key] = (convex_hull(meshes[job.name][0]),), reason
-                    else:
-                        _store(cache / f"{job.key}.npz", hulls)
-                    done[job.key] = hulls
-                if progress is not None:
-                    progress(len(done) / max(total, 1))
+                    late = time.monotonic() - job.started > timeout_s
+                    if job.process.poll() is not None or late:
+                        hulls, reason = _finish(job, timeout_s)
+                        running.remove(job)
+                        yield job.key, job.name, hulls, reason
                 if running:
                     time.sleep(0.05)
         finally:
             for job in running:
                 job.process.kill()
                 job.process.wait()
-    return Decomposition(
-        {name: done[key] for name, key in keys.items()},
-        {name: failed[key] for name, key in keys.items() if key in failed},
-    )
 
 
 def _finish(job: _Job, timeout_s: float) -> tuple[tuple[Hull, ...] | None, str]:

@@ -47,9 +47,9 @@ def make_physics(world: World, config: NavConfig) -> Physics:
         from interactive_nav.physics.native import NativePhysics
 
         return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads, forces=forces)
-    from interactive_nav.physics.mjx_batch import MjxPhysics
+    from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
-    return MjxPhysics(world, config, backend, forces)
+    return (WarpPhysics if backend == "warp" else JaxPhysics)(world, config, forces)
 
 
 __all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

@@ -7,6 +7,11 @@ is carried.
 
 from __future__ import annotations
 
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -27,7 +32,8 @@ from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
-from interactive_nav.scenes.world import Layout, World
+from interactive_nav.scenes.layout import Layout
+from interactive_nav.scenes.world import World
 
 # Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,
 # contact matches; and the solver's iteration limit. A test compares them with the engine's.
@@ -38,105 +44,76 @@ CCD_PER_ENV = 32
 
 
 class MjxPhysics(Physics):
-    """Steps a batch with `mjx.step` under vmap."""
+    """Steps a batch with `mjx.step` under vmap; what the two implementations do apart is theirs."""
 
-    def __init__(self, world: World, config: NavConfig, impl: str, forces: ForceOptions = PAPER_FORCE):
-        self.name = impl
+    def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
         self.window = Window(world, config)
         self._world, self._substeps = world, config.substeps
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
         self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
-        if impl == "warp":
-            keep_collector_out()
-        if impl == "warp" and not (self.contacts_per_env and self.constraints_per_env):
-            measured = measure_buffers(world, self.window)
-            self.contacts_per_env = self.contacts_per_env or measured[0]
-            self.constraints_per_env = self.constraints_per_env or measured[1]
-        host = self.window.model
-        if impl == "jax":
-            # MJX-JAX has no contact sensors between bodies: forces are summed from its contacts instead.
-            host = _without_sensors(self.window.spec)
-        self._host = host
-        self._model = uncommitted(mjx.put_model(host, impl=impl))
-        if impl == "warp":
-            # Warp prints a line per overflow or unconverged solve: ours are counted instead.
-            self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
+        self._host = self._host_model()
+        self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
-        self._slot_of_geom = _slot_of_geom(layout, host)
         self._forces = forces
-        self._contacts = sensor_addresses(host) if impl == "warp" and forces.needs_contacts else None
-        self._rolls = rolling_geoms(host, world.robot, layout.robot_bodies)
+
+    def _host_model(self) -> mujoco.MjModel:
+        return self.window.model
+
+    @abc.abstractmethod
+    def _template(self, n: int) -> mjx.Data:
+        """The engine's data that each of n environments starts a control step from."""
+
+    def _placed(self, data: mjx.Data, scene: jax.Array, walls: jax.Array) -> mjx.Data:
+        """The data of one environment with its walls where they stand."""
+        return data
+
+    @abc.abstractmethod
+    def _substep_all(self, model: mjx.Model, data: mjx.Data, control: Callable) -> tuple[mjx.Data, Any, jax.Array]:
+        """All substeps of a control step of one environment.
+
+        Args:
+            model: filled with its scene.
+            data: at the start of the control step.
+            control: (data, k) -> data with the actuators' controls of substep k.
+
+        Returns:
+            The last data; the forces [substeps, M + 1, 3] on slots and structure with what `from_sensors` gives of
+            each substep, or None; and the bits of Warp's OverflowType.
+        """
+
+    def _controlled(self, data: mjx.Data, command: jax.Array, time_s: jax.Array) -> mjx.Data:
+        layout = self.window.layout
+        robot = RobotState(
+            data.qpos[layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
+            data.qvel[layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
+            time_s,
+        )
+        ctrl = self._world.robot.controls(command, robot, jnp)
+        return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
+
+    def _step_one(self, template: mjx.Data, scene, state: PhysicsState, command, time_s):
+        window = self.window
+        chosen, walls, missed = window.select(scene, state)
+        fields = window.fields(scene, chosen, walls)
+        model = self._model.replace(
+            **{name: value.reshape(getattr(self._model, name).shape) for name, value in fields.items()}
+        )
+        inner = window.enter(state, chosen)
+        data = template.replace(qpos=inner.qpos, qvel=inner.qvel, qacc_warmstart=inner.qacc_warmstart)
+        data = self._controlled(self._placed(data, scene, walls), command, time_s)
+
+        def control(data, k):
+            if not self._world.robot.control_every_substep:
+                return data
+            return self._controlled(data, command, time_s + k * self._host.opt.timestep)
+
+        data, (forces, contacts), failures = self._substep_all(model, data, control)
+        out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
+        return out, (window.spread_forces(forces, chosen), contacts), failures, missed
 
     def step_batch(self, scene, state, command, time_s):
-        n = scene.shape[0]
-        if self.name == "warp":
-            template = mjx.make_data(
-                self._host,
-                impl="warp",
-                naconmax=n * self.contacts_per_env,
-                naccdmax=n * min(self.contacts_per_env, CCD_PER_ENV),
-                njmax=self.constraints_per_env,
-            )
-        else:
-            template = mjx.make_data(self._host, impl="jax")
-
-        def control(data, command, time_s):
-            layout = self.window.layout
-            robot = RobotState(
-                data.qpos[layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
-                data.qvel[layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
-                time_s,
-            )
-            ctrl = self._world.robot.controls(command, robot, jnp)
-            return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
-
-        window = self.window
-        every = self._world.robot.control_every_substep
-        dt = self._host.opt.timestep
-
-        def one(scene, state: PhysicsState, command, time_s):
-            chosen, walls, missed = window.select(scene, state)
-            fields = window.fields(scene, chosen, walls)
-            model = self._model.replace(
-                **{name: value.reshape(getattr(self._model, name).shape) for name, value in fields.items()}
-            )
-            inner = window.enter(state, chosen)
-            data = template.replace(qpos=inner.qpos, qvel=inner.qvel, qacc_warmstart=inner.qacc_warmstart)
-            if self.name == "warp":
-                # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model
-                # that it is given: each environment needs its own.
-                xpos, xmat = window.static_poses(scene, walls)
-                data = data.replace(geom_xpos=xpos, geom_xmat=xmat)
-            data = control(data, command, time_s)
-            if self.name == "jax":
-
-                def substep(data, k):
-                    if every:
-                        data = control(data, command, time_s + k * dt)
-                    data = mjx.step(model, data)
-                    return data, self._forces_from_contacts(data)
-
-                data, (forces, contacts) = jax.lax.scan(substep, data, jnp.arange(self._substeps))
-                # Its buffers are static, and it does not report its solver's iterations.
-                failures = jnp.asarray(0, jnp.int32)
-            else:
-                # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's
-                # carry cannot.
-                collected, listed, failures = [], [], jnp.asarray(0, jnp.int32)
-                for k in range(self._substeps):
-                    if every and k:
-                        data = control(data, command, time_s + k * dt)
-                    data = mjx.step(model, data)
-                    collected.append(data.sensordata[self._sensors])
-                    if self._contacts is not None:
-                        listed.append(from_sensors(data.sensordata, self._contacts, self._forces.force_part, jnp))
-                    failures |= data._impl.overflow
-                forces = jnp.stack(collected)
-                contacts = jax.tree.map(lambda *x: jnp.stack(x), *listed) if listed else None
-            out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
-            return out, (window.spread_forces(forces, chosen), contacts), failures, missed
-
+        one = functools.partial(self._step_one, self._template(scene.shape[0]))
         new, (forces, contacts), failures, missed = jax.vmap(one)(scene, state, command, time_s)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
         return new, StepSignals(
@@ -146,6 +123,77 @@ class MjxPhysics(Physics):
             unconverged=((failures & _UNCONVERGED) != 0).astype(jnp.int32),
             nonfinite=(~finite).astype(jnp.int32),
         )
+
+
+class WarpPhysics(MjxPhysics):
+    """MJX-Warp: its contact sensors give the forces, and its buffers may overflow."""
+
+    name = "warp"
+
+    def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
+        keep_collector_out()
+        super().__init__(world, config, forces)
+        if not (self.contacts_per_env and self.constraints_per_env):
+            measured = measure_buffers(world, self.window)
+            self.contacts_per_env = self.contacts_per_env or measured[0]
+            self.constraints_per_env = self.constraints_per_env or measured[1]
+        # Warp prints a line per overflow or unconverged solve: ours are counted instead.
+        self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
+        self._contacts = sensor_addresses(self._host) if forces.needs_contacts else None
+
+    def _template(self, n):
+        return mjx.make_data(
+            self._host,
+            impl="warp",
+            naconmax=n * self.contacts_per_env,
+            naccdmax=n * min(self.contacts_per_env, CCD_PER_ENV),
+            njmax=self.constraints_per_env,
+        )
+
+    def _placed(self, data, scene, walls):
+        # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model
+        # that it is given: each environment needs its own.
+        xpos, xmat = self.window.static_poses(scene, walls)
+        return data.replace(geom_xpos=xpos, geom_xmat=xmat)
+
+    def _substep_all(self, model, data, control):
+        # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's carry cannot.
+        collected, listed, failures = [], [], jnp.asarray(0, jnp.int32)
+        for k in range(self._substeps):
+            data = mjx.step(model, control(data, k) if k else data)
+            collected.append(data.sensordata[self._sensors])
+            if self._contacts is not None:
+                listed.append(from_sensors(data.sensordata, self._contacts, self._forces.force_part, jnp))
+            failures |= data._impl.overflow
+        contacts = jax.tree.map(lambda *x: jnp.stack(x), *listed) if listed else None
+        return data, (jnp.stack(collected), contacts), failures
+
+
+class JaxPhysics(MjxPhysics):
+    """MJX-JAX: it has no contact sensors between bodies, so forces are summed from its contacts instead."""
+
+    name = "jax"
+
+    def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
+        super().__init__(world, config, forces)
+        layout = self.window.layout
+        self._slot_of_geom = _slot_of_geom(layout, self._host)
+        self._rolls = rolling_geoms(self._host, world.robot, layout.robot_bodies)
+
+    def _host_model(self):
+        return _without_sensors(self.window.spec)
+
+    def _template(self, n):
+        return mjx.make_data(self._host, impl="jax")
+
+    def _substep_all(self, model, data, control):
+        def substep(data, k):
+            data = mjx.step(model, control(data, k))
+            return data, self._forces_from_contacts(data)
+
+        data, forces = jax.lax.scan(substep, data, jnp.arange(self._substeps))
+        # Its buffers are static, and it does not report its solver's iterations.
+        return data, forces, jnp.asarray(0, jnp.int32)
 
     def _forces_from_contacts(self, data) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array] | None]:
         """From MJX-JAX's contacts: the net force [M + 1, 3] of the robot on each slot and the structure, world frame;

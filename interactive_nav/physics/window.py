@@ -19,7 +19,8 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.scenes.world import FEET, World, build_empty_spec
+from interactive_nav.scenes.spec import FEET, build_empty_spec
+from interactive_nav.scenes.world import World
 
 REACH_M = 0.6
 """An object left out of the window although it is this near to the robot's footprint counts as missed."""

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTE
+from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.world import World
 from scenes_mjcf.categories import CATEGORIES, class_id
 
@@ -50,16 +51,7 @@ def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
     ids_of = {m.name: class_id(m.category, five) for m in world.scenes[scene].movables}
     ids_of |= {f"{o.category}_small_{i}": o.segmentation_id for i, o in enumerate(world.small_objects)}
     spec = mujoco.MjSpec.from_file(str(world.scenes[scene].path / "scene.xml"))
-    with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
-    for geom in list(spec.geoms):
-        # Hulls and boxes are for collision; a body without a visual mesh is drawn as its boxes.
-        shown = geom.group == VISUAL_GROUP or geom.type == mujoco.mjtGeom.mjGEOM_PLANE
-        bare = geom.parent.name not in with_mesh
-        geom.group = VISUAL_GROUP if shown or (bare and geom.type == mujoco.mjtGeom.mjGEOM_BOX) else 4
-        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
-            geom.rgba = [*FLOOR_COLOUR, 1.0]
-        elif bare and geom.group == VISUAL_GROUP:
-            geom.rgba = [*PALETTE[ids_of.get(geom.parent.name, 0)], 1.0]
+    _show_furniture(spec, ids_of)
     before = {b.name for b in spec.bodies}
     world.robot.add_to(spec)
     for body in spec.bodies:
@@ -67,17 +59,7 @@ def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
             for geom in body.geoms:
                 geom.group, geom.rgba = ROBOT_GROUP, [*CATEGORIES["robot"].colour, 1.0]
     for i, obj in enumerate(world.small_objects):
-        body = spec.worldbody.add_body(name=f"{obj.category}_small_{i}")
-        body.add_freejoint(name=f"{obj.category}_small_{i}_joint")
-        for box in obj.boxes:
-            body.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                pos=box.centre_m,
-                quat=box.quat,
-                size=box.half_m,
-                group=VISUAL_GROUP,
-                rgba=[*PALETTE[obj.segmentation_id], 1.0],
-            )
+        _add_small(spec, f"{obj.category}_small_{i}", obj)
     spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
     for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
         spec.delete(camera)
@@ -105,6 +87,34 @@ def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
         ids[g] = class_id("robot") if model.geom_group[g] == ROBOT_GROUP else ids_of.get(name, 0)
         colour[g] = _colour(model, g)
     return VisualModel(model, np.concatenate(targets), np.concatenate(sources), ids, colour)
+
+
+def _show_furniture(spec: mujoco.MjSpec, ids_of: dict[str, int]) -> None:
+    """Puts what is drawn of a scene into the visual group and all else out of sight."""
+    with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
+    for geom in list(spec.geoms):
+        # Hulls and boxes are for collision; a body without a visual mesh is drawn as its boxes.
+        shown = geom.group == VISUAL_GROUP or geom.type == mujoco.mjtGeom.mjGEOM_PLANE
+        bare = geom.parent.name not in with_mesh
+        geom.group = VISUAL_GROUP if shown or (bare and geom.type == mujoco.mjtGeom.mjGEOM_BOX) else 4
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.rgba = [*FLOOR_COLOUR, 1.0]
+        elif bare and geom.group == VISUAL_GROUP:
+            geom.rgba = [*PALETTE[ids_of.get(geom.parent.name, 0)], 1.0]
+
+
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject) -> None:
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=f"{name}_joint")
+    for box in obj.boxes:
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.centre_m,
+            quat=box.quat,
+            size=box.half_m,
+            group=VISUAL_GROUP,
+            rgba=[*PALETTE[obj.segmentation_id], 1.0],
+        )
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.scenes.scene import Movable
-from interactive_nav.scenes.world import World, sorted_movables
+from interactive_nav.scenes.spec import sorted_movables
+from interactive_nav.scenes.world import World
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import TABLE, class_id
 

@@ -171,6 +171,25 @@ def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Arr
     return (centre + reach > -slack)[..., :-1] & (centre - reach < slack)[..., 1:]
 
 
+def _lists(shows: jax.Array, env: np.ndarray, n: int) -> tuple[jax.Array, jax.Array]:
+    """Each tile's list of the boxes that it shows, and how many these are.
+
+    Args:
+        shows: [T, B] bool.
+        env: [T] environment of each tile.
+        n: environments.
+
+    Returns:
+        [T, B + 1] i32 rows of boxes, the free places pointing at the row of padding behind all of them; [T] i32.
+    """
+    count, num_boxes = shows.shape
+    rank = jnp.cumsum(shows, -1, dtype=jnp.int32)
+    number = env[:, None] * num_boxes + np.arange(num_boxes, dtype=np.int32)
+    lists = jnp.full((count, num_boxes + 1), n * num_boxes, jnp.int32)
+    lists = lists.at[np.arange(count)[:, None], jnp.where(shows, rank - 1, num_boxes)].set(jnp.asarray(number))
+    return lists.at[:, num_boxes].set(n * num_boxes), rank[:, -1]
+
+
 def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: int) -> jax.Array:
     n, num_boxes = boxes["id"].shape
     tw, th = _tile_side(lens.width), _tile_side(lens.height)
@@ -186,16 +205,9 @@ def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: in
     exists = (boxes["half"][..., 0] >= 0) & (ahead > NEAR_M)
     shows = exists[:, :, None, None] & along[..., :, None] & across[..., None, :]
     shows = jnp.moveaxis(shows.reshape(n, num_boxes, ny * nx), 1, 2).reshape(n * ny * nx, num_boxes)
-
-    # Each tile's list of boxes, its free places pointing at a box of padding at the end of `rows`.
     count = n * ny * nx
-    rank = jnp.cumsum(shows, -1, dtype=jnp.int32)
-    lengths = rank[:, -1]
     env = np.repeat(np.arange(n, dtype=np.int32), ny * nx)
-    number = env[:, None] * num_boxes + np.arange(num_boxes, dtype=np.int32)
-    lists = jnp.full((count, num_boxes + 1), n * num_boxes, jnp.int32)
-    lists = lists.at[np.arange(count)[:, None], jnp.where(shows, rank - 1, num_boxes)].set(jnp.asarray(number))
-    lists = lists.at[:, num_boxes].set(n * num_boxes)
+    lists, lengths = _lists(shows, env, n)
     bits = jax.lax.bitcast_convert_type(boxes["id"], jnp.float32)
     parts = (boxes["axes"].reshape(n, num_boxes, 9), boxes["eye"], boxes["half"], bits[..., None])
     rows = jnp.concatenate(parts, -1).reshape(n * num_boxes, 16)

@@ -21,7 +21,8 @@ from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.world import build_world, parking_spot
+from interactive_nav.scenes.spec import parking_spot
+from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.episode_scores import episode_scores, score_mass_kg

@@ -84,35 +84,26 @@ def build_map(
         raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)
     pictures = _Pictures(scene, data, robot, progress, parts)
-    pictures.total = len(xy) * len(around)
-    images = pictures.draw(np.repeat(xy, len(around), 0), np.tile(around, len(xy)), "nodes")
-    embeddings = localiser.embed(images).reshape(len(xy), len(around), -1)
+    images = pictures.draw_around(xy, around, "nodes")
+    embeddings = localiser.embed(images)
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
         if config.edge_image == "nearest":
             turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
-            looked = images.reshape(len(xy), len(around), *images.shape[1:])[edges[:, 0], turn]
+            looked = images[edges[:, 0], turn]
         else:
             pictures.total += len(edges)
             looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
         return detector.passage(looked, lengths(xy, edges))
 
-    about = {
-        "settings": to_dict(config),
-        "data": to_dict(data),
-        "localiser": localiser.about["digest"],
-        "detector": detector.about["digest"],
-        "margin_m": margin_m,
-        "points": points,
-    }
+    networks = {"localiser": localiser.about["digest"], "detector": detector.about["digest"]}
+    about = {"settings": to_dict(config), "data": to_dict(data), **networks, "margin_m": margin_m, "points": points}
     made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
     free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
     scores = _scores(made, free, config, lacking)
     if config.check:
         places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
-        pictures.total += len(places) * len(around)
-        images = pictures.draw(np.repeat(places, len(around), 0), np.tile(around, len(places)), "check")
-        looked = images.reshape(len(places), len(around), *images.shape[1:])
+        looked = pictures.draw_around(places, around, "check")
         for match in ("aligned", "nearest"):
             sight = NetworkSight(made, localiser, detector, match)
             scores |= localisation_check(sight, made, looked, around, places)
@@ -198,6 +189,12 @@ class _Pictures:
     @functools.cached_property
     def _renderer(self) -> SceneRenderer:
         return renderer_of(self._scene, self._data)
+
+    def draw_around(self, xy: np.ndarray, around: np.ndarray, what: str) -> np.ndarray:
+        """[N, K, H, W, 3] u8: images from places [N, 2], which count to those to draw, along each of K headings."""
+        self.total += len(xy) * len(around)
+        images = self.draw(np.repeat(xy, len(around), 0), np.tile(around, len(xy)), what)
+        return images.reshape(len(xy), len(around), *images.shape[1:])
 
     def draw(self, xy: np.ndarray, heading: np.ndarray, what: str) -> np.ndarray:
         """[N, H, W, 3] u8: images from places [N, 2] along headings [N]."""

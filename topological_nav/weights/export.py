@@ -74,6 +74,13 @@ class Exported:
     compared: Compared
 
 
+def _free_place(out: Path) -> Path:
+    out = Path(os.path.abspath(out))
+    if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out}: is something else than an export; choose another folder (-o)")
+    return out
+
+
 def export(
     localiser: Path,
     detector: Path,
@@ -101,9 +108,7 @@ def export(
             be too large.
         MapError: a map was made with other networks.
     """
-    out = Path(os.path.abspath(out))
-    if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise RunError(f"{out}: is something else than an export; choose another folder (-o)")
+    out = _free_place(out)
     runs = {"rooms": Path(localiser), "passages": Path(detector)} | ({"policy": Path(policy)} if policy else {})
     files = sorted(Path(maps).glob("*.npz")) if maps else []
     if maps and not files:

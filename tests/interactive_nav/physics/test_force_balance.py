@@ -20,7 +20,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, base, make_physics, mjx_batch
 from interactive_nav.physics import native as native_backend
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes import world as world_module
+from interactive_nav.scenes import spec as spec_module
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from tests.toys import write_room
@@ -70,11 +70,11 @@ def make_world(folder, **settings):
         scenes.append(load_scene(folder / str(i)))
     config = NavConfig(num_objects=0, sleep=False, **settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(world_module, "_add_sensors", _with_floor_sensors)
+        patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
         return build_world(get_robot("turtlebot"), tuple(scenes), config), config
 
 
-_add_sensors = world_module._add_sensors
+_add_sensors = spec_module._add_sensors
 
 
 def _with_floor_sensors(spec, robot, slots, config):
@@ -129,7 +129,7 @@ def run(world, config, backend, cases: Sequence[int] = range(len(CASES))) -> Pus
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_backend, "summarise_forces", watched)
         patch.setattr(mjx_batch, "summarise_forces", watched)
-        patch.setattr(world_module, "_add_sensors", _with_floor_sensors)
+        patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
         physics = make_physics(world, dataclasses.replace(config, backend=backend))
         _read_both(physics, world)
         step = jax.jit(jax.vmap(physics.step))

@@ -1,0 +1,335 @@
+"""Robot, small objects, furniture and walls in, the `MjSpec` of one padded scene out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+
+from interactive_nav.config import NavConfig
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.contacts import add_contact_sensors
+from interactive_nav.scenes.layout import Layout, find_layout
+from interactive_nav.scenes.object_folders import ConvertedObject
+from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.scene import Movable, Scene
+
+PARKING_W = (200.0, 200.0)
+"""World x, y of the first parking spot; far outside any building."""
+
+
+_PARKING_STEP_M = 3.0
+
+
+_EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
+
+
+_TILTED = np.array([0.8, 0.36, 0.48, 0.0])
+
+
+FEET = 12
+"""Points of each movable object that can touch the floor."""
+
+
+_FOOT_RADIUS_M = 2e-3
+
+
+_SOLID, _FLOOR = 1, 2
+"""Collision bits: bodies against each other, and what can touch the floor."""
+
+
+FLOOR_FRICTION = 0.05
+"""Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
+
+
+def parking_spot(index: int) -> tuple[float, float]:
+    """World x, y of a parking spot."""
+    return PARKING_W[0] + _PARKING_STEP_M * (index % 16), PARKING_W[1] + _PARKING_STEP_M * (index // 16)
+
+
+def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
+    """Points at which a body of boxes can rest on a plane: the outermost corners of its bottom, then of its top.
+
+    A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
+    contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them.
+
+    Args:
+        boxes: [n, 10] centre, quaternion, half sizes; body frame, z up.
+        count: points wanted.
+
+    Returns:
+        [at most count, 3] m, body frame.
+    """
+    corners = []
+    for row in boxes:
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, row[3:7])
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        corners.append(row[:3] + (signs * row[7:10]) @ rotation.reshape(3, 3).T)
+    points = np.concatenate(corners)
+    azimuth = np.arange(8) * math.pi / 4 + math.pi / 4
+    # Slightly more than level: of corners at (nearly) one height the outermost wins.
+    level = np.stack([0.05 * np.cos(azimuth), 0.05 * np.sin(azimuth), np.ones(8)], -1)
+    kept: list[np.ndarray] = []
+    for direction in [*(level * [1, 1, -1])[::2], *(level * [1, 1, -1])[1::2], *level[::2], *level[1::2]]:
+        point = points[np.argmax(points @ direction)]
+        if len(kept) < count and all(np.linalg.norm(point - k) > 0.02 for k in kept):
+            kept.append(point)
+    return np.stack(kept)
+
+
+def sorted_movables(scene: Scene) -> tuple[list[Movable], list[Movable]]:
+    """A scene's free and hinged bodies, in the order of the slots that hold them: most boxes first."""
+    free = sorted((m for m in scene.movables if m.hinge is None), key=lambda m: -len(m.boxes))
+    hinged = sorted((m for m in scene.movables if m.hinge is not None), key=lambda m: -len(m.boxes))
+    return free, hinged
+
+
+def _slot(lists: list[list[Movable]], index: int) -> list[Movable | None]:
+    return [movables[index] if index < len(movables) else None for movables in lists]
+
+
+def _add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float) -> None:
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=row[:3],
+        quat=row[3:7],
+        size=row[7:10],
+        mass=0.0,
+        friction=[friction, 0.005, 0.0001],
+        group=3,
+    )
+
+
+def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.ndarray, friction: float) -> None:
+    """`FEET` small spheres that alone touch the floor; those not needed hide inside the body."""
+    points = foot_points(boxes) if len(boxes) else np.zeros((0, 3))
+    if len(points):
+        centre = 0.5 * (points.min(0) + points.max(0))
+        points = points - _FOOT_RADIUS_M * np.sign(points - centre)
+    for i in range(FEET):
+        body.add_geom(
+            name=f"{name}_foot_{i}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=points[i] if i < len(points) else hidden_m,
+            size=[_FOOT_RADIUS_M, 0, 0],
+            mass=0.0,
+            friction=[friction, 0.005, 0.0001],
+            group=4,
+            contype=_FLOOR,
+            conaffinity=0,
+        )
+
+
+def _add_movable(
+    spec: mujoco.MjSpec,
+    name: str,
+    movable: Movable | None,
+    n_boxes: int,
+    kind: str,
+    park: int,
+    collision: str,
+    padded: bool,
+) -> None:
+    x, y = parking_spot(park)
+    if movable is None:
+        body = spec.worldbody.add_body(name=name, pos=[x, y, 2.0])
+        # Off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the
+        # models' structure must be equal.
+        mass, inertia, com, iquat = 1.0, np.array([0.01, 0.012, 0.014]), np.full(3, 1e-3), _TILTED
+        boxes, friction = np.zeros((0, 10)), 0.5
+    else:
+        body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w)
+        mass, inertia, com, iquat = movable.mass_kg, movable.inertia, movable.com_m, movable.inertia_quat
+        if np.abs(com).max() < 1e-6:
+            com = com + 1e-6
+        boxes, friction = movable.boxes, movable.friction
+    if padded:
+        # An empty slot floats in place. The tiny value keeps the models' structure equal.
+        body.gravcomp = 1.0 if movable is None else 1e-9
+    body.explicitinertial = True
+    body.mass, body.inertia, body.ipos, body.iquat = mass, inertia, com, iquat
+    if kind == "hinge":
+        hinge = movable.hinge if movable else None
+        joint = body.add_joint(name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
+        joint.axis = hinge.axis if hinge else [0, 0, 1]
+        joint.pos = hinge.anchor_m if hinge else [0, 0, 0]
+        joint.limited = True
+        joint.range = hinge.range_rad if hinge and hinge.range_rad else (-math.pi, math.pi)
+        joint.damping = [hinge.damping if hinge else 0.1, 0, 0]
+        # Not 0: MJX-JAX makes a row of constraints only for joints whose model has friction.
+        joint.frictionloss = hinge.frictionloss if hinge else 1e-6
+    else:
+        body.add_freejoint(name=f"{name}_joint")
+    if collision == "hulls" and movable is not None and movable.hulls:
+        for i, vertices in enumerate(movable.hulls):
+            spec.add_mesh(name=f"{name}_mesh_{i}", uservert=np.asarray(vertices, float).ravel())
+            body.add_geom(
+                name=f"{name}_hull_{i}",
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=f"{name}_mesh_{i}",
+                mass=0.0,
+                friction=[friction, 0.005, 0.0001],
+                group=3,
+                contype=_SOLID | _FLOOR,
+            )
+        return
+    # A padding box hides at the centre of mass, inside the body, and is too small to be met first.
+    hidden = _EMPTY_BOX.copy()
+    hidden[:3] = com
+    for i in range(n_boxes):
+        _add_box(body, boxes[i] if i < len(boxes) else hidden, f"{name}_box_{i}", friction)
+    _add_feet(body, name, boxes, com, friction)
+
+
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, collision: str) -> None:
+    x, y = parking_spot(park)
+    if isinstance(obj, ConvertedObject):
+        parked = dataclasses.replace(obj.movable, pos_w=np.array([x, y, 0.0]))
+        _add_movable(spec, name, parked, len(obj.boxes), "small", park, collision, padded=False)
+        return
+    body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
+    body.add_freejoint(name=f"{name}_joint")
+    volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
+    for i, box in enumerate(obj.boxes):
+        body.add_geom(
+            name=f"{name}_box_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.centre_m,
+            size=box.half_m,
+            density=obj.mass_kg / volume,
+            friction=[obj.friction, 0.005, 0.0001],
+            group=3,
+        )
+    _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
+
+
+def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
+    """Physics options, the floor and the robot."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "interactive_nav"
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = config.sim_dt_s
+    option.gravity = [0, 0, -9.81]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[
+        config.cone
+    ]
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = config.solver_iterations
+    option.ls_iterations = 20
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.1],
+        friction=[FLOOR_FRICTION, 0.005, 0.0001],
+        contype=0,
+        conaffinity=_FLOOR,
+    )
+    robot.add_to(spec)
+    if config.symmetric_actions:
+        for actuator in spec.actuators:
+            low, high = actuator.ctrlrange
+            if actuator.ctrllimited and low < 0 < high:
+                actuator.ctrlrange = [-max(-low, high), max(-low, high)]
+    for geom in spec.geoms:
+        if geom.name != "floor" and (geom.contype or geom.conaffinity):
+            geom.contype |= _FLOOR
+    return spec
+
+
+def build_empty_spec(
+    robot: RobotSpec, slots: tuple[tuple[str, int], ...], n_walls: int, config: NavConfig
+) -> tuple[mujoco.MjSpec, mujoco.MjModel, Layout]:
+    """A model whose movable slots and walls are all empty: its numbers are filled in per environment.
+
+    Args:
+        robot: the robot's spec.
+        slots: (kind, number of boxes) of each movable slot.
+        n_walls: wall boxes.
+        config: the environment's settings.
+
+    Returns:
+        Spec, compiled model and its layout, with sensors as `build_world`'s models have them.
+    """
+    spec = _empty_spec(robot, config)
+    named = [(f"{kind}_{i}", kind) for i, (kind, _) in enumerate(slots)]
+    for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
+        _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
+    _add_structure(spec, np.zeros((0, 10)), n_walls)
+    _add_sensors(spec, robot, named, config)
+    _soften(spec, robot, config)
+    model = spec.compile()
+    return spec, model, find_layout(model, robot, named)
+
+
+def build_spec(
+    robot: RobotSpec,
+    scene_index: int,
+    scenes: tuple[Scene, ...],
+    small: tuple[SmallObject, ...],
+    config: NavConfig,
+) -> tuple[mujoco.MjSpec, list[tuple[str, str]]]:
+    """The padded spec of one scene, and the movable slots as (body name, kind)."""
+    spec = _empty_spec(robot, config)
+    slots: list[tuple[str, str]] = []
+    for i, obj in enumerate(small):
+        name = f"{obj.category}_small_{i}"
+        _add_small(spec, name, obj, len(slots), config.collision)
+        slots.append((name, "small"))
+    lists = [sorted_movables(s) for s in scenes]
+    for kind, per_scene in (("free", [a for a, _ in lists]), ("hinge", [b for _, b in lists])):
+        for i in range(max(len(x) for x in per_scene)):
+            column = _slot(per_scene, i)
+            n_boxes = max(len(m.boxes) for m in column if m is not None)
+            name = f"{kind}_{i}"
+            _add_movable(spec, name, column[scene_index], n_boxes, kind, len(slots), config.collision, None in column)
+            slots.append((name, kind))
+    _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
+    _add_sensors(spec, robot, slots, config)
+    _soften(spec, robot, config)
+    return spec, slots
+
+
+def _soften(spec: mujoco.MjSpec, robot: RobotSpec, config: NavConfig) -> None:
+    for geom in spec.geoms:
+        geom.solref = [config.contact_time_constant_s, 1.0]
+    if robot.contact_time_constant_s is not None:
+        for geom in spec.body(robot.base_body).find_all("geom"):
+            geom.solref = [robot.contact_time_constant_s, 1.0]
+            geom.solmix = 1e6  # a contact's is the mean of both geoms', weighted by this: the robot's holds
+
+
+def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
+    structure = spec.worldbody.add_body(name="structure")
+    for i in range(count):
+        row = walls[i] if i < len(walls) else _EMPTY_BOX + np.array([0, 0, -5.0 - 0.01 * i, 0, 0, 0, 0, 0, 0, 0])
+        _add_box(structure, row, f"wall_{i}", 0.5)
+
+
+def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], config: NavConfig) -> None:
+    for i, (name, kind) in enumerate(slots):
+        _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
+        if kind == "hinge":
+            # A door leaf hangs in its frame: they touch by design.
+            spec.add_exclude(bodyname1=name, bodyname2="structure")
+    _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
+    if config.needs_contacts:
+        add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
+
+
+def _add_force_sensor(spec: mujoco.MjSpec, robot_body: str, other: str, name: str) -> None:
+    """Net force of the robot's subtree on a body: 3 numbers, world frame."""
+    spec.add_sensor(
+        name=name,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname=robot_body,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname=other,
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],
+    )
