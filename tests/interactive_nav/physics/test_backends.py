@@ -258,7 +258,7 @@ def test_auto_picks_native_on_a_cpu():
 
 
 def test_upstream_mjx_jax_still_has_no_contact_sensors_between_bodies(world):
-    """MjxPhysics sums contact forces itself on `jax`. When this fails, read the sensors there too."""
+    """JaxPhysics sums contact forces itself on `jax`. When this fails, read the sensors there too."""
     with pytest.raises(NotImplementedError, match="Contact sensor"):
         mjx.put_model(world.models[0], impl="jax")
 
