@@ -1,4 +1,4 @@
-"""`python -m converters.coacd_worker IN.npz OUT.npz`: one mesh in, its convex hulls out."""
+"""`python -m converters.bodies.coacd_worker IN.npz OUT.npz`: one mesh in, its convex hulls out."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The environment for those who do not use JAX: Gymnasium's API, NumPy arrays (or PyTorch tensors) in and out.
 
     import gymnasium
-    import interactive_nav.gym_env  # registers the ids
+    import interactive_nav.interop.gym_env  # registers the ids
     envs = gymnasium.make_vec("InteractiveNav-TurtleBot-v0", num_envs=64, scenes=["scenes_mjcf/apartment_0"])
 
 Ids are InteractiveNav-<Robot>-v0, one for each name in `robot_names()`. `make` gives one environment,

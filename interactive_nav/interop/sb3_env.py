@@ -1,7 +1,7 @@
 """A batch of environments as Stable-Baselines3 wants it: `VecEnv` in place of Gymnasium's vector environment.
 
 from stable_baselines3 import PPO
-from interactive_nav.sb3_env import SB3VecEnv
+from interactive_nav.interop.sb3_env import SB3VecEnv
 PPO("MlpPolicy", SB3VecEnv("turtlebot", ["scenes_mjcf/apartment_0"], num_envs=16)).learn(1_000_000)
 """
 

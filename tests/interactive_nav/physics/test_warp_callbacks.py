@@ -69,7 +69,7 @@ import gc, sys
 import interactive_nav
 import jax, jax.numpy as jnp
 import warp as wp
-from interactive_nav.warp_callbacks import keep_collector_out
+from interactive_nav.physics.warp_callbacks import keep_collector_out
 
 if sys.argv[1] == "suspended":
     keep_collector_out()
@@ -106,7 +106,7 @@ import gc, sys
 import interactive_nav
 import jax, jax.numpy as jnp
 import warp as wp
-from interactive_nav.warp_callbacks import keep_collector_out
+from interactive_nav.physics.warp_callbacks import keep_collector_out
 
 dies, collector = sys.argv[1:]
 if collector == "suspended":

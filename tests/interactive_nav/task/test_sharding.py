@@ -19,8 +19,8 @@ ONE_PROCESS = """
 import sys
 import interactive_nav
 import jax, jax.numpy as jnp, numpy as np
-from interactive_nav.sharding import ShardedEnv
-from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav.task.sharding import ShardedEnv
+from interactive_nav.task.wrappers import AutoResetEnv
 
 env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1,
                                         sleep=False, episode_steps=6))
@@ -49,10 +49,10 @@ print("equal")
 TWO_PROCESSES = """
 import sys
 import interactive_nav
-from interactive_nav.sharding import ShardedEnv, start_distributed
+from interactive_nav.task.sharding import ShardedEnv, start_distributed
 start_distributed(sys.argv[2], 2, int(sys.argv[3]))
 import jax, jax.numpy as jnp
-from interactive_nav.wrappers import AutoResetEnv
+from interactive_nav.task.wrappers import AutoResetEnv
 
 env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1,
                                         sleep=False))
@@ -128,7 +128,7 @@ class _Told:
 
 TOLD = """
 import jax
-from interactive_nav.sharding import ShardedEnv
+from interactive_nav.task.sharding import ShardedEnv
 from tests.interactive_nav.task.test_sharding import _Told
 print(ShardedEnv(_Told()).reset(jax.random.split(jax.random.PRNGKey(0), 4)).tolist())
 """

@@ -303,7 +303,7 @@ def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, mon
     RunFolder(tmp_path).config.write_text(to_yaml(trained))
     usual = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
-    monkeypatch.setattr("train.evaluate.load_policy", lambda folder, config, *_, **__: (config.env, None))
+    monkeypatch.setattr("train.scoring.evaluation.load_policy", lambda folder, config, *_, **__: (config.env, None))
     scene = load_scene(toy)
     simulator, env = contests._learned(tmp_path, scene, EvaluationConfig())
     assert (simulator.env.backend, env.backend, env.scenes) == ("native", "native", (str(scene.path),))

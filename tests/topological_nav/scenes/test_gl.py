@@ -31,8 +31,8 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 """
 BOX = """
 import mujoco, sys, numpy as np
-from interactive_nav.rendering.base import Lens, look_along
-from topological_nav.gl import GlPainter
+from interactive_nav.sensing.base import Lens, look_along
+from topological_nav.scenes.gl import GlPainter
 spec = mujoco.MjSpec()
 box = mujoco.mjtGeom.mjGEOM_BOX
 spec.worldbody.add_geom(type=box, pos=[3.5, 0, 0], size=[0.5, 1.0, 1.0], rgba=[1, 0, 0, 1], group=2)
@@ -50,10 +50,10 @@ np.savez(sys.argv[1], depth=painter.draw(*poses, depth=True), colour=painter.dra
 ROOMS = """
 import gc, sys, weakref, numpy as np
 from pathlib import Path
-from interactive_nav.rendering.base import Lens
+from interactive_nav.sensing.base import Lens
 from interactive_nav.robots import get_robot
-from interactive_nav.scene import load_scene
-from topological_nav.rendering import SceneRenderer, camera_pose
+from interactive_nav.scenes.scene import load_scene
+from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 asked = np.load(sys.argv[2])
 lens = Lens(int(asked["width"]), int(asked["height"]), float(asked["fov_deg"]))
 renderer = SceneRenderer(load_scene(Path(sys.argv[3])), lens, int(asked["finer"]), engine="gl")

@@ -26,7 +26,7 @@ def test_replicates_onto_each_device():
 def test_two_devices_hold_a_copy_each():
     # The number of host devices is fixed when JAX starts, so this needs a process of its own.
     program = (
-        "import jax, jax.numpy as jnp; from train import brax_compat\n"
+        "import jax, jax.numpy as jnp; from train.learners import brax_compat\n"
         "out = brax_compat.device_put_replicated(jnp.array([1., 2.]), jax.local_devices())\n"
         "assert out.shape == (2, 2), out.shape\n"
         "assert [s.data.tolist() for s in out.addressable_shards] == [[[1., 2.]], [[1., 2.]]]\n"
