@@ -302,14 +302,8 @@ def test_nan_guard_saves_the_batch_and_stops(tmp_path):
 
 
 def _start(tmp_path: Path, *words: str) -> subprocess.Popen:
-    cache = str(getattr(jax.config, "jax_compilation_cache_dir", ""))  # conftest.py made it
-    env = {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": cache,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-    }
     command = [sys.executable, "-m", "tests.train.toy_run", str(tmp_path), *words]
-    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def _wait_for_checkpoint(folder: RunFolder, after: int, process: subprocess.Popen) -> None:
