@@ -34,6 +34,7 @@ from train.errors import CheckpointError
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import RunFolder, claim
+from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.metrics_file import read_metrics
 from interactive_nav_common.versions import versions
 
@@ -45,7 +46,7 @@ def make_env(config: EnvConfig) -> Any:
         ConfigError: an unknown robot, an unusable scene, or settings that do not fit each other.
     """
     try:
-        return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
+        return interactive_nav.make(**flatten(config))
     except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
 
@@ -75,7 +76,7 @@ def config_to_play(
             there = resolve_backend("auto")
             told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(told, highlight=False, soft_wrap=True)
-            env = dataclasses.replace(env, backend=there)
+            env = replace(env, backend=there)
     return dataclasses.replace(config, env=env)
 
 

@@ -11,10 +11,11 @@ import uuid
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
 from train.config import TrainConfig
-from train.config_io import flatten
+
 
 ID_FILE = "wandb_id"
 
