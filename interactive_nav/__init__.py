@@ -92,7 +92,7 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     if isinstance(scenes, (str, Path)):
         raise ValueError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
-    return InteractiveNav(get_robot(robot, config.control_mode), tuple(load_scene(s) for s in scenes), config)
+    return InteractiveNav(get_robot(robot, config.rules.control_mode), tuple(load_scene(s) for s in scenes), config)
 
 
 __all__ = [

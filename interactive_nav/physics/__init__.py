@@ -37,16 +37,18 @@ def make_physics(world: World, config: NavConfig) -> Physics:
     Raises:
         ValueError: hull collision on an MJX backend, or a backend that is not installed.
     """
-    backend = resolve_backend(config.backend)
-    if config.collision == "hulls" and backend != "native":
+    backend = resolve_backend(config.physics.backend)
+    if config.physics.collision == "hulls" and backend != "native":
         raise ValueError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
-    if config.cone == "elliptic" and backend != "native":
+    if config.physics.cone == "elliptic" and backend != "native":
         raise ValueError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
-    forces = ForceOptions(config.force_part, config.force_sum, config.needs_contacts)
+    forces = ForceOptions(config.rules.force_part, config.rules.force_sum, config.rules.needs_contacts)
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics
 
-        return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads, forces=forces)
+        return NativePhysics(
+            world, config.physics.substeps, sleep=config.physics.sleep, threads=config.physics.threads, forces=forces
+        )
     from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
     return (WarpPhysics if backend == "warp" else JaxPhysics)(world, config, forces)

@@ -64,7 +64,11 @@ class Window:
         self.world = world
         layout = world.layout
         kinds = np.asarray(layout.slot_kind)
-        limits = {"small": config.active_small, "free": config.active_furniture, "hinge": config.active_doors}
+        limits = {
+            "small": config.physics.active_small,
+            "free": config.physics.active_furniture,
+            "hinge": config.physics.active_doors,
+        }
         model = world.models[0]
         slots: list[tuple[str, int]] = []
         picked = []
@@ -76,7 +80,7 @@ class Window:
                 picked.append((own, width, len(slots), boxes))
                 slots += [(kind, boxes)] * width
         n_walls = int(model.body_geomnum[layout.structure_body])
-        self.n_walls = min(config.active_walls or n_walls, n_walls)
+        self.n_walls = min(config.physics.active_walls or n_walls, n_walls)
         self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
         self.groups = tuple(self._group(*p) for p in picked)
         self._wall_tables, self._wall_rows = self._walls()

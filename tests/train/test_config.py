@@ -20,7 +20,7 @@ BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
 
 def test_round_trip_of_every_kind_of_value():
     config = TrainConfig(
-        env=EnvConfig(scenes=("a", "b c"), k_int=1.0, success_distance_m=0.4),
+        env=EnvConfig.of(scenes=("a", "b c"), k_int=1.0, success_distance_m=0.4),
         ppo=PPOConfig(learning_rate=1e-7, num_envs=8, policy_hidden_layer_sizes=(3,)),
         run=RunConfig(name="x", tensorboard=False, num_timesteps=10**12),
     )

@@ -162,7 +162,7 @@ class FolderCallbacks:
         each had the time for a whole episode, scores would flatter.
         """
         run = self._config.run
-        fair = self._began_together + num_envs(self._config) * self._config.env.episode_steps
+        fair = self._began_together + num_envs(self._config) * self._config.env.rules.episode_steps
         since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
         lines = [line for line in read_metrics(self._folder.metrics) if line["env_steps"] > since]
         meta = CheckpointMeta(
@@ -172,7 +172,7 @@ class FolderCallbacks:
             began_together=self._began_together,
             algorithm=self._config.algorithm,
             robot=self._config.env.robot,
-            observations=self._config.env.observations,
+            observations=self._config.env.sensors.observations,
             observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
         )
@@ -320,7 +320,7 @@ def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics
         "run": config.run.name,
         "algorithm": config.algorithm,
         "robot": config.env.robot,
-        "k_int": config.env.k_int,
+        "k_int": config.env.rules.k_int,
         "seed": config.run.seed,
         "completed": result.completed,
         "env_steps": result.snapshot.env_steps,

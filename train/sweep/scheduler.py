@@ -200,7 +200,7 @@ class Scheduler:
         """Starts what there is room for: training first, then evaluation."""
         for name in self._free(self._to_train(states)):
             command = words_of_training(self._folder, name, self._programs.train)
-            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.threads:
+            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.physics.threads:
                 command = [*command, f"env.threads={_threads(self._runs[name])}"]
             if not self._begin("train", [name], command):
                 return states

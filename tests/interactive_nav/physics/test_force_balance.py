@@ -68,7 +68,7 @@ def make_world(folder, **settings):
     for i, (kg, mu) in enumerate(BLOCKS):
         write_room(folder / str(i), (8.0, 3.0), (("basket", 0.55, 0.0, kg, mu),))
         scenes.append(load_scene(folder / str(i)))
-    config = NavConfig(num_objects=0, sleep=False, **settings)
+    config = NavConfig.of(num_objects=0, sleep=False, **settings)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
         return build_world(get_robot("turtlebot"), tuple(scenes), config), config

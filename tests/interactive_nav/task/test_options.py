@@ -59,7 +59,7 @@ _RESETS: dict[bool, Any] = {}
 
 def begin(env, goal=(1.6, 0.0), x=-0.7):
     """First state, which only options of waypoints and potential change: the others share a compiled reset."""
-    special = env.config.waypoint_style != "ahead" or env.config.potential != "continuous"
+    special = env.config.rules.waypoint_style != "ahead" or env.config.rules.potential != "continuous"
     if special or False not in _RESETS:
         reset = jax.jit(jax.vmap(env.reset_to))
         _RESETS[special] = reset

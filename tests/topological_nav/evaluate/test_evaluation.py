@@ -299,7 +299,7 @@ def test_mistakes_are_one_line(words, told, capsys, monkeypatch, tmp_path):
 
 def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, monkeypatch, capsys):
     """Unless the settings themselves ask for what is not here."""
-    trained = TrainConfig(env=EnvConfig(backend="warp"))
+    trained = TrainConfig(env=EnvConfig.of(backend="warp"))
     RunFolder(tmp_path).config.write_text(to_yaml(trained))
     usual = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
