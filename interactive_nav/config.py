@@ -242,12 +242,12 @@ class SensorConfig(Settings):
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         known = (*SIGNALS, *IMAGES)
         if not self.observations or len(set(self.observations) & set(known)) != len(self.observations):
             raise ConfigError(f"observations is {self.observations!r}, expected a choice from {', '.join(known)}")
         if len(self.lidar_pos_m) != 3:
             raise ConfigError(f"lidar_pos_m is {self.lidar_pos_m!r}, expected three numbers")
+        super().__post_init__()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import math
 import mujoco
 import numpy as np
 
-from interactive_nav.config import NavConfig
+from interactive_nav.config import NavConfig, PhysicsConfig, TaskRules
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors
 from interactive_nav.scenes.layout import Layout, find_layout
@@ -261,8 +261,8 @@ def build_empty_spec(
     for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
         _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
     _add_structure(spec, np.zeros((0, 10)), n_walls)
-    _add_sensors(spec, robot, named, config)
-    _soften(spec, robot, config)
+    _add_sensors(spec, robot, named, config.rules)
+    _soften(spec, robot, config.physics)
     model = spec.compile()
     return spec, model, find_layout(model, robot, named)
 
@@ -292,14 +292,14 @@ def build_spec(
             )
             slots.append((name, kind))
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
-    _add_sensors(spec, robot, slots, config)
-    _soften(spec, robot, config)
+    _add_sensors(spec, robot, slots, config.rules)
+    _soften(spec, robot, config.physics)
     return spec, slots
 
 
-def _soften(spec: mujoco.MjSpec, robot: RobotSpec, config: NavConfig) -> None:
+def _soften(spec: mujoco.MjSpec, robot: RobotSpec, physics: PhysicsConfig) -> None:
     for geom in spec.geoms:
-        geom.solref = [config.physics.contact_time_constant_s, 1.0]
+        geom.solref = [physics.contact_time_constant_s, 1.0]
     if robot.contact_time_constant_s is not None:
         for geom in spec.body(robot.base_body).find_all("geom"):
             geom.solref = [robot.contact_time_constant_s, 1.0]
@@ -313,14 +313,14 @@ def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
         _add_box(structure, row, f"wall_{i}", 0.5)
 
 
-def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], config: NavConfig) -> None:
+def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], rules: TaskRules) -> None:
     for i, (name, kind) in enumerate(slots):
         _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
         if kind == "hinge":
             # A door leaf hangs in its frame: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
     _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
-    if config.rules.needs_contacts:
+    if rules.needs_contacts:
         add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
 
 

@@ -69,11 +69,11 @@ class InteractiveNav(Env):
         robot = robot.symmetric() if config.rules.symmetric_actions else robot
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
-        self.tables = build_tables(self.world, config)
+        self.tables = build_tables(self.world, config.rules)
         self.physics = make_physics(self.world, config)
         self.sensors = Sensors(self.world, config, self.physics.name)
         self.success_distance_m = config.rules.success_distance_m or robot.body_width_m
-        self.score_mass_kg = score_mass_kg(self.world, config)
+        self.score_mass_kg = score_mass_kg(self.world, config.rules)
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
         self._num_small = len(self.world.small_objects)
         self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
@@ -239,7 +239,7 @@ class InteractiveNav(Env):
         )
         timed_out = ~success & ~broken & ~lost & ~lifted & (nav.step_count >= self.config.rules.episode_steps)
         done = (success | timed_out | lifted | broken | lost).astype(jnp.float32)
-        values = episode_scores(nav, self.config, self.tables, self.score_mass_kg, success, broken)
+        values = episode_scores(nav, self.config.rules, self.tables, self.score_mass_kg, success, broken)
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
         truncated = timed_out | lost if self.config.rules.bootstrap_at_time_limit else lost
@@ -308,11 +308,9 @@ class InteractiveNav(Env):
         return geodesic_at(self.tables, scene, goal, xy)
 
     def _waypoints(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
-        config = self.config
-        points_at = grid_waypoints_at if config.rules.waypoint_style == "grid" else waypoints_at
-        world = points_at(
-            self.tables, scene, goal, pos_w[:2], config.rules.num_waypoints, config.rules.waypoint_spacing_m
-        )
+        rules = self.config.rules
+        points_at = grid_waypoints_at if rules.waypoint_style == "grid" else waypoints_at
+        world = points_at(self.tables, scene, goal, pos_w[:2], rules.num_waypoints, rules.waypoint_spacing_m)
         return waypoints_in_body(world, pos_w, rotation)
 
     def _advance(
