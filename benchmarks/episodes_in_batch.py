@@ -115,7 +115,7 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
         return draw(xy_w, yaw_rad)
 
     journeys = clock.timed("episodes drawn", lambda: venue.episodes)()
-    player = NavigatorPlayer(Navigator(made, sight, policy, contest.config), simulator, camera, contest.config)
+    player = NavigatorPlayer(Navigator(made, sight, policy, contest.config.navigator), simulator, camera)
     played = clock.timed(REST, play)(player, simulator, journeys, contest.config, tell)
     return dict(clock.parts), played, images, time.perf_counter() - began
 
@@ -158,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         nonlocal told
         if time.monotonic() - told > 5.0:
             told = time.monotonic()
-            most = contest.config.limit_s
+            most = contest.config.navigator.limit_s
             print(f"{over} over, simulated {simulated_s:.0f} s of {most:.0f} s at most", file=sys.stderr, flush=True)
 
     parts, played, images, seconds = measure(contest, tell)

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.steps_per_second import _commit, _versions
-from interactive_nav.config import NavConfig
+from interactive_nav.config import NavConfig, PhysicsConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav.scenes.objects import SmallObject
@@ -64,7 +64,7 @@ SCENARIOS = (
     Scenario("TurtleBot pushes a door", "turtlebot", "door", 0.35),
     Scenario("Fetch pushes a table", "fetch", "table", 0.35),
 )
-ENVIRONMENT = {"sim_dt_s": NavConfig.sim_dt_s, "solver_iterations": NavConfig.solver_iterations}
+ENVIRONMENT = {"sim_dt_s": PhysicsConfig.sim_dt_s, "solver_iterations": PhysicsConfig.solver_iterations}
 SWEEP = (
     {},
     *({"sim_dt_s": dt} for dt in (1 / 240, 0.005, 0.01, 0.025, 0.05)),
@@ -149,7 +149,7 @@ def push(scenario: Scenario, source: Scene, settings: dict, tolerance: float | N
         steps, `robot_m` [N, T, 2] positions, `seconds` of stepping (compiling apart).
     """
     basket = scenario.category == "basket"
-    config = NavConfig(**{"num_objects": 1 if basket else 0, "sleep": False, **settings})
+    config = NavConfig.of(**{"num_objects": 1 if basket else 0, "sleep": False, **settings})
     world, slot, radius_m = _world(scenario, source, config)
     if tolerance is not None:
         for model in world.models:
@@ -169,7 +169,7 @@ def push(scenario: Scenario, source: Scene, settings: dict, tolerance: float | N
     start = time.perf_counter()
     force, path = np.zeros(len(qpos)), []
     q = world.layout.robot_qpos
-    for _ in range(round(SECONDS / config.control_dt_s)):
+    for _ in range(round(SECONDS / config.physics.control_dt_s)):
         state, signals = step(scene, state, command)
         force += np.asarray(signals.force_n)
         path.append(np.asarray(state.qpos[:, q : q + 2]))
@@ -223,10 +223,10 @@ def measure(backend: str, scenarios: tuple[Scenario, ...], only: str, scene: str
                 **base,
                 "scenario": scenario.name,
                 "collision": collision,
-                "sim_dt_s": NavConfig.sim_dt_s,
-                "solver_iterations": NavConfig.solver_iterations,
-                "cone": NavConfig.cone,
-                "contact_time_constant_s": NavConfig.contact_time_constant_s,
+                "sim_dt_s": PhysicsConfig.sim_dt_s,
+                "solver_iterations": PhysicsConfig.solver_iterations,
+                "cone": PhysicsConfig.cone,
+                "contact_time_constant_s": PhysicsConfig.contact_time_constant_s,
                 **settings,
                 "against_boxes": compare(run, reference),
                 "against_hulls": compare(run, truth),

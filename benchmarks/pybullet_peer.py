@@ -209,7 +209,7 @@ def main() -> None:
             travelled += went
     cores = os.cpu_count() or 1
     native = {
-        f"native_{threads}_threads": native_rate(world, NavConfig(threads=threads), qpos, args.steps)
+        f"native_{threads}_threads": native_rate(world, NavConfig.of(threads=threads), qpos, args.steps)
         for threads in sorted({1, cores})
     }
     device = jax.devices()[0]

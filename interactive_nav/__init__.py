@@ -93,9 +93,8 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     if isinstance(scenes, (str, Path)):
         raise ValueError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
-    return InteractiveNav(
-        get_robot(robot, config.control_mode), tuple(load_scene(s) for s in scene_folders(scenes)), config
-    )
+    loaded = tuple(load_scene(s) for s in scene_folders(scenes))
+    return InteractiveNav(get_robot(robot, config.rules.control_mode), loaded, config)
 
 
 __all__ = [

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from interactive_nav_common.config import Count, Seed, Settings, Share
+from interactive_nav_common.config import Count, Seed, Settings, Share, flat_section
 from interactive_nav_common.errors import ConfigError
 
 PITCHES = ("up", "level", "down")
@@ -227,9 +227,11 @@ class NavigatorConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluationConfig(NavigatorConfig):
+class EvaluationConfig(Settings):
     """Episodes, and how they are scored."""
 
+    navigator: NavigatorConfig = flat_section(NavigatorConfig)
+    """Who plays them."""
     seed: Seed = 0
     """Of the episodes."""
     episodes: Annotated[int | None, (1, 10**6)] = None

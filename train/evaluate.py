@@ -17,6 +17,7 @@ from rich.console import Console
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError
 from interactive_nav.episodes import load as load_episodes
 from interactive_nav.types import FAILURES
+from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.rows import write_parquet
 from train import config_io
@@ -123,7 +124,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         configs = [_wanted(folder, policies, arguments, console) for folder in folders]
         fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
         # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
-        kinds = [dataclasses.replace(config.env, k_int=0.0) for config in configs]
+        kinds = [replace(config.env, k_int=0.0) for config in configs]
         order = sorted(range(len(folders)), key=lambda i: kinds.index(kinds[i]))
         player, built = None, None
         for i in order:

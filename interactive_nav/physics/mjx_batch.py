@@ -48,9 +48,10 @@ class MjxPhysics(Physics):
 
     def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
         self.window = Window(world, config)
-        self._world, self._substeps = world, config.substeps
+        physics = config.physics
+        self._world, self._substeps = world, physics.substeps
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
-        self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
+        self.contacts_per_env, self.constraints_per_env = physics.contacts_per_env, physics.constraints_per_env
         self._host = self._host_model()
         self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
         layout = self.window.layout

@@ -64,7 +64,8 @@ class Window:
         self.world = world
         layout = world.layout
         kinds = np.asarray(layout.slot_kind)
-        limits = {"small": config.active_small, "free": config.active_furniture, "hinge": config.active_doors}
+        physics = config.physics
+        limits = {"small": physics.active_small, "free": physics.active_furniture, "hinge": physics.active_doors}
         model = world.models[0]
         slots: list[tuple[str, int]] = []
         picked = []
@@ -76,7 +77,7 @@ class Window:
                 picked.append((own, width, len(slots), boxes))
                 slots += [(kind, boxes)] * width
         n_walls = int(model.body_geomnum[layout.structure_body])
-        self.n_walls = min(config.active_walls or n_walls, n_walls)
+        self.n_walls = min(physics.active_walls or n_walls, n_walls)
         self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
         self.groups = tuple(self._group(*p) for p in picked)
         self._wall_tables, self._wall_rows = self._walls()

@@ -180,8 +180,8 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         robot=env.robot.name,
         scene=str(env.scenes[scene].path),
         scene_digest=env.scenes[scene].digest,
-        control_dt_s=env.config.control_dt_s,
-        num_objects=env.config.num_objects,
+        control_dt_s=env.config.physics.control_dt_s,
+        num_objects=env.config.rules.num_objects,
         policy=player.name,
         episode=episode,
         label=player.label,
@@ -197,9 +197,9 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         touches_movable=counts["interaction_steps"],
         touches_structure=counts["structure_steps"],
         metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
-        small_objects=env.config.small_objects,
-        objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
-        segmentation_classes=env.config.segmentation_classes,
+        small_objects=env.config.rules.small_objects,
+        objects=tuple(str(Path(folder).absolute()) for folder in env.config.rules.objects),
+        segmentation_classes=env.config.sensors.segmentation_classes,
         success_distance_m=env.success_distance_m,
     )
 

@@ -230,7 +230,7 @@ class ThirdPerson:
         self.env, self.rows, self.columns = env, rows, columns
         config, small = env.config, env.world.small_objects
         self._view = functools.cache(
-            lambda scene: SceneView(env.robot, env.scenes[scene], small, config.segmentation_classes)
+            lambda scene: SceneView(env.robot, env.scenes[scene], small, config.sensors.segmentation_classes)
         )
 
     def frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:

@@ -100,12 +100,12 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     """
     if not scenes:
         raise ValueError("scenes is empty, expected at least one scene folder")
-    if config.collision == "hulls" and len(scenes) > 1:
+    if config.physics.collision == "hulls" and len(scenes) > 1:
         raise ValueError(
             f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
             "use collision='boxes'"
         )
-    small = small_objects(config.num_objects, config.small_objects, config.objects)
+    small = small_objects(config.rules.num_objects, config.rules.small_objects, config.rules.objects)
     specs, models, slots = [], [], []
     for i in range(len(scenes)):
         spec, slots = build_spec(robot, i, scenes, small, config)

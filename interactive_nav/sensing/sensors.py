@@ -52,14 +52,15 @@ class Sensors:
 
     renderer: Renderer | None
 
-    def __init__(self, world: World, config: NavConfig, backend: str):
+    def __init__(self, world: World, settings: NavConfig, backend: str):
         """Builds tables, and the renderer if images are asked for.
 
         Args:
             world: of the environment.
-            config: its settings.
+            settings: the environment's.
             backend: of the physics: warp, jax or native.
         """
+        rules, config = settings.rules, settings.sensors
         self._layout, self._config = world.layout, config
         model = world.models[0]
         self._joints = _own_joints(model, world)
@@ -73,7 +74,7 @@ class Sensors:
         beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
         self._beams_b = np.stack(beams, -1).astype(np.float32)
         sizes = {
-            "waypoints": 2 * config.num_waypoints,
+            "waypoints": 2 * rules.num_waypoints,
             "goal": 3,
             "velocity": 6,
             "localisation": 3,

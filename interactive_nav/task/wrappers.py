@@ -18,7 +18,7 @@ DRAW_SHARE = 16
 
 def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
     """[...] scenes that environments with these numbers in their batch keep; None where each episode draws one."""
-    return slot % len(env.scenes) if env.config.scene_choice == "slot" else None
+    return slot % len(env.scenes) if env.config.rules.scene_choice == "slot" else None
 
 
 class AutoResetEnv(Env):
@@ -107,7 +107,7 @@ class AutoResetEnv(Env):
             current, pending = carry
             index = jnp.nonzero(pending, size=share, fill_value=n)[0]
             nav, rng = (jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], x) for x in current[-2:])
-            if self.env.config.scene_choice == "slot":
+            if self.env.config.rules.scene_choice == "slot":
                 fresh = jax.vmap(self.env.draw)(rng, nav.scene_index)
             else:
                 fresh = jax.vmap(self.env.draw)(rng)

@@ -22,7 +22,7 @@ from train.runs.run_folder import RunFolder
 def run(tmp_path_factory, room):
     """A run that has not trained yet: yardsticks need no checkpoint."""
     config = toy_config(tmp_path_factory.mktemp("runs"))
-    env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=15, num_objects=1)
+    env = EnvConfig.of(scenes=(str(room),), backend="native", episode_steps=15, num_objects=1)
     folder = RunFolder(tmp_path_factory.mktemp("run"))
     folder.open(resolve(dataclasses.replace(config, env=env), "native"))
     return folder.path

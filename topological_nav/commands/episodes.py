@@ -81,7 +81,7 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
         refuse_unused(arguments, "thinned", who)
     if arguments.truth:
         refuse_unused(arguments, "--maps --localiser --detector match supersample", "with --truth")
-    if not contest.config.glance:
+    if not contest.config.navigator.glance:
         refuse_unused(arguments, "watch_s", "with glance=false")
 
 
@@ -98,7 +98,7 @@ def navigate(arguments: argparse.Namespace) -> None:
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     with stop_signals() as stops, bar() as tell:
         told = stopping(tell, stops)
-        limit_s = int(contest.config.limit_s)
+        limit_s = int(contest.config.navigator.limit_s)
         driven = drive_episode(
             contest,
             arguments.episode,
@@ -137,7 +137,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
             made = venue.map_of(name) if name in ("dense", "sparse") else None
             panels[name] = (made, tracks_of(contest, venue, name), {row["episode"]: row for row in mine})
         save(
-            journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable),
+            journeys_figure(venue.scene.name, venue.space, panels, contest.config.navigator.passable),
             contest.out / f"{venue.scene.name}.png",
         )
     lines, compared = summary(rows), differences(rows)

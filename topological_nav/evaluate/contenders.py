@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from topological_nav.config import EvaluationConfig
+from topological_nav.config import EvaluationConfig, NavigatorConfig
 from topological_nav.evaluate.episodes import Episodes
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import Events, State
@@ -58,7 +58,6 @@ class NavigatorPlayer:
         navigator: Navigator,
         simulator: Simulator,
         camera: Camera,
-        config: EvaluationConfig,
         watch: Callable[[float, Seen, State, Events], None] = lambda *_: None,
     ):
         """Takes its parts.
@@ -67,16 +66,15 @@ class NavigatorPlayer:
             navigator: of the scene.
             simulator: of the scene.
             camera: what the navigator's sight understands.
-            config: of the evaluation.
             watch: told time, poses, new state and events of every step.
         """
-        self._navigator, self._simulator, self._camera, self._config = navigator, simulator, camera, config
+        self._navigator, self._simulator, self._camera = navigator, simulator, camera
         self._watch = watch
         self.state: State | None = None
 
     def begin(self, episodes: Episodes) -> None:
         """Takes the goals' images, along as many headings as a localisation's."""
-        count = self._config.images
+        count = self._navigator.config.images
         around = 2 * np.pi * np.arange(count) / count
         n = len(episodes)
         images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n))
@@ -118,13 +116,13 @@ Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
 class ActionPlayer:
     """Whoever acts on the environment's own state: its runs follow each other without a break."""
 
-    def __init__(self, simulator: Simulator, make_act: Callable[[], Act], config: EvaluationConfig):
+    def __init__(self, simulator: Simulator, make_act: Callable[[], Act], config: NavigatorConfig):
         """Takes what acts.
 
         Args:
             simulator: of the environment.
             make_act: called for every batch of episodes.
-            config: of the evaluation.
+            config: of the navigator: runs and time of episodes are everybody's.
         """
         self._simulator, self._make_act, self._config = simulator, make_act, config
 
@@ -148,7 +146,7 @@ class ActionPlayer:
         return self._simulator.act(state, action), marks
 
 
-def expert(simulator: Simulator, config: EvaluationConfig) -> ActionPlayer:
+def expert(simulator: Simulator, config: NavigatorConfig) -> ActionPlayer:
     """The planner of `train.scoring.planners` that has the map and all poses: it goes round everything where it can.
 
     Where its grid leaves no way between an object and a wall, it takes the one through the least of objects: episodes
@@ -168,4 +166,4 @@ def learned(simulator: Simulator, policy: Any, config: EvaluationConfig) -> Acti
     def act(state: Any, episode: np.ndarray, _: np.ndarray, step: int) -> Any:
         return chosen(state.obs, jnp.asarray(episode), jnp.asarray(step))
 
-    return ActionPlayer(simulator, lambda: act, config)
+    return ActionPlayer(simulator, lambda: act, config.navigator)

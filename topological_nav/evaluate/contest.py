@@ -169,24 +169,24 @@ class ContestScene:
         """Networks, or the truth."""
         if self.networks is None:
             return TrueSight(made, self.space)
-        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.match)
+        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.navigator.match)
 
     def navigator(self, contender: str) -> Navigator:
         """Of the dense or the sparse map."""
         made = self.map_of(contender)
         sight = self.sight(made)
-        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
+        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config.navigator)
 
     def contender(self, name: str) -> tuple[Contender, Simulator]:
         """Who plays, and in what."""
         config = self.contest.config
         if name == "expert":
-            return expert(self.expert_simulator, config), self.expert_simulator
+            return expert(self.expert_simulator, config.navigator), self.expert_simulator
         if name == "ppo":
             assert self.contest.ppo is not None
             simulator, policy = _learned(self.contest.ppo, self.scene, config)
             return learned(simulator, policy, config), simulator
-        return NavigatorPlayer(self.navigator(name), self.simulator, self.camera, config), self.simulator
+        return NavigatorPlayer(self.navigator(name), self.simulator, self.camera), self.simulator
 
     def asked(self, contender: str) -> dict[str, Any]:
         """Everything that decides the rows of a contender."""
@@ -224,7 +224,8 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
         ConfigError: a trained policy cannot look at poses.
     """
     if contest.policy == PASSAGE_POLICY:
-        return PassagePolicy(sight, contest.config.passable, contest.config.clear_m)
+        asked = contest.config.navigator
+        return PassagePolicy(sight, asked.passable, asked.clear_m)
     if contest.truth:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
     from topological_nav.drives import driving

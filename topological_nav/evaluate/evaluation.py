@@ -167,7 +167,7 @@ def columns(episodes: Episodes, played: Played, config: EvaluationConfig) -> dic
         "within": (played.goal_m < config.success_m).astype(np.float64),
         "arrived": played.arrived,
         "contact": contact.astype(np.float64),
-        "aadc_s": played.contact_runs * config.run_s,
+        "aadc_s": played.contact_runs * config.navigator.run_s,
         "contact_s": played.contact_s,
         "wall_s": played.wall_s,
         "duration_s": played.duration_s,

@@ -109,7 +109,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         seen_at.append((time_s, seen.xy_w[0], seen.yaw_rad[0], int(state.phase[0])))
         told.extend(f"{time_s:7.1f} s  {said}" for said in _said(made, state, events))
 
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, contest.config, watch)
+    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, watch)
     played = play(player, venue.simulator, journey, contest.config, lambda _, time_s: progress(time_s))
     assert player.state is not None
     time_s, xy, yaw, phase = zip(*seen_at, strict=True)
@@ -121,7 +121,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         journey,
         played,
         int(player.state.goal[0]),
-        contest.config.passable,
+        contest.config.navigator.passable,
         np.array(time_s),
         np.array(xy),
         np.array(yaw),

@@ -60,7 +60,7 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
         UserError: the backend is not installed.
     """
     need_engine(backend)
-    config = NavConfig(
+    config = NavConfig.of(
         backend=backend,
         control_mode=CONTROL,
         num_objects=0,

@@ -34,6 +34,7 @@ from train.errors import CheckpointError
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import RunFolder, claim
+from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.metrics_file import read_metrics
 from interactive_nav_common.versions import versions
 
@@ -45,7 +46,7 @@ def make_env(config: EnvConfig) -> Any:
         ConfigError: an unknown robot, an unusable scene, or settings that do not fit each other.
     """
     try:
-        return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
+        return interactive_nav.make(**flatten(config))
     except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
 
@@ -75,7 +76,7 @@ def config_to_play(
             there = resolve_backend("auto")
             told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(told, highlight=False, soft_wrap=True)
-            env = dataclasses.replace(env, backend=there)
+            env = replace(env, backend=there)
     return dataclasses.replace(config, env=env)
 
 
@@ -161,7 +162,7 @@ class FolderCallbacks:
         each had the time for a whole episode, scores would flatter.
         """
         run = self._config.run
-        fair = self._began_together + num_envs(self._config) * self._config.env.episode_steps
+        fair = self._began_together + num_envs(self._config) * self._config.env.rules.episode_steps
         since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
         lines = [line for line in read_metrics(self._folder.metrics) if line["env_steps"] > since]
         meta = CheckpointMeta(
@@ -171,7 +172,7 @@ class FolderCallbacks:
             began_together=self._began_together,
             algorithm=self._config.algorithm,
             robot=self._config.env.robot,
-            observations=self._config.env.observations,
+            observations=self._config.env.sensors.observations,
             observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
         )
@@ -319,7 +320,7 @@ def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics
         "run": config.run.name,
         "algorithm": config.algorithm,
         "robot": config.env.robot,
-        "k_int": config.env.k_int,
+        "k_int": config.env.rules.k_int,
         "seed": config.run.seed,
         "completed": result.completed,
         "env_steps": result.snapshot.env_steps,

@@ -16,12 +16,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.metrics_file import METRICS, read_metrics, write_metrics
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
-from train.config_io import flatten, from_yaml, to_yaml
+from train.config_io import from_yaml, to_yaml
 
 MAY_CHANGE = (
     *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),

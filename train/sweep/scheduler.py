@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from interactive_nav_common.config import replace
 from train.sweep.folder import (
     RunState,
     SweepFolder,
@@ -199,7 +200,7 @@ class Scheduler:
         """Starts what there is room for: training first, then evaluation."""
         for name in self._free(self._to_train(states)):
             command = words_of_training(self._folder, name, self._programs.train)
-            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.threads:
+            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.physics.threads:
                 command = [*command, f"env.threads={_threads(self._runs[name])}"]
             if not self._begin("train", [name], command):
                 return states
@@ -213,7 +214,7 @@ class Scheduler:
         """Runs to evaluate by one process each: those of one environment (k_int is in no score)."""
         kinds: dict[Any, list[str]] = {}
         for name in names:
-            env = dataclasses.replace(self._runs[name].config.env, k_int=0.0)
+            env = replace(self._runs[name].config.env, k_int=0.0)
             kinds.setdefault(name if name in self._alone else env, []).append(name)
         size = EVALUATED_TOGETHER
         return [group[i : i + size] for group in kinds.values() for i in range(0, len(group), size)]

@@ -36,7 +36,7 @@ def _simulate(robot, model, data, action, seconds):
 
 def _alone(robot):
     """The robot alone in an empty hall, at home: model and data."""
-    world = build_world(robot, (hall(()),), NavConfig(num_objects=0))
+    world = build_world(robot, (hall(()),), NavConfig.of(num_objects=0))
     model = world.models[0]
     data = mujoco.MjData(model)
     data.qpos[:] = world.rest_qpos[0]
@@ -89,7 +89,7 @@ def test_pushing_at_constant_speed_balances_the_floors_friction(name):
     robot, load = get_robot(name, "twist"), LOADS[1 if name != "turtlebot" else 0]
     front = 0.6
     scene = hall((box(load, front + load.half_m[0], 0.0),))
-    world = build_world(robot, (scene,), NavConfig(num_objects=0))
+    world = build_world(robot, (scene,), NavConfig.of(num_objects=0))
     model = world.models[0]
     data = mujoco.MjData(model)
     data.qpos[:] = world.rest_qpos[0]

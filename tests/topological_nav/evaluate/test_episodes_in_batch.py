@@ -38,7 +38,7 @@ def test_compiling_belongs_to_the_part_that_asked_for_it():
 
 
 def test_a_batch_is_played_and_its_parts_add_up(made: Made):
-    config = EvaluationConfig(episodes=3, limit_s=12.0, images=2, backend="native", supersample=1)
+    config = EvaluationConfig.of(episodes=3, limit_s=12.0, images=2, backend="native", supersample=1)
     contest = Contest(
         scenes=(made.scene,),
         contenders=("dense",),

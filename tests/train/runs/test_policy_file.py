@@ -26,7 +26,7 @@ from train.errors import CheckpointError
 from train.learners.learner import Snapshot
 from train.runs.run import train_run
 
-TOY = EnvConfig(scenes=("toy",), backend="native")
+TOY = EnvConfig.of(scenes=("toy",), backend="native")
 
 
 def learner_of(env, algorithm, share):
