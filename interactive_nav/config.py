@@ -266,11 +266,6 @@ def _refuse_idle(config: NavConfig) -> None:
                 raise ConfigError(f"{name} is {value!r}, which changes nothing here: expected {needs}; or leave it out")
 
 
-def original_code(**settings: Any) -> NavConfig:
-    """All values of the original's code at once (`ORIGINAL_CODE`), and settings by name over them."""
-    return make_config(variant="code", **settings)
-
-
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
     """A `NavConfig` from settings by name.
 

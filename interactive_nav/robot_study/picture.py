@@ -6,16 +6,19 @@ otherwise drawn with matplotlib from the same geoms.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.robot_study.evidence import Evidence
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
+from interactive_nav.sensing.base import look_along
 
 _SIZE = (480, 480)
 _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG = 145.0, -22.0
@@ -71,26 +74,11 @@ def _with_gl(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE:
             model.geom_group[g] = 0 if g in shown else 5
     centre, half = _span(model, data)
-    camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance = centre, 2.9 * half
-    camera.azimuth, camera.elevation = _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG
-    # mujoco.Renderer asks for a window system unless MUJOCO_GL was set before mujoco's import, and then aborts
-    # the process where there is no display: EGL is used directly.
-    from mujoco.egl import GLContext
-
-    context = GLContext(*_SIZE)
-    context.make_current()
-    scene = mujoco.MjvScene(model, 1000)
-    drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, drawn)
-    option, view = mujoco.MjvOption(), mujoco.MjrRect(0, 0, *_SIZE)
-    mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
-    mujoco.mjr_render(view, scene, drawn)
-    image = np.zeros((_SIZE[1], _SIZE[0], 3), np.uint8)
-    mujoco.mjr_readPixels(image, None, view, drawn)
-    drawn.free()
-    context.free()
-    return image[::-1].copy()
+    azimuth, elevation = math.radians(_VIEW_AZIMUTH_DEG), math.radians(_VIEW_ELEVATION_DEG)
+    level = math.cos(elevation)
+    forward = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
+    pose = look_along((centre - 2.9 * half * forward)[None], forward[None])
+    return GlPainter(model, *_SIZE, sky=None).draw(data, pose, model.vis.global_.fovy, [0])[0]
 
 
 def _faces(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:

@@ -19,6 +19,16 @@ FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
 
 
+@flax.struct.dataclass
+class CameraPose:
+    """Where a camera is, world frame."""
+
+    pos_w: Any
+    """[..., 3], m: f32 of JAX, or NumPy's on the host."""
+    axes_w: Any
+    """[..., 3, 3], columns: forward, right, up."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Lens:
     """A pinhole camera with square pixels."""
@@ -41,22 +51,23 @@ class Lens:
     @property
     def columns(self) -> np.ndarray:
         """[width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
-        return ((np.arange(self.width) + 0.5 - self.width / 2) * self.pixel).astype(np.float32)
+        return self._offsets[0].astype(np.float32)
 
     @property
     def rows(self) -> np.ndarray:
         """[height] f32: upward offset at depth 1, top to bottom."""
-        return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
+        return self._offsets[1].astype(np.float32)
 
+    @property
+    def _offsets(self) -> tuple[np.ndarray, np.ndarray]:
+        """`columns` and `rows` in full precision."""
+        across, down = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
+        return (across - self.width / 2) * self.pixel, (self.height / 2 - down) * self.pixel
 
-@flax.struct.dataclass
-class CameraPose:
-    """Where a camera is, world frame."""
-
-    pos_w: jax.Array
-    """[..., 3] f32, m."""
-    axes_w: jax.Array
-    """[..., 3, 3] f32, columns: forward, right, up."""
+    def rays(self, pose: CameraPose) -> np.ndarray:
+        """[height, width, 3] of the pixels of one camera, world frame; along its axis their length is 1."""
+        right, up = np.meshgrid(*self._offsets)
+        return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
 
 
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
@@ -75,7 +86,7 @@ def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
     aside = xp.asarray([0.0, -1.0, 0.0], forward.dtype)
     right = xp.where(length > 1e-6, flat / xp.where(length > 1e-6, length, 1.0), aside)
     up = xp.cross(right, forward)
-    return CameraPose(pos_w, xp.stack([forward, right, up], -1))  # type: ignore[arg-type]
+    return CameraPose(pos_w, xp.stack([forward, right, up], -1))
 
 
 class Renderer(abc.ABC):

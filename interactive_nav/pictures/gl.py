@@ -12,12 +12,13 @@ import math
 import os
 import warnings
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from interactive_nav.sensing.base import Lens
+from interactive_nav.sensing.base import CameraPose
 from interactive_nav_common.errors import UserError
 
 LIBRARIES = ("egl", "osmesa", "glfw")
@@ -26,25 +27,25 @@ SKY = (237, 242, 247)
 
 
 class GlPainter:
-    """Draws the visual geoms of one model, one camera after the other; it must stay in the thread that made it."""
+    """Draws one model, one camera after the other; it must stay in the thread that made it."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, lens: Lens, group: int):
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, int, int] | None = SKY):
         """Makes a context.
 
         Args:
             model: its offscreen buffer is at least as large as the pictures.
-            data: where everything stands.
-            lens: of the pictures.
-            group: of the geoms that are shown.
+            width: of the pictures, pixels.
+            height: pixels.
+            sky: colour where nothing is hit; None: the model's.
 
         Raises:
             UserError: no GL library starts here.
         """
-        self._model, self._data, self._lens = model, data, lens
+        self._model, self._size, self._sky = model, (height, width), sky
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self._context = _context_class()(lens.width, lens.height)
+                self._context = _context_class()(width, height)
                 weakref.finalize(self, self._context.free)  # at exit, before the modules that it needs are gone
                 self._context.make_current()
                 self._drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -55,43 +56,56 @@ class GlPainter:
             ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawn)
         self._scene = mujoco.MjvScene(model, model.ngeom + 100)
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = np.arange(6) == group
-        self._view = mujoco.MjrRect(0, 0, lens.width, lens.height)
-        model.vis.global_.fovy = lens.fov_deg
+        self._view = mujoco.MjrRect(0, 0, width, height)
 
-    def draw(self, pos_w: np.ndarray, axes_w: np.ndarray, depth: bool = False) -> np.ndarray:
+    def draw(
+        self, data: mujoco.MjData, pose: CameraPose, fov_deg: float, groups: Sequence[int], depth: bool = False
+    ) -> np.ndarray:
         """Pictures of cameras.
 
         Args:
-            pos_w: [N, 3] m.
-            axes_w: [N, 3, 3] forward, right, up as columns; forward is not vertical.
+            data: where everything stands.
+            pose: of N cameras without roll, leaves [N, ...].
+            fov_deg: vertical field of view.
+            groups: of the geoms that are shown.
             depth: distances along the axis (m) rather than colours.
 
         Returns:
             [N, H, W, 3] u8, or [N, H, W] f32.
         """
         self._context.make_current()
-        return np.stack([self._one(p, a[:, 0], depth) for p, a in zip(pos_w.astype(float), axes_w, strict=True)])
-
-    def _one(self, pos_w: np.ndarray, forward: np.ndarray, depth: bool) -> np.ndarray:
-        camera = mujoco.MjvCamera()
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.lookat[:], camera.distance = pos_w + forward, 1.0
-        camera.elevation = math.degrees(math.asin(np.clip(forward[2], -1.0, 1.0)))
-        camera.azimuth = math.degrees(math.atan2(forward[1], forward[0]))
+        self._model.vis.global_.fovy = fov_deg
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = np.isin(np.arange(6), groups)
         every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, camera, every, self._scene)
+        images = []
+        for pos_w, axes_w in zip(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w), strict=True):
+            camera = _free_camera(pos_w, axes_w[:, 0], axes_w[:, 2])
+            mujoco.mjv_updateScene(self._model, data, option, None, camera, every, self._scene)
+            images.append(self._read(depth))
+        return np.stack(images)
+
+    def _read(self, depth: bool) -> np.ndarray:
         mujoco.mjr_render(self._view, self._scene, self._drawn)
-        colour = np.zeros((self._lens.height, self._lens.width, 3), np.uint8)
-        window = np.zeros((self._lens.height, self._lens.width), np.float32)
+        colour, window = np.zeros((*self._size, 3), np.uint8), np.zeros(self._size, np.float32)
         mujoco.mjr_readPixels(colour, window, self._view, self._drawn)
         if not depth:
-            colour[window >= 1.0] = SKY
+            if self._sky is not None:
+                colour[window >= 1.0] = self._sky
             return colour[::-1].copy()
         extent, planes = self._model.stat.extent, self._model.vis.map
         near, far = planes.znear * extent, planes.zfar * extent
         return (near / (1.0 - window * (1.0 - near / far)))[::-1].copy()
+
+
+def _free_camera(pos_w: np.ndarray, forward: np.ndarray, up: np.ndarray) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat[:], camera.distance = pos_w + forward, 1.0
+    camera.elevation = math.degrees(math.asin(np.clip(forward[2], -1.0, 1.0)))
+    flat = forward if abs(forward[2]) < 1 - 1e-9 else up
+    camera.azimuth = math.degrees(math.atan2(flat[1], flat[0]))
+    return camera
 
 
 def _context_class() -> Any:
