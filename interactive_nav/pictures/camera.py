@@ -18,7 +18,7 @@ import numpy as np
 
 from interactive_nav.physics import resolve_backend
 from interactive_nav.pictures.gl import GlPainter
-from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel
+from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
 from interactive_nav.pictures.shading import BACKGROUND, PALETTE, lambert
 from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
 from interactive_nav_common.errors import UserError
@@ -125,7 +125,7 @@ class Camera:
         back = -1.8 * ahead + [0, 0, 1.1]
         # Not behind a wall.
         reach = np.linalg.norm(back)
-        hit = model.cast(target, back[None] / reach, SCENE)[1][0] / reach
+        hit = cast(model.model, model.data, target, back[None] / reach, SCENE)[1][0] / reach
         eye = target + back * (min(1.0, 0.9 * hit) if hit > 0 else 1.0)
         return look_along(eye, target - eye), 70.0
 
@@ -183,15 +183,11 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 def _by_rays(
     model: _PictureModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...], streams: set[str]
 ) -> dict[str, np.ndarray]:
-    ray = lens.rays(pose)
-    length = np.linalg.norm(ray, axis=-1)
-    geom, distance, normal = model.cast(pose.pos_w, (ray / length[..., None]).reshape(-1, 3), groups)
-    geom, depth = geom.reshape(length.shape), distance.reshape(length.shape) / length
+    ray, geom, depth, faces = trace(model.model, model.data, pose, lens, groups)
     met = (geom >= 0) & (depth > 0) & (depth < FAR_M)
     out: dict[str, np.ndarray] = {"depth": np.where(met, depth, 0.0).astype(np.float32)}
     out["segmentation"] = np.where(met, model.class_id[geom], 0).astype(np.uint8)
     if streams & {"normals", "rgb"}:
-        faces = normal.reshape(*length.shape, 3)
         # Meshes may be seen from behind: normals are turned to the viewer.
         faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
         forward, right_w, up_w = pose.axes_w.T

@@ -16,6 +16,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
+from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import CATEGORIES, class_id
 
@@ -169,34 +170,52 @@ class SceneModel:
                 data.geom_xpos[g] = pos + axes @ model.geom_pos[g]
                 data.geom_xmat[g] = (axes @ matrix_from_quat(model.geom_quat[g])).ravel()
 
-    def cast(self, origin_w: np.ndarray, unit_w: np.ndarray, groups: Sequence[int]) -> tuple[np.ndarray, ...]:
-        """What rays meet first.
 
-        Args:
-            origin_w: (3,) m.
-            unit_w: [n, 3] directions of length 1.
-            groups: geom groups that can be met.
+def cast(
+    model: mujoco.MjModel, data: mujoco.MjData, origin_w: np.ndarray, unit_w: np.ndarray, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What rays meet first.
 
-        Returns:
-            [n] geoms, -1 where nothing is met; [n] distances, m; [n, 3] normals.
-        """
-        count = len(unit_w)
-        geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
-        mujoco.mj_multiRay(
-            self.model,
-            self.data,
-            np.asarray(origin_w, float),
-            np.ascontiguousarray(unit_w).ravel(),
-            np.isin(np.arange(6), groups).astype(np.uint8),
-            1,
-            -1,
-            geom,
-            distance,
-            normal,
-            count,
-            mujoco.mjMAXVAL,
-        )
-        return geom, distance, normal.reshape(-1, 3)
+    Args:
+        model: what is there.
+        data: where it is.
+        origin_w: (3,) m.
+        unit_w: [n, 3] directions of length 1.
+        groups: geom groups that can be met.
+
+    Returns:
+        [n] geoms, -1 where nothing is met; [n] distances, m; [n, 3] normals.
+    """
+    count = len(unit_w)
+    geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
+    origin, flat = np.asarray(origin_w, float), np.ascontiguousarray(unit_w).ravel()
+    shown = np.isin(np.arange(6), groups).astype(np.uint8)
+    far = mujoco.mjMAXVAL
+    mujoco.mj_multiRay(model, data, origin, flat, shown, 1, -1, geom, distance, normal, count, far)
+    return geom, distance, normal.reshape(-1, 3)
+
+
+def trace(
+    model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the pixels of a camera show.
+
+    Args:
+        model: what is there.
+        data: where it is.
+        pose: of one camera.
+        lens: its.
+        groups: geom groups that are seen.
+
+    Returns:
+        [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 where nothing is met; [H, W] depths along the optical axis,
+        m; [H, W, 3] normals.
+    """
+    ray = lens.rays(pose)
+    length = np.linalg.norm(ray, axis=-1, keepdims=True)
+    geom, distance, normal = cast(model, data, pose.pos_w, (ray / length).reshape(-1, 3), groups)
+    shape = ray.shape[:2]
+    return ray, geom.reshape(shape), distance.reshape(shape) / length[..., 0], normal.reshape(ray.shape)
 
 
 def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
-from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, SCENE, THINGS, SceneModel
+from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, SCENE, THINGS, SceneModel, cast, trace
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
@@ -59,9 +59,14 @@ class Camera:
         """Where it is and how it is turned."""
         return look_along(self.pos_w, self.forward_w)
 
+    @property
+    def lens(self) -> Lens:
+        """Its pixels."""
+        return Lens(self.columns, self.rows, math.degrees(self.fov_rad))
+
     def rays(self) -> np.ndarray:
         """[rows * columns, 3] directions; their component along `forward_w` is 1."""
-        return Lens(self.columns, self.rows, math.degrees(self.fov_rad)).rays(self.pose).reshape(-1, 3)
+        return self.lens.rays(self.pose).reshape(-1, 3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,25 +112,22 @@ class SceneView(SceneModel):
             groups: `OUTSIDE` or `INSIDE`.
             paint: drawn on the floor.
         """
-        rays = camera.rays()
-        length = np.linalg.norm(rays, axis=1)
-        geom, distance, normal = self.cast(camera.pos_w, rays / length[:, None], groups)
+        ray, geom, depth_m, normal = trace(self.model, self.data, camera.pose, camera.lens, groups)
         hit = geom >= 0
-        points = camera.pos_w + rays * (distance / length)[:, None]
-        colour = np.tile(np.array(SKY_COLOUR), (len(rays), 1))
+        points = camera.pos_w + ray * depth_m[..., None]
+        colour = np.full(ray.shape, SKY_COLOUR)
         colour[hit] = self._colour[geom[hit]]
         floor = hit & self._floor[geom]
         colour[floor] = _floor_colour(points[floor, :2], paint or FloorPaint())
         if CUT_WALLS in groups:
             colour[hit] *= self._light(points[hit], normal[hit], groups)[:, None]
         else:  # indoors, a lamp beside the camera
-            colour[hit] *= 0.5 + 0.5 * np.abs((normal[hit] * rays[hit]).sum(1, keepdims=True) / length[hit, None])
-        classes = np.where(hit, self.class_id[geom], NOTHING).astype(np.uint8)
-        shape = (camera.rows, camera.columns)
+            along = (normal * ray).sum(-1, keepdims=True) / np.linalg.norm(ray, axis=-1, keepdims=True)
+            colour[hit] *= 0.5 + 0.5 * np.abs(along[hit])
         return Image(
-            colour=(np.clip(colour, 0, 1) * 255 + 0.5).astype(np.uint8).reshape(*shape, 3),
-            depth_m=np.where(hit, distance / length, np.inf).astype(np.float32).reshape(shape),
-            classes=classes.reshape(shape),
+            colour=(np.clip(colour, 0, 1) * 255 + 0.5).astype(np.uint8),
+            depth_m=np.where(hit, depth_m, np.inf).astype(np.float32),
+            classes=np.where(hit, self.class_id[geom], NOTHING).astype(np.uint8),
         )
 
     def _light(self, points: np.ndarray, normal: np.ndarray, groups: tuple[int, ...]) -> np.ndarray:
@@ -135,7 +137,7 @@ class SceneView(SceneModel):
         ray = points - lamp
         far = np.linalg.norm(ray, axis=1)
         unit = ray / far[:, None]
-        _, distance, _ = self.cast(lamp, unit, groups)
+        _, distance, _ = cast(self.model, self.data, lamp, unit, groups)
         lit = (distance < 0) | (distance > far - 0.02)
         facing = np.clip(-(normal * unit).sum(1), 0, 1)
         sky = 0.58 + 0.10 * normal[:, 2]
