@@ -18,18 +18,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from interactive_nav.sensing.base import CameraPose
+from interactive_nav.sensing.base import SKY_COLOUR, CameraPose
 from interactive_nav_common.errors import UserError
 
 LIBRARIES = ("egl", "osmesa", "glfw")
-SKY = (237, 242, 247)
-"""Where nothing is hit, as in `interactive_nav.sensing.warp`; MuJoCo's would be black."""
+SKY = tuple(round(255 * c) for c in SKY_COLOUR)
+"""Where nothing is hit; MuJoCo's would be black."""
 
 
 class GlPainter:
     """Draws one model, one camera after the other; it must stay in the thread that made it."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, int, int] | None = SKY):
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, ...] | None = SKY):
         """Makes a context.
 
         Args:

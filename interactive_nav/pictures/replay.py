@@ -230,6 +230,11 @@ def _play_step(env: InteractiveNav, state: Any, action: jax.Array) -> tuple[Any,
     return state, out | {f"metrics/{name}": state.metrics[name][0] for name in EPISODE_METRICS}
 
 
+def replay_path(run: Path, policy: str, episode: int) -> Path:
+    """Where a run keeps a replay."""
+    return run / "replays" / f"{policy}-episode{episode}.npz"
+
+
 def save(replay: Replay, path: str | Path) -> None:
     """Writes a replay as npz, whole or not at all.
 

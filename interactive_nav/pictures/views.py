@@ -21,7 +21,7 @@ from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, SCENE, THINGS
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.sensing.base import CameraPose, Lens, look_along
+from interactive_nav.sensing.base import SKY_COLOUR, CameraPose, Lens, look_along
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import CLASS_COLOURS, CLASSES, TABLE
@@ -31,7 +31,6 @@ COLOURS = {category.name: category.colour for category in TABLE}
 GOAL_COLOUR = (0.30, 0.72, 0.36)
 TRAIL_COLOUR = (0.16, 0.47, 0.84)
 FLOOR_COLOUR = (0.80, 0.78, 0.74)
-SKY_COLOUR = (0.93, 0.95, 0.97)
 NOTHING = 255
 """Class of a ray that meets nothing."""
 

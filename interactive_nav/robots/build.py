@@ -151,17 +151,8 @@ def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoc
 
 
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """(3,) half sizes of a primitive's bounding box in its own frame, m."""
-    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.full(3, size[0])
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return np.array([size[0], size[0], size[0] + size[1]])
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return np.array([size[0], size[0], size[1]])
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
-    return size
+    """(3,) half sizes of a box about the geom's origin that holds it, in its own frame, m."""
+    return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
 
 
 def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:

@@ -17,6 +17,8 @@ from interactive_nav.batching import one_of_batch
 NEAR_M = 0.01
 FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
+SKY_COLOUR = (0.93, 0.95, 0.97)
+"""RGB in [0, 1] of pictures where nothing is met."""
 
 
 @flax.struct.dataclass

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import sorted_movables
 from interactive_nav.scenes.world import World
 from interactive_nav_common.rotations import Array, matrix_from_quat
@@ -53,6 +54,20 @@ class BoxTables:
         return len(self.body)
 
 
+def _boxes_of_slots(world: World, scene: Scene, five_categories: bool) -> list[tuple[np.ndarray, int]]:
+    """Boxes [n, 10] and class id of what is in each slot of a scene, then of its walls."""
+    free, hinged = sorted_movables(scene)
+    own, out = {"free": iter(free), "hinge": iter(hinged)}, []
+    for i, kind in enumerate(world.layout.slot_kind):
+        if kind == "small":
+            out.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id))
+            continue
+        movable = next(own[kind], None)
+        boxes = np.zeros((0, 10)) if movable is None else movable.boxes
+        out.append((boxes, 0 if movable is None else class_id(movable.category, five_categories)))
+    return [*out, (scene.walls, 0)]
+
+
 def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
@@ -62,20 +77,7 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
-    columns: list[list[tuple[np.ndarray, int]]] = []
-    for scene in scenes:
-        free, hinged = sorted_movables(scene)
-        own = {"free": iter(free), "hinge": iter(hinged)}
-        column: list[tuple[np.ndarray, int]] = []
-        for i, kind in enumerate(layout.slot_kind):
-            if kind == "small":
-                column.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id))
-                continue
-            movable = next(own[kind], None)
-            boxes = np.zeros((0, 10)) if movable is None else movable.boxes
-            column.append((boxes, 0 if movable is None else class_id(movable.category, five_categories)))
-        column.append((scene.walls, 0))
-        columns.append(column)
+    columns = [_boxes_of_slots(world, scene, five_categories) for scene in scenes]
     counts = [max(len(column[m][0]) for column in columns) for m in range(slots + 1)]
     body = np.repeat(np.arange(slots + 1), counts)
     first = np.concatenate([[0], np.cumsum(counts)])
@@ -85,20 +87,15 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     is_hinge = np.asarray([kind == "hinge" for kind in layout.slot_kind], bool)
     hinge_pos, hinge_axis, anchor = np.zeros((3, len(scenes), slots, 3))
     hinge_axes = np.broadcast_to(np.eye(3), (len(scenes), slots, 3, 3)).copy()
-    for s, column in enumerate(columns):
+    for s, (column, model) in enumerate(zip(columns, world.models, strict=True)):
         for m, (boxes, number) in enumerate(column):
-            for i, row in enumerate(boxes):
-                at = first[m] + i
-                pos[s, at], axes[s, at], half[s, at], ids[s, at] = (
-                    row[:3],
-                    matrix_from_quat(row[3:7]),
-                    row[7:10],
-                    number,
-                )
-        model = world.models[s]
+            at = slice(first[m], first[m] + len(boxes))
+            pos[s, at], half[s, at], ids[s, at] = boxes[:, :3], boxes[:, 7:10], number
+            axes[s, at] = matrix_from_quat(boxes[:, 3:7])
         for m in np.flatnonzero(is_hinge):
-            at, joint = layout.slot_body[m], model.body_jntadr[layout.slot_body[m]]
-            hinge_pos[s, m], hinge_axes[s, m] = model.body_pos[at], matrix_from_quat(model.body_quat[at])
+            leaf = layout.slot_body[m]
+            joint = model.body_jntadr[leaf]
+            hinge_pos[s, m], hinge_axes[s, m] = model.body_pos[leaf], matrix_from_quat(model.body_quat[leaf])
             hinge_axis[s, m], anchor[s, m] = model.jnt_axis[joint], model.jnt_pos[joint]
     f32 = jnp.float32
     return BoxTables(
