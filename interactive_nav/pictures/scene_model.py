@@ -118,15 +118,17 @@ class SceneModel:
         spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        for name in body_names(small):
+        for name in body_names(small):  # out of sight until they are placed
             self.data.qpos[self.model.joint(f"{name}_joint").qposadr[0] + 2] = -50.0
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        known["robot"], rest = (class_id("robot"), "robot"), (class_id("structure"), "structure")
+        self._inertial_axes_b = matrix_from_quat(self.model.body_iquat)
+        self._geom_axes_b = matrix_from_quat(self.model.geom_quat)
+        mine, rest = ((class_id(kind), kind) for kind in ("robot", "structure"))
         robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
         names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
-        rows = [known.get("robot" if own else name, rest) for own, name in zip(robots, names, strict=True)]
+        rows = [mine if own else known.get(name, rest) for own, name in zip(robots, names, strict=True)]
         self.class_id = np.array([number for number, _ in rows], np.uint8)
         """[ngeom] segmentation ids."""
         self.category = [category for _, category in rows]
@@ -165,10 +167,10 @@ class SceneModel:
             data.xpos[body], data.xquat[body], data.xmat[body] = pos, quat, rotation
             axes = rotation.reshape(3, 3)
             data.xipos[body] = pos + axes @ model.body_ipos[body]
-            data.ximat[body] = (axes @ matrix_from_quat(model.body_iquat[body])).ravel()
-            for g in range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body]):
-                data.geom_xpos[g] = pos + axes @ model.geom_pos[g]
-                data.geom_xmat[g] = (axes @ matrix_from_quat(model.geom_quat[g])).ravel()
+            data.ximat[body] = (axes @ self._inertial_axes_b[body]).ravel()
+            own = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+            data.geom_xpos[own] = pos + model.geom_pos[own] @ axes.T
+            data.geom_xmat[own] = (axes @ self._geom_axes_b[own]).reshape(-1, 9)
 
 
 def cast(
