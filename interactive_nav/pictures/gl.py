@@ -39,8 +39,14 @@ class GlPainter:
             sky: colour where nothing is hit; None: the model's.
 
         Raises:
-            UserError: no GL library starts here.
+            UserError: no GL library starts here, or the buffer is smaller than the pictures.
         """
+        buffer = model.vis.global_
+        if width > buffer.offwidth or height > buffer.offheight:
+            raise UserError(
+                f"engine 'gl' got pictures of {width} x {height} pixels, expected at most {buffer.offwidth} x "
+                f"{buffer.offheight}; ask for smaller ones, or for engine=rays"
+            )
         self._model, self._size, self._sky = model, (height, width), sky
         try:
             with warnings.catch_warnings():

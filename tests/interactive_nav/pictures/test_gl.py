@@ -49,3 +49,9 @@ def test_without_a_gl_it_says_what_to_install(monkeypatch):
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with pytest.raises(UserError, match=r"no library.*here.*install libegl1 and libgl1-mesa-dri"):
         GlPainter(model, 64, 48)
+
+
+def test_pictures_larger_than_the_buffer_are_refused():
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with pytest.raises(UserError, match=r"got pictures of 641 x 480 pixels, expected at most 640 x 480"):
+        GlPainter(model, 641, 480)
