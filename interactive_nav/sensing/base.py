@@ -53,22 +53,16 @@ class Lens:
     @property
     def columns(self) -> np.ndarray:
         """[width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
-        return self._offsets[0].astype(np.float32)
+        return ((np.arange(self.width) + 0.5 - self.width / 2) * self.pixel).astype(np.float32)
 
     @property
     def rows(self) -> np.ndarray:
         """[height] f32: upward offset at depth 1, top to bottom."""
-        return self._offsets[1].astype(np.float32)
-
-    @property
-    def _offsets(self) -> tuple[np.ndarray, np.ndarray]:
-        """`columns` and `rows` in full precision."""
-        across, down = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
-        return (across - self.width / 2) * self.pixel, (self.height / 2 - down) * self.pixel
+        return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
 
     def rays(self, pose: CameraPose) -> np.ndarray:
         """[height, width, 3] of the pixels of one camera, world frame; along its axis their length is 1."""
-        right, up = np.meshgrid(*self._offsets)
+        right, up = np.meshgrid(self.columns.astype(float), self.rows.astype(float))
         return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
 
 
