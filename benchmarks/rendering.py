@@ -54,16 +54,17 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
     if stream == "rgb_textured":
         if renderer_name != "warp":
             raise Skip("textures are drawn by warp only")
-        from interactive_nav.pictures.visual import VISUAL_GROUP, build_visual
+        from interactive_nav.pictures.scene_model import SCENE, SceneModel
         from interactive_nav.sensing.warp import WarpColour
 
-        visual = build_visual(env.world, 0)
-        data = visual.pose(np.asarray(qpos[0]))
+        visual = SceneModel(env.robot, env.scenes[0], env.world.small_objects)
+        visual.pose(env.world, 0, np.asarray(qpos[0]))
+        data = visual.data
         n = len(scene)
         position = jnp.broadcast_to(jnp.asarray(data.geom_xpos, jnp.float32), (n, visual.model.ngeom, 3))
         matrix = jnp.asarray(data.geom_xmat.reshape(-1, 3, 3), jnp.float32)
         matrix = jnp.broadcast_to(matrix, (n, visual.model.ngeom, 3, 3))
-        painter = WarpColour(visual.model, lens, n, [VISUAL_GROUP])
+        painter = WarpColour(visual.model, lens, n, list(SCENE))
         return lambda angle: painter.draw(position, matrix, _turned(camera, angle))
     renderer = make_renderer(sensors.boxes, lens, renderer_name, env.backend)
 

@@ -265,11 +265,6 @@ class NavConfig(Settings):
     """What the robot perceives."""
 
 
-def original_code(**settings: Any) -> NavConfig:
-    """All values of the original's code at once (`ORIGINAL_CODE`), and settings by name over them."""
-    return make_config(variant="code", **settings)
-
-
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
     """A `NavConfig` from settings by name.
 

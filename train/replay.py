@@ -26,11 +26,6 @@ from train.scoring.policies import YARDSTICKS
 from train.scoring.rollout import episode_keys
 
 
-def replay_path(run: Path, policy: str, episode: int) -> Path:
-    """Where a run keeps a replay."""
-    return run / "replays" / f"{policy}-episode{episode}.npz"
-
-
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.replay", description="Records episodes step by step.")
@@ -72,7 +67,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                         episode,
                         lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
                     )
-                path = replay_path(folder.path, name, episode)
+                path = replay.replay_path(folder.path, name, episode)
                 replay.save(played, path)
                 score = played.metrics["ins_0.5"]
                 console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)

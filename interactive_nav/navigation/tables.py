@@ -199,19 +199,7 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
     """
     with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
         places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
-    layout, slots = world.layout, world.layout.num_slots
-    com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
-    hinge = {
-        k: np.zeros((len(world.scenes), slots, n)) for k, n in (("pos", 3), ("quat", 4), ("axis", 3), ("anchor", 3))
-    }
-    hinge["quat"][..., 0] = 1.0
-    for s, model in enumerate(world.models):
-        for k in range(slots):
-            if layout.slot_kind[k] == "hinge":
-                body = layout.slot_body[k]
-                joint = model.body_jntadr[body]
-                hinge["pos"][s, k], hinge["quat"][s, k] = model.body_pos[body], model.body_quat[body]
-                hinge["axis"][s, k], hinge["anchor"][s, k] = model.jnt_axis[joint], model.jnt_pos[joint]
+    com = np.stack([m.body_ipos[world.layout.slot_body] for m in world.models])
     mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.mass_kg], 1)
 
     def f32(value) -> jnp.ndarray:
@@ -224,10 +212,6 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         rest_qpos=f32(world.rest_qpos),
         mass_kg=f32(mass),
         com_m=f32(com),
-        hinge_pos_w=f32(hinge["pos"]),
-        hinge_quat_w=f32(hinge["quat"]),
-        hinge_axis=f32(hinge["axis"]),
-        hinge_anchor_m=f32(hinge["anchor"]),
         **navigation_tables([p[0] for p in places]),
         start_xy_w=f32(_pad([p[1] for p in places], 1)),
         num_starts=i32([len(p[1]) for p in places]),

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.sensing.base import CameraPose, Lens
+from interactive_nav.sensing.base import SKY_COLOUR, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate
 from scenes_mjcf.categories import CLASS_COLOURS
 
-FLOOR_COLOUR, BACKGROUND_COLOUR = (0.56, 0.50, 0.43), (0.93, 0.95, 0.97)
-PALETTE = np.array([*CLASS_COLOURS, FLOOR_COLOUR, BACKGROUND_COLOUR], np.float32)
+FLOOR_COLOUR = (0.56, 0.50, 0.43)
+PALETTE = np.array([*CLASS_COLOURS, FLOOR_COLOUR, SKY_COLOUR], np.float32)
 """Colours by class id, then the floor's and the background's."""
 FLOOR, BACKGROUND = len(CLASS_COLOURS), len(CLASS_COLOURS) + 1
 _LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])

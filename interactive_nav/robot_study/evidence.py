@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 
 from interactive_nav.config import NavConfig
+from interactive_nav.metrics import GRAVITY
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robot_study.hall import GRAVITY_M_S2, LOADS, box, hall
+from interactive_nav.robot_study.hall import LOADS, box, hall
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec
@@ -83,7 +84,7 @@ def push_limit_n(robot: RobotSpec, world: World) -> float:
         geom = next(g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 3)
         torque += model.jnt_actfrcrange[joint, 1] / model.geom_size[geom, 0]
         grip = max(grip, float(model.geom_friction[geom, 0]))
-    return min(torque, grip * world.robot_mass_kg * GRAVITY_M_S2)
+    return min(torque, grip * world.robot_mass_kg * GRAVITY)
 
 
 @dataclasses.dataclass(frozen=True)

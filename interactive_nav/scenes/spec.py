@@ -13,7 +13,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors
 from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import ConvertedObject
-from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.objects import SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Movable, Scene
 
 PARKING_W = (200.0, 200.0)
@@ -193,17 +193,7 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, coll
         return
     body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
     body.add_freejoint(name=f"{name}_joint")
-    volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
-    for i, box in enumerate(obj.boxes):
-        body.add_geom(
-            name=f"{name}_box_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=box.centre_m,
-            size=box.half_m,
-            density=obj.mass_kg / volume,
-            friction=[obj.friction, 0.005, 0.0001],
-            group=3,
-        )
+    add_boxes(body, obj, name)
     _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
 
 
@@ -277,8 +267,7 @@ def build_spec(
     """The padded spec of one scene, and the movable slots as (body name, kind)."""
     spec = _empty_spec(robot, config)
     slots: list[tuple[str, str]] = []
-    for i, obj in enumerate(small):
-        name = f"{obj.category}_small_{i}"
+    for name, obj in zip(body_names(small), small, strict=True):
         _add_small(spec, name, obj, len(slots), config.physics.collision)
         slots.append((name, "small"))
     lists = [sorted_movables(s) for s in scenes]

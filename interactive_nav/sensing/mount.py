@@ -13,7 +13,7 @@ import numpy as np
 
 from interactive_nav.robots.spec import Camera
 from interactive_nav.sensing.base import CameraPose, look_along
-from interactive_nav.sensing.boxes import compose, rotate
+from interactive_nav.sensing.boxes import compose, rotate, swing
 from interactive_nav_common.rotations import matrix_from_quat
 
 
@@ -52,10 +52,8 @@ class Mount:
                 if slides:
                     pos = pos + rotate(axes, axis) * value[..., None]
                     continue
-                half = 0.5 * value[..., None]
-                turn = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
-                anchor = jnp.asarray(anchor, qpos.dtype)
-                pos = pos + rotate(axes, anchor - rotate(turn, anchor))
+                arm, turn = swing(axis, jnp.asarray(anchor, qpos.dtype), value)
+                pos = pos + rotate(axes, arm)
                 axes = compose(axes, turn)
         where = pos + rotate(axes, jnp.asarray(self.pos_b, qpos.dtype))
         return look_along(where, rotate(axes, jnp.asarray(self.forward_b, qpos.dtype)))

@@ -23,6 +23,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import parking_spot
 from interactive_nav.scenes.world import build_world
+from interactive_nav.sensing.boxes import body_poses, rotate
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.episode_scores import episode_scores, score_mass_kg
@@ -277,24 +278,8 @@ class InteractiveNav(Env):
 
     def _object_positions(self, scene: jax.Array, physics: PhysicsState) -> jax.Array:
         """(M, 3) centres of mass in the world frame."""
-        layout, tables = self.world.layout, self.tables
-        com = tables.com_m[scene]
-        out = jnp.zeros((layout.num_slots, 3))
-        hinged = np.asarray([kind == "hinge" for kind in layout.slot_kind], bool)
-        free = np.flatnonzero(~hinged)
-        if len(free):
-            pose = physics.qpos[layout.slot_qpos[free][:, None] + np.arange(7)]
-            rotated = jnp.einsum("mij,mj->mi", matrix_from_quat(pose[:, 3:]), com[free])
-            out = out.at[free].set(pose[:, :3] + rotated)
-        swing = np.flatnonzero(hinged)
-        if len(swing):
-            angle = physics.qpos[layout.slot_qpos[swing]]
-            axis, anchor = tables.hinge_axis[scene, swing], tables.hinge_anchor_m[scene, swing]
-            quat = jnp.concatenate([jnp.cos(angle / 2)[:, None], jnp.sin(angle / 2)[:, None] * axis], -1)
-            arm = jnp.einsum("mij,mj->mi", matrix_from_quat(quat), com[swing] - anchor) + anchor
-            rest = matrix_from_quat(tables.hinge_quat_w[scene, swing])
-            out = out.at[swing].set(tables.hinge_pos_w[scene, swing] + jnp.einsum("mij,mj->mi", rest, arm))
-        return out
+        pos_w, axes_w = body_poses(self.sensors.boxes, scene, physics.qpos)
+        return pos_w[:-1] + rotate(axes_w[:-1], self.tables.com_m[scene])
 
     def _touches(self, scene: jax.Array, signals: StepSignals) -> jax.Array:
         occupied = self.tables.mass_kg[scene, 1:] > 0

@@ -85,7 +85,7 @@ def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes):
     observed = set(np.unique(env.sensors.boxes.class_id[0]))
     assert seen == observed | {1} and {6, 8, 4 if classes == 4 else 11} <= seen
     view = SceneView(get_robot("turtlebot"), world.scenes[0], pick(6), classes)
-    assert set(np.unique(view._class)) == seen
+    assert set(np.unique(view.class_id)) == seen
     assert CLASSES[8] == "basket" and CLASSES[7] == "pot" and CLASSES[10] == "shoe"
     np.testing.assert_allclose(PALETTE[: len(CLASS_COLOURS)], CLASS_COLOURS, atol=1e-6)
 

@@ -368,7 +368,7 @@ def test_everything_has_a_name_and_only_primitives_collide(name):
 
 
 def test_pictures_need_no_display():
-    image = picture(get_robot("jackrabbot2"), renderer="matplotlib")
+    image = picture(get_robot("jackrabbot2"), renderer="rays")
     assert image.shape == (480, 480, 3) and image.dtype == np.uint8
     ink = (image < 200).any(-1)
     assert 0.05 < ink.mean() < 0.7  # a robot, on a light ground

@@ -34,7 +34,11 @@ def test_slots_masses_and_names(world):
     )
     np.testing.assert_allclose(world.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
     assert world.robot_mass_kg == pytest.approx(2.673)
-    assert world.settle_m.max() < 0.01
+    for model, rest in zip(world.models, world.rest_qpos, strict=True):
+        furniture = [
+            at for kind, at in zip(world.layout.slot_kind, world.layout.slot_qpos, strict=True) if kind == "free"
+        ]
+        assert max(np.abs(rest[at : at + 3] - model.qpos0[at : at + 3]).max() for at in furniture) < 0.01
 
 
 def test_models_of_different_scenes_have_one_structure(world):
