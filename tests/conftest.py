@@ -10,6 +10,8 @@ from pathlib import Path
 
 # Before JAX: tests compile much and compute little.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_llvm_disable_expensive_passes=true".strip()
+# An array that silently gains an axis is an error, here and in the programs that tests start.
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 
 import pytest
 from filelock import FileLock

@@ -130,7 +130,7 @@ def check_distances(world: World, tables: SceneTables, config: NavConfig) -> Non
         starts = tables.start_xy_w[scene]
         field = goal_field(tables, scene, goal)
         way_m = jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(starts)
-        far = jnp.linalg.norm(starts - goal, axis=-1) >= config.min_goal_distance_m - slack_m
+        far = jnp.linalg.norm(starts - goal[None], axis=-1) >= config.min_goal_distance_m - slack_m
         fits = far & (way_m <= config.max_goal_distance_m + slack_m)
         return (fits & (jnp.arange(len(starts)) < tables.num_starts[scene])).any()
 

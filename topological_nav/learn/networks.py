@@ -143,7 +143,7 @@ def vicreg_loss(a: jax.Array, b: jax.Array) -> jax.Array:
     invariance = jnp.square(a - b).mean()
     spread, shared = jnp.float32(0.0), jnp.float32(0.0)
     for z in (a, b):
-        z = z - z.mean(0)
+        z = z - z.mean(0, keepdims=True)
         spread += nn.relu(1.0 - jnp.sqrt(z.var(0, ddof=1) + 1e-4)).mean() / 2
         covariance = z.T @ z / (n - 1)
         shared += (jnp.square(covariance).sum() - jnp.square(jnp.diag(covariance)).sum()) / d
