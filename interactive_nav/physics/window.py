@@ -205,7 +205,7 @@ class Window:
         ]
         for group, index in zip(self.groups, chosen, strict=True):
             hinge = outer.slot_kind[group.slots[0]] == "hinge"
-            q, v = np.arange(1 if hinge else 7), np.arange(1 if hinge else 6)
+            q, v = np.arange(1 if hinge else 7)[None], np.arange(1 if hinge else 6)[None]
             mine = slice(group.first, group.first + group.width)
             found.append(
                 (
