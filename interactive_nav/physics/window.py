@@ -87,11 +87,6 @@ class Window:
         xpos, xmat = _static_poses(self.model)
         self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
 
-    @property
-    def complete(self) -> bool:
-        """Whether everything is in the window."""
-        return sum(g.width for g in self.groups) == self.world.layout.num_slots
-
     def _group(self, own: np.ndarray, width: int, first: int, boxes: int) -> _Group:
         world, layout = self.world, self.world.layout
         bodies = layout.slot_body[own]
