@@ -26,12 +26,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 import interactive_nav
-from interactive_nav.interop.gym_steps import STEPS, reset_all, reset_where
+from interactive_nav.interop.gym_steps import STEPS, reset_where
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.views import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
-from interactive_nav.task.wrappers import scene_of_slot
+from interactive_nav.task.wrappers import reset_all, scene_of_slot
 from interactive_nav_common.errors import ConfigError
 
 ARRAYS = ("numpy", "jax", "torch")

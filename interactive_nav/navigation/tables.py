@@ -128,7 +128,7 @@ def check_distances(world: World, tables: SceneTables, rules: TaskRules) -> None
         starts = tables.start_xy_w[scene]
         field = goal_field(tables, scene, goal)
         way_m = jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(starts)
-        far = jnp.linalg.norm(starts - goal, axis=-1) >= rules.min_goal_distance_m - slack_m
+        far = jnp.linalg.norm(starts - goal[None], axis=-1) >= rules.min_goal_distance_m - slack_m
         fits = far & (way_m <= rules.max_goal_distance_m + slack_m)
         return (fits & (jnp.arange(len(starts)) < tables.num_starts[scene])).any()
 

@@ -159,7 +159,7 @@ class Window:
             else:
                 centre = state.qpos[layout.slot_qpos[group.slots][:, None] + np.arange(2)]
                 speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots][:, None] + np.arange(6)]).max(-1)
-            gap = jnp.linalg.norm(centre - robot, axis=-1) - self._radius_m[scene, group.slots]
+            gap = jnp.linalg.norm(centre - robot[None], axis=-1) - self._radius_m[scene, group.slots]
             gap = jnp.where(self._occupied[scene, group.slots], gap, _FAR_M)
             _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * (speed > _MOVING_M_S)), group.width)
             left_out = jnp.ones(len(group.slots), bool).at[index].set(False)
@@ -170,7 +170,7 @@ class Window:
         if self.n_walls == count:
             return tuple(chosen), jnp.arange(count), missed.astype(jnp.int32)
         # Planar distance from the robot to each wall box.
-        offset = jnp.einsum("wi,wij->wj", robot - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
+        offset = jnp.einsum("wi,wij->wj", robot[None] - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
         outside = jnp.maximum(jnp.abs(offset) - walls["geom_size"][scene, :, :2], 0.0)
         gap = jnp.where(walls["used"][scene] > 0, jnp.linalg.norm(outside, axis=-1), _FAR_M)
         _, index = jax.lax.top_k(-gap, self.n_walls)
@@ -201,7 +201,7 @@ class Window:
         ]
         for group, index in zip(self.groups, chosen, strict=True):
             hinge = outer.slot_kind[group.slots[0]] == "hinge"
-            q, v = np.arange(1 if hinge else 7), np.arange(1 if hinge else 6)
+            q, v = np.arange(1 if hinge else 7)[None], np.arange(1 if hinge else 6)[None]
             mine = slice(group.first, group.first + group.width)
             found.append(
                 (

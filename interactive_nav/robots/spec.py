@@ -146,13 +146,17 @@ class RobotSpec:
 
     def command(self, action, xp=np):
         """Maps actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
-        low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
+        low, high = self._command_range(action, xp)
         return low + 0.5 * (xp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
 
     def action(self, command, xp=np):
         """The inverse of `command`: actions [..., A], clipped to [-1, 1]."""
-        low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
+        low, high = self._command_range(command, xp)
         return xp.clip(2.0 * (xp.asarray(command) - low) / (high - low) - 1.0, -1.0, 1.0)
+
+    def _command_range(self, values, xp):
+        """`action_low` and `action_high`, each in the shape of actions or commands [..., A]."""
+        return (xp.broadcast_to(xp.asarray(end), xp.shape(values)) for end in (self.action_low, self.action_high))
 
     def controls(self, command, state: RobotState, xp=np):
         """Actuator controls [..., nu] for commands [..., A]."""

@@ -79,7 +79,7 @@ def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
     forward = forward_w / xp.linalg.norm(forward_w, axis=-1, keepdims=True)
     flat = xp.stack([forward[..., 1], -forward[..., 0], xp.zeros_like(forward[..., 0])], -1)
     length = xp.linalg.norm(flat, axis=-1, keepdims=True)
-    aside = xp.asarray([0.0, -1.0, 0.0], forward.dtype)
+    aside = xp.broadcast_to(xp.asarray([0.0, -1.0, 0.0], forward.dtype), flat.shape)
     right = xp.where(length > 1e-6, flat / xp.where(length > 1e-6, length, 1.0), aside)
     up = xp.cross(right, forward)
     return CameraPose(pos_w, xp.stack([forward, right, up], -1))

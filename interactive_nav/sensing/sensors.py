@@ -163,7 +163,7 @@ class Sensors:
     def _scan(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array, rng: jax.Array) -> jax.Array:
         config = self._config
         origin = nav.robot_pos_w + rotate(rotation, jnp.asarray(config.lidar_pos_m, jnp.float32))
-        beams = rotate(rotation, jnp.asarray(self._beams_b))
+        beams = rotate(rotation[None], jnp.asarray(self._beams_b))
         distance = cast_fan(self.boxes, nav.scene_index, physics.qpos, origin, beams)
         scan = jnp.clip(distance / config.lidar_range_m, LIDAR_NEAR_M / config.lidar_range_m, 1.0)
         key = stream(rng, "lidar", nav.step_count)

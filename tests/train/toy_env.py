@@ -75,7 +75,7 @@ class ToyEnv(Env):
         goal_b = jnp.stack([cos * offset[0] + sin * offset[1], -sin * offset[0] + cos * offset[1]])
         distance = jnp.linalg.norm(goal_b)
         along = jnp.minimum(0.2 * jnp.arange(1, 11), distance)
-        waypoints_b = along[:, None] * goal_b / jnp.maximum(distance, 1e-6)
+        waypoints_b = along[:, None] * goal_b[None] / jnp.maximum(distance, 1e-6)
         zero = jnp.zeros(1)
         velocity = jnp.concatenate([nav.velocity[:1], zero, zero, zero, zero, nav.velocity[1:]])
         return jnp.concatenate([waypoints_b.ravel(), goal_b, zero, velocity])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from topological_nav.drives.imitation import fresh_params
-from topological_nav.drives.policy import Forward, Policy
+from topological_nav.drives.policy import Forward, Policy, standardised
 from topological_nav.errors import RunError
 from topological_nav.learn.pairs import load_pair, need_task
 from topological_nav.learn.runs import read_description, read_weights
@@ -65,8 +65,7 @@ class TrainedPolicy:
             network.network.apply(variables, images, method="embed")
             for network, variables in zip(self._networks, weights["embedders"], strict=True)
         ]
-        scale = weights["policy"]["scale"]
-        x = (jnp.concatenate(parts, -1) - scale["mean"]) / scale["deviation"]  # type: ignore[arg-type]
+        x = standardised(jnp.concatenate(parts, -1), weights["policy"]["scale"])  # type: ignore[arg-type]
         state, logits = self._policy.apply({"params": weights["policy"]["params"]}, state, x)  # type: ignore[misc]
         return state, tuple(one.argmax(-1) for one in logits)
 

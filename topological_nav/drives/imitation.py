@@ -29,7 +29,7 @@ from interactive_nav_common.files import write_text
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
 from topological_nav.drives.frames import Frames
-from topological_nav.drives.policy import Forward, Policy, policy_loss, unrolled
+from topological_nav.drives.policy import Forward, Policy, policy_loss, standardised, unrolled
 from topological_nav.drives.sequences import (
     Sequences,
     class_values,
@@ -149,7 +149,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
     tx, most = optax.adam(learning_rate), batch
 
     def loss_of(params, scale, u, batch, weights):
-        x = (u - scale["mean"]) / scale["deviation"]
+        x = standardised(u, scale)
         logits = unrolled(policy, params["policy"], x[:, :-1])
         truth = (batch["linear"], batch["angular"])
         sizes = (policy.linear_classes, policy.angular_classes)
@@ -233,7 +233,7 @@ def _judge(policy: Policy, forward: Forward) -> Callable[..., tuple[jax.Array, .
 
     @jax.jit
     def judged(params, scale, u, linear, angular):
-        x = (u - scale["mean"]) / scale["deviation"]
+        x = standardised(u, scale)
         logits = unrolled(policy, params["policy"], x[:, :-1])
         action = jnp.concatenate(
             [jax.nn.one_hot(linear, policy.linear_classes), jax.nn.one_hot(angular, policy.angular_classes)], -1

@@ -281,7 +281,8 @@ def _first_step_speed(limit: str, joint: str, mjx_jax: bool) -> float:
     model = mujoco.MjModel.from_xml_string(xml)
     if mjx_jax:
         data = mjx.make_data(model, impl="jax").replace(ctrl=jnp.array([25.0]))
-        return float(jax.jit(mjx.step)(mjx.put_model(model, impl="jax"), data).qvel[0])
+        with jax.numpy_rank_promotion("allow"):  # MJX counts on it
+            return float(jax.jit(mjx.step)(mjx.put_model(model, impl="jax"), data).qvel[0])
     data = mujoco.MjData(model)
     data.ctrl[:] = 25.0
     mujoco.mj_step(model, data)

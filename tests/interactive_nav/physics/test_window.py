@@ -46,6 +46,7 @@ def _state(world, scene, robot_xy=(0.0, 0.0)):
 @pytest.mark.parametrize("scene", [0, 1])
 def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
     window = Window(world, NavConfig.of(num_objects=2, **ALL))
+    assert sum(group.width for group in window.groups) == world.layout.num_slots
     chosen, walls, missed = window.select(jnp.asarray(scene), _state(world, scene))
     fields, model, inner, outer = window.fields(jnp.asarray(scene), chosen, walls), world.models[scene], window, world
     assert int(missed) == 0 and set(fields) == set(FIELDS)
