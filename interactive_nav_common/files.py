@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import re
 import secrets
@@ -17,22 +18,28 @@ from interactive_nav_common.locks import release, take_lock
 from interactive_nav_common.signals import signals_wait
 
 STALE_S = 1.0
-"""An unfinished folder younger than this may be one whose maker has not locked it yet."""
+"""Something unfinished younger than this may be what its maker has not locked yet."""
+PARTIAL = ".partial-"
+"""Begins the names of unfinished files."""
 
 
 @contextlib.contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside `path` of the same ending, which replaces it once the block has written it.
 
-    Each writer has its own temporary file: of two that write one path at the same time, the last one stands.
+    Each writer has its own temporary file, locked while it writes: of two that write one path at the same time, the last
+    one stands.
 
     Raises:
         FileError: it cannot be written; what stood at `path` is untouched.
     """
     path = Path(path)
-    partial = path.with_name(f".partial-{secrets.token_hex(4)}-{path.name}")
+    partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name}"), None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(partial, os.O_CREAT | os.O_RDWR, 0o666)
+        with contextlib.suppress(OSError):  # a file system without locks: what a killed writer leaves stays there
+            fcntl.flock(lock, fcntl.LOCK_EX)
         yield partial
         os.replace(partial, path)
     except OSError as error:
@@ -41,6 +48,17 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             partial.unlink()
+        release(lock)
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes unfinished files of a folder whose writers were killed; those of writers that run are locked and stay."""
+    for path in folder.glob(f"{PARTIAL}*"):
+        with contextlib.suppress(OSError, FileError):
+            lock = None if time.time() - path.stat().st_mtime < STALE_S else take_lock(path)
+            if lock is not None:
+                path.unlink()
+                release(lock)
 
 
 def write_text(path: str | Path, text: str) -> None:

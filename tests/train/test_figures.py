@@ -101,6 +101,13 @@ def test_trajectories_side_by_side_are_of_the_same_episodes(results, monkeypatch
     assert [path.stem[-8:] for path in chosen.values()] == ["0123abcd"] * 2 and sorted(chosen) == [0.0, 1.0]
 
 
+def test_what_is_unfinished_is_passed_over(results):
+    half = results / "rows" / "_paths" / ".partial-01234567-x.npz"
+    half.touch()
+    assert half not in cli.Results(results).records
+    half.unlink()
+
+
 def test_ins_over_alpha_shows_means_and_intervals_of_seeds():
     """SAC on TurtleBot at k_int = 0.1: P_eff 0.83, E_eff 0.699, seeds 0.01 apart: half width 4.3027 x 0.01 / sqrt 3."""
     figure = scores.ins_over_alpha(paper_like(), "turtlebot", "test")

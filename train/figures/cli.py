@@ -23,6 +23,7 @@ from train.figures.frontier import frontier
 from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
+from train.scoring.row_files import PATHS
 from train.scoring.statistics import run_means
 
 import matplotlib.pyplot as plt  # isort: skip
@@ -43,9 +44,10 @@ class Results:
         self.root = root
         logs = sorted([*root.rglob(METRICS), *root.rglob(PACKED_METRICS)])
         self.curves = {log.parent: lines for log in logs if (lines := read_metrics(log))}
-        records = [path for path in sorted(root.rglob("*.npz")) if "checkpoints" not in path.parts]
+        # What begins with a dot is unfinished.
+        records = [path for path in sorted(root.rglob("[!.]*.npz")) if "checkpoints" not in path.parts]
         self.records = [path for path in records if not path.parent.name.startswith("diverged-")]
-        self.tables = [p for p in sorted(root.rglob("*.parquet")) if not p.name.startswith(".")]
+        self.tables = sorted(root.rglob("[!.]*.parquet"))
         if not self.curves and not self.records and not self.tables:
             raise FileError(
                 f"{root}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
@@ -126,7 +128,7 @@ def _of_sweep(found: Results, split: str | None) -> Iterator[tuple[str, Callable
     for path in found.records:
         name, _, asked = path.stem.rpartition("-")  # the same digest: the same episodes
         r = runs.get(name)
-        if r is not None and path.parent.name == "_paths":
+        if r is not None and path.parent.name == PATHS:
             groups.setdefault((r["robot"], r["algorithm"], r["seed"], asked), {})[r["k_int"]] = path
     drawn = set()
     for key, by_k_int in sorted(groups.items()):

@@ -20,7 +20,7 @@ from train.errors import CheckpointError
 from train.runs import checkpoint
 from train.runs.policy_file import STEP
 from train.runs.run_folder import RunFolder
-from train.scoring.row_files import files_of_run, paths_beside
+from train.scoring.row_files import PATHS, files_of_run, paths_beside
 from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
@@ -86,7 +86,7 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
     # Paths, then rows, then what is no longer wanted: rows are never without paths as new as they.
     paths = [paths_beside(path) for path in new if paths_beside(path).is_file()]
     for path in paths:
-        with whole_file(out / "_paths" / path.name) as partial:
+        with whole_file(out / PATHS / path.name) as partial:
             shutil.copy2(path, partial)
     write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None)
     for path in old:
