@@ -27,8 +27,8 @@ PARTIAL = ".partial-"
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside `path` of the same ending, which replaces it once the block has written it.
 
-    Each writer has its own temporary file, locked while it writes: of two that write one path at the same time, the last
-    one stands.
+    Each writer has its own temporary file, locked while it writes: of two that write one path at the same time, the
+    last one stands.
 
     Raises:
         FileError: it cannot be written; what stood at `path` is untouched.
