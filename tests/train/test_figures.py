@@ -235,10 +235,6 @@ def test_looks_keep_apart():
     assert style.in_order({"zeta", "ddpg", "ppo", "sac"}) == ["ppo", "sac", "ddpg", "zeta"]
 
 
-def test_markdown_tables_by_hand():
-    assert tables.markdown(("a", "b"), [(1, "x")]) == "| a | b |\n| --- | --- |\n| 1 | x |\n"
-
-
 def episodes_of(policy: str, success: list[float], **more: object) -> pa.Table:
     """Rows of one policy in the same tasks."""
     count = len(success)

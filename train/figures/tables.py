@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from interactive_nav_common.rows import markdown
 from interactive_nav_common.statistics import estimate, interval
 from train.figures import style
 from train.scoring.statistics import cells, claims, learned_rows, run_means
@@ -15,12 +14,6 @@ from train.scoring.statistics import cells, claims, learned_rows, run_means
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
 NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
-
-
-def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
-    """A table."""
-    rows = [list(header), ["---"] * len(header), *([str(cell) for cell in line] for line in lines)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 
 def score_cells(rows: pa.Table) -> str:
