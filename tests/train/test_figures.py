@@ -228,10 +228,13 @@ def test_unseen_scenes_are_shown_where_there_are_any():
 
 
 def test_looks_keep_apart():
-    among = ["ppo", "td3", "a2c"]
-    assert len({style.look(style.ALGORITHMS, name, among) for name in among}) == 3
-    assert [style.fill_of(k, [0.0, 0.1, 1.0]) for k in (0.0, 0.1, 1.0)] == ["none", "left", "full"]
-    assert len({str(style.line_of(k, [0.0, 0.1, 1.0])) for k in (0.0, 0.1, 1.0)}) == 3
+    names, k_ints = ("ppo", "td3", "a2c"), (0.0, 0.1, 1.0)
+    looks = style.Looks({("fetch", name, k_int): [1] for name in names for k_int in k_ints})
+    assert len({tuple(looks.algorithm(name).values()) for name in names}) == 3 and looks.seeds == "1 seed"
+    assert [looks.fill(k_int) for k_int in k_ints] == ["none", "left", "full"]
+    assert [looks.line(k_int) for k_int in k_ints] == [":", "--", "-"]
+    alone = style.Looks({("fetch", "ppo", 0.5): []})
+    assert (alone.fill(0.5), alone.line(0.5)) == ("full", "-")
     assert style.in_order({"zeta", "ddpg", "ppo", "sac"}) == ["ppo", "sac", "ddpg", "zeta"]
 
 
