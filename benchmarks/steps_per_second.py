@@ -14,7 +14,6 @@ from __future__ import annotations
 import functools
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
 from typing import Any
@@ -31,6 +30,7 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from train import config_io
 from train.runs.run import train_run
+from train.sweep.devices import gpu_listing
 
 MODES = ("physics", "task", "observed", "simulation", "train")
 CHUNK = 20
@@ -45,11 +45,8 @@ def _make(robot: str, scenes: tuple[str, ...], backend: str, settings: str):
 
 def _gpu_memory_mib() -> float | None:
     """Memory in use on the first GPU, by everything (Warp allocates beside JAX), or None without one."""
-    command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "-i", "0"]
-    try:
-        return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0])
-    except (OSError, subprocess.CalledProcessError, ValueError, IndexError):
-        return None
+    used = gpu_listing("memory.used").split()
+    return float(used[0]) if used and used[0].isdecimal() else None
 
 
 def _peak_memory_mib() -> dict[str, float] | None:

@@ -24,6 +24,19 @@ PARTIAL = ".partial-"
 
 
 @contextlib.contextmanager
+def writing(place: object, remedy: str, what: str = "cannot be written") -> Iterator[None]:
+    """Says in one line what could not be written in the block, why, and what helps.
+
+    Raises:
+        FileError: the system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"{place}: {what} ({error.strerror or error}); {remedy}") from None
+
+
+@contextlib.contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside `path` of the same ending, which replaces it once the block has written it.
 
@@ -36,15 +49,13 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name}"), None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = os.open(partial, os.O_CREAT | os.O_RDWR, 0o666)
-        with contextlib.suppress(OSError):  # a file system without locks: what a killed writer leaves stays there
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield partial
-        os.replace(partial, path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise FileError(f"{path}: cannot be written ({reason}); make room or choose another place") from None
+        with writing(path, "make room or choose another place"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = os.open(partial, os.O_CREAT | os.O_RDWR, 0o666)
+            with contextlib.suppress(OSError):  # a file system without locks: what a killed writer leaves stays there
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            yield partial
+            os.replace(partial, path)
     finally:
         with contextlib.suppress(OSError):
             partial.unlink()
@@ -101,12 +112,10 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     if target.exists() and not target.is_dir():
         raise FileError(f"{target}: is a file, expected a folder to write; give another place")
     part = target.parent / f".{target.name}.part-{os.getpid()}-{secrets.token_hex(4)}"
-    try:
+    with writing(target, "give another place"):
         target.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
         lock = take_lock(part)
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written ({error.strerror}); give another place") from None
     try:
         yield part
     finally:
@@ -129,7 +138,7 @@ def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
     """
     placed: list[Path] = []
     moved: list[tuple[Path, Path]] = []
-    with signals_wait():
+    with signals_wait(), writing(", ".join(map(str, folders.values())), "make room or give another place"):
         try:
             for finished, target in folders.items():
                 while not _take_place(finished, target):
@@ -140,17 +149,13 @@ def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
                         target.rename(old)
                         moved.append((old, target))
                 placed.append(target)
-        except BaseException as error:
+        except BaseException:
             for target in placed:
                 shutil.rmtree(target, ignore_errors=True)
             for old, target in reversed(moved):
                 with contextlib.suppress(OSError):  # then it stays, and the next writer puts it back
                     if not _take_place(old, target):
                         shutil.rmtree(old, ignore_errors=True)
-            if isinstance(error, OSError):
-                place = ", ".join(str(target) for target in folders.values())
-                reason = error.strerror or error
-                raise FileError(f"{place}: cannot be written ({reason}); make room or give another place") from None
             raise
         for old, _ in moved:
             shutil.rmtree(old, ignore_errors=True)

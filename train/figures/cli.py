@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError, UserError
+from interactive_nav_common.errors import FileError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
@@ -179,29 +178,26 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+@reports_errors("train.figures")
 def main(argv: Sequence[str] | None = None) -> int:
     """Draws; 0 when done, 2 on a user's error."""
     arguments = parser().parse_args(argv)
     split = None if arguments.split == "all" else arguments.split
-    try:
-        if arguments.tables:
-            found = Results(Path(arguments.results))
-            if not set(found.rows.column_names) >= SWEPT or not run_means(found.rows):
-                raise FileError(
-                    f"{arguments.results}: no rows of learned runs; evaluate them first (python -m train.sweep FILE "
-                    "--only evaluate, or python -m train.evaluate RUN_DIR)"
-                )
-            print(document(found.rows, chosen_split(found.rows, split)), end="")
-            return 0
-        for name, draw in figures_of(Path(arguments.results), split):
-            path = Path(arguments.out) / f"{name}.{arguments.format}"
-            with style.applied():
-                figure = draw()
-                with whole_file(path) as partial:
-                    figure.savefig(partial, format=arguments.format)
-            plt.close(figure)
-            print(path)
-    except UserError as error:
-        print(f"train.figures: {error}", file=sys.stderr)
-        return 2
+    if arguments.tables:
+        found = Results(Path(arguments.results))
+        if not set(found.rows.column_names) >= SWEPT or not run_means(found.rows):
+            raise FileError(
+                f"{arguments.results}: no rows of learned runs; evaluate them first (python -m train.sweep FILE "
+                "--only evaluate, or python -m train.evaluate RUN_DIR)"
+            )
+        print(document(found.rows, chosen_split(found.rows, split)), end="")
+        return 0
+    for name, draw in figures_of(Path(arguments.results), split):
+        path = Path(arguments.out) / f"{name}.{arguments.format}"
+        with style.applied():
+            figure = draw()
+            with whole_file(path) as partial:
+                figure.savefig(partial, format=arguments.format)
+        plt.close(figure)
+        print(path)
     return 0
