@@ -87,10 +87,9 @@ def reference(seed: int, xy: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, 
     return np.ma.filled(want, np.inf), ~np.ma.getmaskarray(want) & even.filled(False)
 
 
-def plan(seed: int, side_m: float = 13.0, resolution_m: float = 0.05) -> np.ndarray:
-    """[260, 260] bool: a square building of 4 x 4 rooms."""
-    rng = np.random.default_rng(seed)
-    n = int(side_m / resolution_m)
+def plan(seed: int) -> np.ndarray:
+    """[260, 260] bool at 0.05 m: a square building of 4 x 4 rooms."""
+    rng, n = np.random.default_rng(seed), 260
     free = np.ones((n, n), bool)
     free[:4] = free[-4:] = free[:, :4] = free[:, -4:] = False
     for k in (1, 2, 3):

@@ -8,7 +8,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from train.sweep.folder import (
     RunState,
@@ -21,6 +21,7 @@ from train.sweep.folder import (
 from train.sweep.jobs import LOCKED, LOST, Job
 from train.sweep.local import Launcher
 from train.sweep.spec import RunSpec
+from train.sweep.table import SweepDisplay
 
 STAGES = ("train", "evaluate")
 POLL_S = 0.5
@@ -71,18 +72,6 @@ class Outcome:
         return 1 if any(s.state != "running" for s in left) else 0
 
 
-class Display(Protocol):
-    """What a person sees."""
-
-    def event(self, text: str, style: str = "") -> None:
-        """Something happened."""
-        ...
-
-    def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:
-        """How far the runs are; must be cheap to call often."""
-        ...
-
-
 class Scheduler:
     """Decides what runs next.
 
@@ -101,7 +90,7 @@ class Scheduler:
         self,
         folder: SweepFolder,
         launcher: Launcher,
-        display: Display,
+        display: SweepDisplay,
         stages: Sequence[str] = STAGES,
         redo: bool = False,
         unfinished: bool = False,
