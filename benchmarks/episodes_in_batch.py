@@ -23,6 +23,7 @@ from typing import Any
 import jax
 
 from interactive_nav_common.config import overridden
+from interactive_nav_common.rows import markdown
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, load_networks, local_policy
@@ -120,14 +121,13 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
     return dict(clock.parts), played, images, time.perf_counter() - began
 
 
-def table(parts: dict[str, Spent]) -> list[str]:
-    """Lines of Markdown, the dearest part first."""
-    lines = ["| Part | Calls | Seconds | XLA compiling | Longest call |", "|---|---|---|---|---|"]
-    for name, spent in sorted(parts.items(), key=lambda item: -item[1].seconds):
-        lines.append(
-            f"| {name} | {spent.calls:,} | {spent.seconds:.1f} | {spent.compiling:.1f} | {spent.longest:.2f} |"
-        )
-    return lines
+def table(parts: dict[str, Spent]) -> str:
+    """Markdown, the dearest part first."""
+    lines = [
+        (name, f"{spent.calls:,}", f"{spent.seconds:.1f}", f"{spent.compiling:.1f}", f"{spent.longest:.2f}")
+        for name, spent in sorted(parts.items(), key=lambda item: -item[1].seconds)
+    ]
+    return markdown(("Part", "Calls", "Seconds", "XLA compiling", "Longest call"), lines)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -162,7 +162,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             print(f"{over} over, simulated {simulated_s:.0f} s of {most:.0f} s at most", file=sys.stderr, flush=True)
 
     parts, played, images, seconds = measure(contest, tell)
-    print("\n".join(table(parts)))
+    print(table(parts), end="")
     simulated_h, device = played.duration_s.sum() / 3600, jax.devices()[0].device_kind
     print(
         f"{len(played.success)} episodes, {simulated_h:.2f} h simulated in {seconds:.0f} s on {device}; "

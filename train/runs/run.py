@@ -23,6 +23,7 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
+from interactive_nav_common.metrics_file import mean_over_episodes
 from interactive_nav_common.locks import locked
 from interactive_nav_common.signals import stop_signals
 from train.runs import checkpoint, tracking
@@ -35,7 +36,6 @@ from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import RunFolder, claim
 from interactive_nav_common.config import flatten, replace
-from interactive_nav_common.metrics_file import read_metrics
 from interactive_nav_common.versions import versions
 
 
@@ -164,11 +164,11 @@ class FolderCallbacks:
         run = self._config.run
         fair = self._began_together + num_envs(self._config) * self._config.env.rules.episode_steps
         since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
-        lines = [line for line in read_metrics(self._folder.metrics) if line["env_steps"] > since]
+        lines = [line for line in self._folder.read_metrics() if line["env_steps"] > since]
         meta = CheckpointMeta(
             env_steps=snapshot.env_steps,
             wall_s=self._wall_s(),
-            score=mean_score(lines, run.best_metric),
+            score=mean_over_episodes(lines, f"episode/{run.best_metric}"),
             began_together=self._began_together,
             algorithm=self._config.algorithm,
             robot=self._config.env.robot,
@@ -194,13 +194,6 @@ class FolderCallbacks:
             self._events.close()
         if self._tracker:
             self._tracker.close()
-
-
-def mean_score(lines: list[dict[str, Any]], name: str) -> float | None:
-    """Mean of a score over the episodes of some lines of metrics; None where none ended."""
-    scored = [(line[f"episode/{name}"], line["episodes"]) for line in lines if f"episode/{name}" in line]
-    episodes = sum(count for _, count in scored)
-    return sum(score * count for score, count in scored) / episodes if episodes else None
 
 
 def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
@@ -299,13 +292,13 @@ def num_envs(config: TrainConfig) -> int:
 
 def last_metrics(folder: RunFolder) -> dict[str, Any]:
     """The last logged line, without its step; empty if there is none."""
-    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    lines = folder.read_metrics()
     return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
 
 
 def failures(folder: RunFolder) -> dict[str, float]:
     """Steps (episodes for `nonfinite`) in which physics failed, over all logged episodes; those that are not 0."""
-    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    lines = folder.read_metrics()
     totals = {
         name: sum(line.get(f"episode/{name}", 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES
     }

@@ -83,11 +83,6 @@ def make_follower(env: Any) -> PolicyFn:
     return functools.partial(waypoint_follower, env.robot, waypoint)
 
 
-def make_learned(act: Any) -> PolicyFn:
-    """A Brax policy (observation, key) -> (action, extras) without its extras."""
-    return lambda observation, key: act(observation, key)[0]
-
-
 YARDSTICKS: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
 PLANNERS = ("avoider", "namo:W")
 """Planners on the host; W is the weight of pushing against detour, 0 to 1."""

@@ -29,6 +29,8 @@ from train.config import TrainConfig, validate
 SWEEP_DIR = config_io.PRESET_DIR / "sweeps"
 BARE = ("algorithm", "env.robot")
 """Axes whose values name themselves in a run's name."""
+FREE = {"grid": Mapping, "settings": Mapping, "overrides": list, "skip": list}
+"""Keys of a sweep's file whose values name settings of the runs."""
 PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
 
@@ -156,31 +158,16 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    _mapping(plain, where, "the file")
-    fields = {field.name: field for field in dataclasses.fields(SweepConfig)}
-    made: dict[str, Any] = {}
-    for key, value in plain.items():
-        if key not in fields:
-            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), list(fields))}")
-        if key in ("evaluate", "launch"):
-            base = EvaluateConfig() if key == "evaluate" else LaunchConfig()
-            made[key] = overlay(base, {} if value is None else value, where, f"{key}.")
-        elif key in ("grid", "settings"):
-            made[key] = _mapping({} if value is None else value, where, key)
-        elif key in ("overrides", "skip"):
-            if not isinstance([] if value is None else value, list):
-                raise ConfigError(f"{where}: {key}: got {value!r}, expected a list")
-            made[key] = value or []
-        elif not isinstance(value, str):
-            raise ConfigError(f"{where}: {key}: got {value!r} ({type(value).__name__}), expected text")
-        else:
-            made[key] = value
-    made["name"] = made.get("name") or default_name
-    if made["name"] != Path(made["name"]).name or made["name"] == "..":
-        raise ConfigError(f"{where}: name is {made['name']!r}, expected one folder name (out_dir says where it lies)")
-    if not made.get("preset"):
+    _expected(Mapping, plain, where, "the file")
+    given = {key: value for key, value in plain.items() if value is not None}
+    free = {key: _expected(kind, given.pop(key), where, key) for key, kind in FREE.items() if key in given}
+    config = overlay(SweepConfig(**free), given, where)
+    config = dataclasses.replace(config, name=config.name or default_name)
+    if config.name != Path(config.name).name or config.name == "..":
+        raise ConfigError(f"{where}: name is {config.name!r}, expected one folder name (out_dir says where it lies)")
+    if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
-    return SweepConfig(**made)
+    return config
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
@@ -265,9 +252,9 @@ def help_text() -> str:
     return settings_help(SweepConfig(), equals=": ")
 
 
-def _mapping(value: Any, where: str, what: str) -> Any:
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}: {what}: got {value!r} ({type(value).__name__}), expected a mapping of settings")
+def _expected(kind: type, value: Any, where: str, what: str) -> Any:
+    if not isinstance(value, kind):
+        raise ConfigError(f"{where}: {what}: got {value!r}, expected {'a list' if kind is list else 'a mapping'}")
     return value
 
 
@@ -293,18 +280,18 @@ def _nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
     known = ("where", "settings", "launch")
-    _mapping(entry, where, "the entry")
+    _expected(Mapping, entry, where, "the entry")
     for key in entry:
         if key not in known:
             raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), known)}")
-    made = {key: _mapping(entry.get(key) or {}, where, key) for key in known}
+    made = {key: _expected(Mapping, entry.get(key) or {}, where, key) for key in known}
     return {**made, "where": _where(made["where"], config, where)}
 
 
 def _where(entry: Any, config: SweepConfig, where: str) -> dict[str, list[Any]]:
     """Axis -> the values that match."""
     wanted = {}
-    for axis, value in _mapping(entry, where, "where").items():
+    for axis, value in _expected(Mapping, entry, where, "where").items():
         if axis not in config.grid:
             near = nearest(str(axis), list(config.grid))
             raise ConfigError(f"{where}: {axis!r} is no axis of the grid{near}; axes: {', '.join(config.grid)}")
