@@ -24,7 +24,6 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import to_dict
 from topological_nav.adapt.adaptation import (
     PASSAGES_STREAM,
-    Asked,
     Tell,
     adapted_about,
     digest_of,
@@ -36,7 +35,7 @@ from topological_nav.config import PITCHES, DataConfig
 from topological_nav.data.dataset import headings, load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
-from topological_nav.errors import DatasetError, MapError
+from topological_nav.errors import Asked, DatasetError, MapError, go_on
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
 from topological_nav.learn.localise import localisation_scores
 from topological_nav.learn.pairs import need_task
@@ -64,8 +63,8 @@ def passage_configurations(
     out: Path,
     config: AdaptConfig,
     tell: Tell = lambda _: None,
-    should_stop: Asked = lambda: False,
-) -> dict[str, Any] | None:
+    should_stop: Asked = go_on,
+) -> dict[str, Any]:
     """Scores a passage detector in another domain, learned from the source or not, fine-tuned or not.
 
     Args:
@@ -77,10 +76,11 @@ def passage_configurations(
         should_stop: asked after every epoch.
 
     Returns:
-        The content of results.json; None where it was stopped before the end.
+        The content of results.json.
 
     Raises:
         DatasetError, RunError: something cannot be used.
+        Stopped: it was asked for before the end.
     """
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
@@ -102,8 +102,6 @@ def passage_configurations(
                     out, name, learner, lambda state, _, key: epoch(state, images, labels, key),
                     config.fine_tune_epochs, epoch_keys(config), tell, should_stop, f"checkpoint-{name}.msgpack",
                 )  # fmt: skip
-                if learner is None:
-                    return None
             variables = {"params": learner.params, "batch_stats": learner.batch_stats}
             tuned = Trained(network, variables, trained.about)
             results[name] = _scores(tuned, tested)

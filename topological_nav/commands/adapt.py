@@ -10,10 +10,9 @@ from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.signals import stop_signals
 from topological_nav.adapt.config import AdaptConfig
-from topological_nav.commands.progress import Stopped, say
+from topological_nav.commands.progress import asked_by, say, tell_line
 from topological_nav.config import PITCHES
-
-Asked = Callable[[], bool]
+from topological_nav.errors import Asked
 
 
 def add_to(command: Callable[[str, str, object], argparse.ArgumentParser], dataset: Path, runs: Path) -> None:
@@ -61,8 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
     if chosen.said:
         say(chosen.said)
     with stop_signals() as stops:
-        if not _RUNS[arguments.what](arguments, config, lambda: bool(stops)):
-            raise Stopped(stops[0])
+        _RUNS[arguments.what](arguments, config, asked_by(stops))
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:
@@ -82,7 +80,7 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
         refuse_unused(arguments, "--data", f"{why} with --target")
 
 
-def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
+def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     from interactive_nav_common.metrics_file import read_metrics
     from topological_nav.adapt.adaptation import adapt_features, target_rooms
     from topological_nav.data.dataset import load_rooms
@@ -90,9 +88,7 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
     from topological_nav.figures.transfer_figures import features_figure
 
     out = arguments.out or arguments.adapted / "features"
-    results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, _tell, should_stop)
-    if results is None:
-        return False
+    results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, tell_line, should_stop)
     rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
     level = PITCHES.index("level")
     figure = features_figure(rendered[:, level, 0], seen[:, level, 0], read_metrics(out / "metrics.jsonl"), results)
@@ -104,10 +100,9 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
             f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
         )
     print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
-    return True
 
 
-def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
+def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     from interactive_nav_common.metrics_file import read_metrics
     from topological_nav.adapt.transfer import CONFIGURATIONS, passage_configurations
     from topological_nav.data.dataset import load_passages
@@ -116,9 +111,7 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
     from topological_nav.figures.transfer_figures import passages_figure
 
     out = arguments.out or arguments.adapted / "passages"
-    results = passage_configurations(arguments.detector, arguments.target, out, config, _tell, should_stop)
-    if results is None:
-        return False
+    results = passage_configurations(arguments.detector, arguments.target, out, config, tell_line, should_stop)
     images = load_passages(arguments.target).images
     seen = as_seen(images, preset(config.domain))
     save(passages_figure(images, seen, read_metrics(out / "metrics.jsonl"), results), out / "configurations.png")
@@ -127,10 +120,9 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
         how = f"{start}{', fine-tuned' if tunes else ''}"
         print(f"{name}  {how:<33}accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
     print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
-    return True
 
 
-def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
+def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     del should_stop
     from topological_nav.adapt.transfer import collected_map
     from topological_nav.figures.maps import map_figure, save
@@ -144,11 +136,6 @@ def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: 
     for name, value in built.scores.items():
         print(f"{name}: {value}")
     print(f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges; drawn in {out.with_suffix('.png')}")
-    return True
-
-
-def _tell(line: str) -> None:
-    print(line, flush=True)
 
 
 _NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}

@@ -17,8 +17,8 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
-from topological_nav.data.dataset import lens_of
 from topological_nav.data.domains import as_seen_from, preset
+from topological_nav.data.folders import lens_of
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.errors import RunError
 from topological_nav.evaluate.contenders import Contender, NavigatorPlayer, expert, learned

@@ -19,7 +19,8 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
-from topological_nav.data.dataset import headings, lens_of
+from topological_nav.data.dataset import headings
+from topological_nav.data.folders import lens_of
 from topological_nav.errors import SpaceError
 from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained

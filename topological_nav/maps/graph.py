@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_arrays
 from topological_nav.errors import MapError, readable
 from topological_nav.learn.localise import nearest_node
 
@@ -235,12 +235,8 @@ _ARRAYS = ("xy_w", "room", "embeddings", "edges", "p", "angle_rad")
 def save_map(made: TopologicalMap, path: Path) -> None:
     """Writes a map as one npz file, whole or not at all."""
     header = {"format": FORMAT, "scene": made.scene, "digest": made.digest, "about": made.about}
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez_compressed(
-            file,
-            header=np.frombuffer(json.dumps(header).encode(), np.uint8),
-            **{name: getattr(made, name) for name in _ARRAYS},
-        )  # type: ignore[arg-type]
+    arrays = {name: getattr(made, name) for name in _ARRAYS}
+    write_arrays(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
 def load_map(path: Path, digest: str | None = None) -> TopologicalMap:

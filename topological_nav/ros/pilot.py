@@ -12,7 +12,7 @@ from PIL import Image
 from interactive_nav.robots import get_robot
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
-from topological_nav.data.dataset import lens_of
+from topological_nav.data.folders import lens_of
 from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map

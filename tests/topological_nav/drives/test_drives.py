@@ -16,6 +16,7 @@ from interactive_nav_common.errors import UserError
 from tests.topological_nav.conftest import DRIVEN
 from topological_nav.__main__ import main
 from topological_nav.config import DriveConfig
+from topological_nav.data.folders import lens_of
 from topological_nav.data.shards import read_shard
 from topological_nav.drives import dataset as driving
 from topological_nav.drives.fleet import make_env
@@ -73,7 +74,7 @@ def test_commands_stay_within_bounds_and_move_the_robot(drives):
 
 def test_images_are_what_the_robot_saw(drives, driven, painted):
     robot, scene = get_robot("ttbot"), load_scene(painted)
-    renderer = SceneRenderer(scene, driving.lens_of(CONFIG, robot), 1)
+    renderer = SceneRenderer(scene, lens_of(CONFIG, robot), 1)
     seen = 0
     for rows, images in driving.drive_images(driven):
         assert len(images) == drives.steps[rows].sum() and images.shape[1:] == (32, 32, 3)
