@@ -32,16 +32,16 @@ from topological_nav.adapt.adaptation import (
 )
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES, DataConfig
-from topological_nav.data.dataset import headings, load_passages, read_header
+from topological_nav.data.dataset import load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
 from topological_nav.errors import Asked, DatasetError, MapError, go_on
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
-from topological_nav.learn.localise import localisation_scores
+from topological_nav.learn.localise import in_words, localisation_scores, nearest_turn
 from topological_nav.learn.pairs import need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, length_scores, load_trained, save_trained
-from topological_nav.maps.build import Built
+from topological_nav.maps.build import Built, edge_scores
 from topological_nav.maps.graph import assemble, lengths, near_pairs
 from topological_nav.scenes.space import free_space
 
@@ -142,12 +142,11 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
     room = label - rooms.label[mine].min()
-    around = headings(data)
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
         if not len(edges):
             return np.zeros(0)
-        turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
+        turn = nearest_turn(angle, data.headings)
         return detector.passage(shown[edges[:, 0], turn], lengths(xy, edges))
 
     if not len(near_pairs(xy, config.edge_m)):
@@ -168,26 +167,12 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     free = space.segment_free(
         xy[made.edges[:, 0]], xy[made.edges[:, 1]], judged.passage_points, judged.passage_margin_m
     )
-    return Built(made, space, free, _map_scores(localiser, made, free, level[held][:, ::3], rooms, held, label, config))
-
-
-def _map_scores(localiser, made, free, asked, rooms, held, label, config: AdaptConfig) -> dict[str, Any]:
-    open_ = made.p >= config.passable
-    parts = made.open_parts(config.passable)
-    scores: dict[str, Any] = {
-        "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
-        "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
-        "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
-    }
-    if len(asked):
-        found = localisation_scores(
-            localiser.embed(asked), rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label
-        )
-        scores["held-out images localised"] = (
-            f"nearest node {found['node']:.3f}, right room {found['room']:.3f}, "
-            f"median error {found['error_m']:.2f} m (least possible {found['least_error_m']:.2f} m)"
-        )
-    return scores
+    scores = edge_scores(made, free, config.passable)
+    if held.any():
+        asked = localiser.embed(level[held][:, ::3])
+        found = localisation_scores(asked, rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label)
+        scores["held-out images localised"] = in_words(found)
+    return Built(made, space, free, scores)
 
 
 def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[_Labelled, _Labelled]:

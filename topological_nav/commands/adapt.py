@@ -86,6 +86,7 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
     from topological_nav.data.dataset import load_rooms
     from topological_nav.figures.maps import save
     from topological_nav.figures.transfer_figures import features_figure
+    from topological_nav.learn.localise import in_words
 
     out = arguments.out or arguments.adapted / "features"
     results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, tell_line, should_stop)
@@ -94,11 +95,7 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
     figure = features_figure(rendered[:, level, 0], seen[:, level, 0], read_metrics(out / "metrics.jsonl"), results)
     save(figure, out / "adaptation.png")
     for name in ("source", "before", "statistics", "after"):
-        mean = results[name]["mean"]
-        print(
-            f"{name:<11}nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
-            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
-        )
+        print(f"{name:<11}{in_words(results[name]['mean'])}")
     print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
 
 

@@ -84,6 +84,7 @@ def train(arguments: argparse.Namespace) -> None:
     out = arguments.out or RUNS / arguments.task
     from interactive_nav_common.metrics_file import read_metrics
     from topological_nav.figures.maps import curves_figure, save
+    from topological_nav.learn.localise import in_words
     from topological_nav.learn.training import train as train_network
 
     with stop_signals() as stops:
@@ -95,10 +96,7 @@ def train(arguments: argparse.Namespace) -> None:
     if rows := results.get("lengths"):
         print("ahead:  " + ",  ".join(f"{row['ahead_m']:g} m {row['accuracy']:.3f}" for row in rows) + "  right")
     if mean := results["localisation"].get("mean"):
-        print(
-            f"localisation: nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
-            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
-        )
+        print(f"localisation: {in_words(mean)}")
     print(f"{out}: {results['parameters']:,} parameters")
 
 

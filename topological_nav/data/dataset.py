@@ -35,9 +35,6 @@ DATASET = Folder(
     file="dataset.json",
     version=2,
     base=DataConfig(),
-    holds="the dataset there is of",
-    has="the dataset there has",
-    asked="this one",
     none="is no dataset (no dataset.json); make one: python -m topological_nav data ...",
     again="make the dataset again",
 )

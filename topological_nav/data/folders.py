@@ -38,12 +38,6 @@ class Folder(Generic[Config]):
     """Of the folder; raised whenever older ones would be read wrongly."""
     base: Config
     """Settings where the description lacks one."""
-    holds: str
-    """What it holds, with the verb, such as `the dataset there is`."""
-    has: str
-    """The same with `has`."""
-    asked: str
-    """What is asked for instead."""
     none: str
     """What to say of a folder that is none."""
     again: str
@@ -87,12 +81,12 @@ class Folder(Generic[Config]):
                 for name, value in to_dict(settings).items():
                     if header["settings"][name] != value:
                         raise DatasetError(
-                            f"{out}: {self.has} {name} = {value!r}, {self.asked} {header['settings'][name]!r}; "
+                            f"{out}: was made with {name} = {value!r}, expected {header['settings'][name]!r}; "
                             "choose another folder or delete it"
                         )
                 if there["scenes"] != header["scenes"]:
                     raise DatasetError(
-                        f"{out}: {self.holds} {', '.join(s['name'] for s in there['scenes'])} as they were; "
+                        f"{out}: is of {', '.join(s['name'] for s in there['scenes'])} as they were; "
                         "the scenes differ: choose another folder or delete it"
                     )
             else:

@@ -41,9 +41,6 @@ DRIVES = Folder(
     file="drives.json",
     version=1,
     base=DriveConfig(),
-    holds="the drives there are in",
-    has="the drives there have",
-    asked="these",
     none="holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE...",
     again="drive again",
 )

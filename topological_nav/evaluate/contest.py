@@ -19,6 +19,7 @@ from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.data.folders import lens_of
+from topological_nav.drives import driving
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.errors import RunError
 from topological_nav.evaluate.contenders import Contender, NavigatorPlayer, expert, learned
@@ -27,7 +28,7 @@ from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import Trained, load_trained
 from topological_nav.maps.build import drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
-from topological_nav.maps.sight import NetworkSight, PassagePolicy, Sight, TrueSight
+from topological_nav.maps.sight import NetworkSight, Sight, TrueSight
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.simulation import Camera, Simulator, make_env, pose_camera, scene_camera
@@ -223,15 +224,10 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
         RunError: no such run.
         ConfigError: a trained policy cannot look at poses.
     """
-    if contest.policy == PASSAGE_POLICY:
-        return PassagePolicy(sight, contest.config.passable, contest.config.clear_m)
-    if contest.truth:
+    if contest.truth and contest.policy != PASSAGE_POLICY:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
-    from topological_nav.drives import driving
-
-    assert networks is not None
-    seeing = (contest.localiser, networks.localiser), (contest.detector, networks.detector)
-    return driving.load_policy_beside(contest.policy, *seeing)
+    seeing = [(contest.localiser, networks.localiser), (contest.detector, networks.detector)] if networks else []
+    return driving.local_policy(contest.policy, sight, contest.config, *seeing)
 
 
 def _digest_of(policy: str) -> str:

@@ -22,6 +22,7 @@ from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings
 from topological_nav.data.folders import lens_of
 from topological_nav.errors import SpaceError
+from topological_nav.learn.localise import nearest_turn
 from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
@@ -90,8 +91,7 @@ def build_map(
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
         if config.edge_image == "nearest":
-            turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
-            looked = images[edges[:, 0], turn]
+            looked = images[edges[:, 0], nearest_turn(angle, len(around))]
         else:
             pictures.total += len(edges)
             looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
@@ -101,7 +101,11 @@ def build_map(
     about = {"settings": to_dict(config), "data": to_dict(data), **networks, "margin_m": margin_m, "points": points}
     made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
     free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
-    scores = _scores(made, free, config, lacking)
+    scores = {
+        "nodes a room": " ".join(str(n) for n in np.bincount(made.room)),
+        **edge_scores(made, free, config.passable),
+    }
+    scores |= {"lacking": "; ".join(lacking)} if lacking else {}
     if config.check:
         places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
         looked = pictures.draw_around(places, around, "check")
@@ -230,15 +234,11 @@ def forget(parts: Path) -> None:
         parts.rmdir()
 
 
-def _scores(made: TopologicalMap, free: np.ndarray, config: MapConfig, lacking: list[str]) -> dict[str, Any]:
-    open_ = made.p >= config.passable
-    parts = made.open_parts(config.passable)
-    scores: dict[str, Any] = {
-        "nodes a room": " ".join(str(n) for n in np.bincount(made.room)),
+def edge_scores(made: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:
+    """How a map's edges compare with the plan, and what open ones join, in words; see `Built`."""
+    open_, parts = made.p >= passable, made.open_parts(passable)
+    return {
         "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
         "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
         "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
     }
-    if lacking:
-        scores["lacking"] = "; ".join(lacking)
-    return scores

@@ -110,14 +110,14 @@ def test_an_interrupted_folder_is_completed_to_the_same(drives, driven, painted,
 
 
 def test_other_settings_and_other_folders_are_refused(driven, painted, tmp_path, capsys):
-    with pytest.raises(DatasetError, match="the drives there have legs = 3, these 2"):
+    with pytest.raises(DatasetError, match="was made with legs = 3, expected 2"):
         driving.simulate_drives([painted], driven, dataclasses.replace(CONFIG, legs=2))
     copy = tmp_path / "drives"
     copy.mkdir()
     header = json.loads((driven / "drives.json").read_text())
     header["scenes"][0]["digest"] = "0" * 64
     (copy / "drives.json").write_text(json.dumps(header))
-    with pytest.raises(DatasetError, match="the drives there are in painted as they were; the scenes differ"):
+    with pytest.raises(DatasetError, match="is of painted as they were; the scenes differ"):
         driving.simulate_drives([painted], copy, CONFIG)
     with pytest.raises(DatasetError, match="holds no drives"):
         driving.load_drives(tmp_path)
