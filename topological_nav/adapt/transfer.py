@@ -20,7 +20,7 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import to_dict
 from topological_nav.adapt.adaptation import (
     PASSAGES_STREAM,
@@ -132,12 +132,8 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     need_task(detector.about, "passages", "the detector")
     scene = load_scene(scene_folder)
     header, data = read_header(target)
-    index = next((i for i, s in enumerate(header["scenes"]) if s["digest"] == scene.digest), None)
-    if index is None:
-        names = ", ".join(s["name"] for s in header["scenes"])
-        raise DatasetError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
     rooms = target_rooms(target, config)
-    mine = rooms.scene == index
+    mine = rooms.scene == _index_of(scene, header, target)
     nodes, held = mine & ~rooms.test, mine & rooms.test
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
@@ -173,6 +169,15 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
         found = localisation_scores(asked, rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label)
         scores["held-out images localised"] = in_words(found)
     return Built(made, space, free, scores)
+
+
+def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
+    """Which scene of a dataset it is."""
+    digests = [there["digest"] for there in header["scenes"]]
+    if scene.digest not in digests:
+        names = ", ".join(there["name"] for there in header["scenes"])
+        raise DatasetError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
+    return digests.index(scene.digest)
 
 
 def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[_Labelled, _Labelled]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
@@ -11,32 +10,10 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.signals import stop_signals
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.commands.progress import asked_by, say, tell_line
-from topological_nav.config import PITCHES
+from topological_nav.config import DATASET, PITCHES, RUNS
 from topological_nav.errors import Asked
 
-
-def add_to(command: Callable[[str, str, object], argparse.ArgumentParser], dataset: Path, runs: Path) -> None:
-    """Adds the command to a command line.
-
-    Args:
-        command: makes the parser of a command from its name, what it does, and its settings.
-        dataset: where a dataset lies by default.
-        runs: where runs lie.
-    """
-    adapt = command("adapt", "Takes networks and maps to another domain.", AdaptConfig())
-    adapt.add_argument(
-        "what",
-        choices=list(_RUNS),
-        help="features: the embedding, adversarially; passages: the detector in configurations A to D; map: of images "
-        "collected in the target domain",
-    )
-    adapt.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
-    adapt.add_argument("--data", type=Path, metavar="DIR", help=f"source (default {dataset})")
-    adapt.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
-    adapt.add_argument("--localiser", type=Path, metavar="RUN", help=f"embeds images (default {runs}, or packaged)")
-    adapt.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
-    adapt.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {runs}/adapted/WHAT, a map SCENE.npz")
-    adapt.set_defaults(adapted=runs / "adapted", dataset=dataset)
+ADAPTED = RUNS / "adapted"
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -44,13 +21,13 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises:
         Stopped: a signal asked for it.
-        TopologicalError, SceneError: something cannot be used.
+        UserError: something cannot be used.
     """
     config = overridden(AdaptConfig(), arguments.settings)
     if (arguments.what == "map") != bool(arguments.scene):
         raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
     _refuse_unused(arguments)
-    arguments.data = arguments.data or arguments.dataset
+    arguments.data = arguments.data or DATASET
     arguments.target = arguments.target or arguments.data
     from topological_nav.weights.packaged import choose
 
@@ -60,7 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
     if chosen.said:
         say(chosen.said)
     with stop_signals() as stops:
-        _RUNS[arguments.what](arguments, config, asked_by(stops))
+        WHAT[arguments.what](arguments, config, asked_by(stops))
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:
@@ -88,7 +65,7 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
     from topological_nav.figures.transfer_figures import features_figure
     from topological_nav.learn.localise import in_words
 
-    out = arguments.out or arguments.adapted / "features"
+    out = arguments.out or ADAPTED / "features"
     results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, tell_line, should_stop)
     rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
     level = PITCHES.index("level")
@@ -107,7 +84,7 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
     from topological_nav.figures.maps import save
     from topological_nav.figures.transfer_figures import passages_figure
 
-    out = arguments.out or arguments.adapted / "passages"
+    out = arguments.out or ADAPTED / "passages"
     results = passage_configurations(arguments.detector, arguments.target, out, config, tell_line, should_stop)
     images = load_passages(arguments.target).images
     seen = as_seen(images, preset(config.domain))
@@ -126,7 +103,7 @@ def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: 
     from topological_nav.maps.graph import save_map
 
     scene = Path(arguments.scene)
-    out = arguments.out or arguments.adapted / f"{scene.resolve().name}.npz"
+    out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"
     built = collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config)
     save_map(built.map, out)
     save(map_figure(built), out.with_suffix(".png"))
@@ -136,4 +113,4 @@ def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: 
 
 
 _NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}
-_RUNS = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}
+WHAT = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}

@@ -28,7 +28,7 @@ from topological_nav.data.passages import Passages, draw_passages, held_out
 from topological_nav.data.shards import read_shards
 from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.scenes.rendering import camera_pose
-from topological_nav.scenes.rooms import Rooms, agreement, find_rooms, recorded_rooms
+from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space, spread
 
 DATASET = Folder(
@@ -105,8 +105,7 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
         SpaceError: too little free space.
     """
     rng = np.random.default_rng([config.seed, 2, int(scene.digest[:8], 16)])
-    known = recorded_rooms(scene.digest)
-    rooms = find_rooms(space, config.room_method, config.num_rooms, known, config.seed, config.clearance_m)
+    rooms = scene_rooms(scene, space, config)
     try:
         drawn = space.sample(rng, config.positions, config.clearance_m)
     except SpaceError as error:

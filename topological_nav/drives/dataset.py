@@ -34,7 +34,7 @@ from topological_nav.drives.routes import draw_routes, drivable
 from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import camera_pose
-from topological_nav.scenes.rooms import find_rooms, recorded_rooms
+from topological_nav.scenes.rooms import scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
 
 DRIVES = Folder(
@@ -128,7 +128,7 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
     fields_before = 0
     for index, scene in enumerate(scenes):
         space = free_space(scene, robot.height_m)
-        rooms = find_rooms(space, "gmm", None, recorded_rooms(scene.digest), config.seed, DataConfig().clearance_m)
+        rooms = scene_rooms(scene, space, DataConfig(seed=config.seed))
         xy, _ = place_nodes(space, rooms, MapConfig(edge_m=config.edge_m), robot.body_width_m / 2, 50)
         field = way_field(space, xy, config, LIMIT_M)
         joined = drivable(space, xy, field, config)

@@ -14,8 +14,7 @@ from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
 from topological_nav.data.folders import lens_of
 from topological_nav.drives.driving import local_policy
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import load_trained
+from topological_nav.learn.pairs import load_networks
 from topological_nav.maps.graph import load_map
 from topological_nav.maps.sight import NetworkSight
 from topological_nav.navigate.navigator import Navigator, Pilot
@@ -47,11 +46,10 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
         MapError, RunError: map or networks cannot be used, or do not belong together.
         ConfigError: no goal picture, or one that cannot be read.
     """
-    networks = load_trained(journey.localiser), load_trained(journey.detector)
-    camera, made = camera_of(*networks), load_map(journey.map)
-    lens = lens_of(camera, get_robot(camera.robot))
-    sight = NetworkSight(made, *networks, config.match)
-    seeing = zip((journey.localiser, journey.detector), networks, strict=True)
+    networks, made = load_networks(journey.localiser, journey.detector), load_map(journey.map)
+    lens = lens_of(networks.camera, get_robot(networks.camera.robot))
+    sight = NetworkSight(made, networks.localiser, networks.detector, config.match)
+    seeing = (journey.localiser, networks.localiser), (journey.detector, networks.detector)
     policy = local_policy(journey.policy, sight, config, *seeing)
     if not journey.goals:
         raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
