@@ -26,8 +26,9 @@ from interactive_nav_common.config import overridden
 from interactive_nav_common.rows import markdown
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contenders import NavigatorPlayer
-from topological_nav.evaluate.contest import Contest, ContestScene, load_networks, local_policy
+from topological_nav.evaluate.contest import Contest, ContestScene, local_policy
 from topological_nav.evaluate.evaluation import Played, Tell, play
+from topological_nav.learn.pairs import load_networks
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.weights.packaged import packaged_weights
 

@@ -12,6 +12,9 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.locks import release, take_lock
@@ -80,6 +83,16 @@ def write_text(path: str | Path, text: str) -> None:
     """
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_arrays(path: str | Path, **arrays: Any) -> None:
+    """Writes arrays as a packed npz file, whole or not at all.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 @contextlib.contextmanager

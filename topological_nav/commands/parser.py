@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import settings_help
+from topological_nav.adapt.config import AdaptConfig
 from topological_nav.commands import adapt
 from topological_nav.commands.learning import TASKS
 from topological_nav.config import (
@@ -155,4 +156,15 @@ def _export(command: Command) -> None:
 
 
 def _adapt(command: Command) -> None:
-    adapt.add_to(command, DATASET, RUNS)
+    sub = command("adapt", "Takes networks and maps to another domain.", AdaptConfig())
+    sub.add_argument(
+        "what",
+        choices=list(adapt.WHAT),
+        help="features: the embedding, adversarially; passages: the detector in configurations A to D; map: of images "
+        "collected in the target domain",
+    )
+    sub.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
+    sub.add_argument("--data", type=Path, metavar="DIR", help=f"source (default {DATASET})")
+    sub.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
+    sub.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {adapt.ADAPTED}/WHAT, a map SCENE.npz")
+    _networks(sub)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -32,22 +31,9 @@ class Contender(Protocol):
         """Only these episodes go on."""
         ...
 
-    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Events]:
         """The state after one control step, and what the contender says of the step before it."""
         ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Marks:
-    """[B] bool each."""
-
-    run_started: np.ndarray
-    run_ended: np.ndarray
-    arrived: np.ndarray
-    timed_out: np.ndarray
-    localised: np.ndarray
-    blocked: np.ndarray
-    lost: np.ndarray
 
 
 class NavigatorPlayer:
@@ -87,7 +73,7 @@ class NavigatorPlayer:
         assert self.state is not None
         self.state, self._images = self.state.take(rows), self._images[rows]
 
-    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Events]:
         """See `Contender`."""
         assert self.state is not None
         seen = self._simulator.seen(state)
@@ -97,16 +83,7 @@ class NavigatorPlayer:
             self._images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
         self.state, linear, angular, events = self._navigator.step(mind, self._images, seen.yaw_rad, time_s)
         self._watch(time_s, seen, self.state, events)
-        marks = Marks(
-            events.run_started,
-            events.run_ended,
-            events.arrived,
-            events.timed_out,
-            events.localised,
-            events.blocked,
-            events.lost,
-        )
-        return self._simulator.drive(state, linear, angular), marks
+        return self._simulator.drive(state, linear, angular), events
 
 
 Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
@@ -134,16 +111,20 @@ class ActionPlayer:
         """See `Contender`."""
         self._episode = self._episode[rows]
 
-    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Events]:
         """See `Contender`."""
         step = round(time_s / self._simulator.dt_s)
         every = max(1, round(self._config.run_s / self._simulator.dt_s))
         edge = np.full(len(over), step % every == 0)
         none = np.zeros(len(over), bool)
-        late = ~over & (time_s >= self._config.limit_s - 1e-3)
-        marks = Marks(edge & ~over, edge & ~over & (step > 0), none, late, none, none, none)
+        events = Events(
+            **dict.fromkeys(("localised", "glanced", "lost", "blocked", "arrived"), none),
+            run_started=edge & ~over,
+            run_ended=edge & ~over & (step > 0),
+            timed_out=~over & (time_s >= self._config.limit_s - 1e-3),
+        )
         action = self._act(state, self._episode, ~over, step)
-        return self._simulator.act(state, action), marks
+        return self._simulator.act(state, action), events
 
 
 def expert(simulator: Simulator, config: NavigatorConfig) -> ActionPlayer:

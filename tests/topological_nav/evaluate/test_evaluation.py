@@ -23,11 +23,12 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
-from topological_nav.evaluate.contenders import Marks, learned
+from topological_nav.evaluate.contenders import learned
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
 from topological_nav.evaluate.evaluation import play
 from topological_nav.evaluate.rows import _stem, play_contest
+from topological_nav.navigate.state import Events
 from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.rooms import find_rooms
 from topological_nav.scenes.simulation import Seen, Simulator
@@ -75,8 +76,11 @@ class Line:
         x, step, number = state
         at, none = step % 15, np.zeros(len(x), bool)
         arrived = np.array([self._arrives.get(int(n)) == step for n in number])
-        marks = Marks(none | (at == 0), none | (at == 10), arrived, none | (step >= 60), arrived, none, none)
-        return (x + 0.2 * (at < 10) * ~over, step + 1, number), marks
+        events = Events(
+            localised=arrived, glanced=none, lost=none, blocked=none, arrived=arrived,
+            run_started=none | (at == 0), run_ended=none | (at == 10), timed_out=none | (step >= 60),
+        )  # fmt: skip
+        return (x + 0.2 * (at < 10) * ~over, step + 1, number), events
 
 
 def line_journeys(goals) -> Episodes:
