@@ -46,9 +46,7 @@ class Bounds(NamedTuple):
         low, high = (f"{end:g}" if isinstance(end, float) else str(end) for end in self[:2])
         if self.high < math.inf:
             return f"between {low} and {high}{', both excluded' if self.open else ''}"
-        if self.open:
-            return f"above {low}" if self.low else "a positive number"
-        return f"at least {low}" if self.low else "0 or more"
+        return "a positive number" if self.open else f"at least {low}" if self.low else "0 or more"
 
 
 Seed = Annotated[int, (0, 2**32 - 1)]
@@ -230,7 +228,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
 
     Args:
         base: what `plain` does not name.
-        plain: nested mapping as read from YAML.
+        plain: nested mapping as read from YAML; None, as of an empty file or section: nothing.
         where: file or word the values come from, for messages.
         prefix: dotted name of `base` inside the whole, with its dot.
         known: dotted names elsewhere that a wrong key may have meant.
@@ -238,6 +236,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
+    plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
         section = prefix.rstrip(".") or "the file"
         raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
@@ -308,6 +307,11 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         return _convert(value, arguments[0], where)
     if origin is Annotated:
         return _convert(value, arguments[0], where)
+    if origin in (Mapping, Sequence):  # whose items are checked by who reads them
+        expected, empty = ("a mapping of settings", {}) if origin is Mapping else ("a list", [])
+        if not isinstance(empty if value is None else value, type(empty)):
+            raise ConfigError(f"{where}: got {value!r}, expected {expected}")
+        return value or empty
     if origin is Literal:  # which choices there are is checked with the bounds
         return value
     if origin is tuple:

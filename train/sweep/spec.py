@@ -85,7 +85,7 @@ class LaunchConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepConfig:
+class SweepConfig(Settings):
     """A sweep as its file says it."""
 
     name: str = ""
@@ -156,31 +156,12 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    _mapping(plain, where, "the file")
-    fields = {field.name: field for field in dataclasses.fields(SweepConfig)}
-    made: dict[str, Any] = {}
-    for key, value in plain.items():
-        if key not in fields:
-            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), list(fields))}")
-        if key in ("evaluate", "launch"):
-            base = EvaluateConfig() if key == "evaluate" else LaunchConfig()
-            made[key] = overlay(base, {} if value is None else value, where, f"{key}.")
-        elif key in ("grid", "settings"):
-            made[key] = _mapping({} if value is None else value, where, key)
-        elif key in ("overrides", "skip"):
-            if not isinstance([] if value is None else value, list):
-                raise ConfigError(f"{where}: {key}: got {value!r}, expected a list")
-            made[key] = value or []
-        elif not isinstance(value, str):
-            raise ConfigError(f"{where}: {key}: got {value!r} ({type(value).__name__}), expected text")
-        else:
-            made[key] = value
-    made["name"] = made.get("name") or default_name
-    if made["name"] != Path(made["name"]).name or made["name"] == "..":
-        raise ConfigError(f"{where}: name is {made['name']!r}, expected one folder name (out_dir says where it lies)")
-    if not made.get("preset"):
+    config = overlay(SweepConfig(), plain, where)
+    if config.name != Path(config.name).name or config.name == "..":
+        raise ConfigError(f"{where}: name is {config.name!r}, expected one folder name (out_dir says where it lies)")
+    if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
-    return SweepConfig(**made)
+    return dataclasses.replace(config, name=config.name or default_name)
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
