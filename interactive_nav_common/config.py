@@ -2,7 +2,7 @@
 
 A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` (or a plain pair) for ranges. A
 dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`), or flat,
-their settings among those of the whole (`flat_section`).
+their settings among those of the whole (`flat`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 import yaml
@@ -52,14 +52,14 @@ class Bounds(NamedTuple):
 Seed = Annotated[int, (0, 2**32 - 1)]
 Count = Annotated[int, (1, 10**6)]
 AtLeastOne = Annotated[int, Bounds(1)]
-NotNegativeInt = Annotated[int, Bounds(0)]
+Natural = Annotated[int, Bounds(0)]
 NotNegative = Annotated[float, Bounds(0)]
 Positive = Annotated[float, Bounds(0, open=True)]
 Share = Annotated[float, (0.0, 1.0)]
 Idle = Sequence[tuple[str, str, Callable[[Any], bool]]]
 
 
-def flat_section(kind: Callable[[], Config]) -> Config:
+def flat(kind: Callable[[], Config]) -> Config:
     """A field of a dataclass of settings: another one, whose settings stand among those of the whole."""
     return dataclasses.field(default_factory=kind, metadata={"flat": True})
 
@@ -173,12 +173,33 @@ def flatten(config: Any) -> dict[str, Any]:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain values as YAML holds them: lists for tuples, `auto` for None."""
-    plain: dict[str, Any] = {}
-    for dotted, value in flatten(config).items():
-        *sections, name = dotted.split(".")
-        place = functools.reduce(lambda inner, section: inner.setdefault(section, {}), sections, plain)
-        place[name] = AUTO if value is None else list(value) if isinstance(value, tuple) else value
-    return plain
+
+    def plain(value: Any) -> Any:
+        return AUTO if value is None else list(value) if isinstance(value, tuple) else value
+
+    return nested((name, plain(value)) for name, value in flatten(config).items())
+
+
+def nested(settings: Iterable[tuple[str, Any]], where: str = "settings") -> dict[str, Any]:
+    """Dotted names taken apart; mappings among the values are merged.
+
+    Raises:
+        ConfigError: a section that was given a value; the message begins with `where`.
+    """
+    whole: dict[str, Any] = {}
+    for name, value in settings:
+        *sections, last = str(name).split(".")
+        mapping = isinstance(value, Mapping)
+        place = whole
+        for section in [*sections, last] if mapping else sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"{where}: {name}: {section} has a value already")
+        if mapping:
+            place.update(nested(value.items(), where))
+        else:
+            place[last] = value
+    return whole
 
 
 def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") -> dict[str, Any]:
@@ -189,7 +210,7 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
     Raises:
         ConfigError: a word without `=`, or a section that was given a value.
     """
-    nested: dict[str, Any] = {}
+    settings = []
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or not name:
@@ -198,15 +219,8 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             value = text
-        *sections, last = name.split(".")
-        place = nested
-        for section in sections:
-            inner = place.setdefault(section, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"override {word!r}: {section} was given a value by an earlier override")
-            place = inner
-        place[last] = value
-    return nested
+        settings.append((name, value))
+    return nested(settings, "override")
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share, flat_section
+from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share, flat
 from interactive_nav_common.errors import ConfigError
 
 PITCHES = ("up", "level", "down")
@@ -228,7 +228,7 @@ class NavigatorConfig(Settings):
 class EvaluationConfig(Settings):
     """Episodes, and how they are scored."""
 
-    navigator: NavigatorConfig = flat_section(NavigatorConfig)
+    navigator: NavigatorConfig = flat(NavigatorConfig)
     """Who plays them."""
     seed: Seed = 0
     """Of the episodes."""

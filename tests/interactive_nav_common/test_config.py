@@ -14,7 +14,7 @@ from interactive_nav_common.config import (
     Bounds,
     Positive,
     Settings,
-    flat_section,
+    flat,
     flatten,
     overlay,
     replace,
@@ -42,7 +42,7 @@ class Wheels(Settings):
 class Cart(Settings):
     """Is pushed."""
 
-    wheels: Wheels = flat_section(Wheels)
+    wheels: Wheels = flat(Wheels)
     """Flat."""
     sizes: tuple[AtLeastOne, ...] = (2, 3)
     """Of it."""

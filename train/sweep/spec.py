@@ -13,12 +13,13 @@ import yaml
 
 from interactive_nav_common.config import (
     AtLeastOne,
+    Natural,
     NotNegative,
-    NotNegativeInt,
     Positive,
     Settings,
     flatten,
     nearest,
+    nested,
     overlay,
     settings_help,
 )
@@ -40,7 +41,7 @@ class EvaluateConfig(Settings):
     """Scene folders; empty: those that the run was trained on."""
     episodes: AtLeastOne = 1000
     """Episodes of each run."""
-    seed: NotNegativeInt = 1_000_000
+    seed: Natural = 1_000_000
     """Which episodes."""
     balanced: bool = True
     """Scenes take turns; otherwise each episode draws one."""
@@ -48,7 +49,7 @@ class EvaluateConfig(Settings):
     """best, last or a number of env steps."""
     stochastic: bool = True
     """Sample actions instead of taking their mode."""
-    record: NotNegativeInt = 8
+    record: Natural = 8
     """First episodes whose paths are kept for pictures."""
     batch: AtLeastOne | None = None
     """Episodes played at a time; auto: by backend."""
@@ -73,7 +74,7 @@ class LaunchConfig(Settings):
     """Runs at a time on a machine without a GPU; each gets its part of the cores."""
     cpus_per_run: AtLeastOne = 1
     """CPU cores that a run reserves on a Ray cluster."""
-    retries: NotNegativeInt = 2
+    retries: Natural = 2
     """Times that a crashed run is started again by one command; a refused config or diverged numbers are not."""
     grace_s: NotNegative = 300.0
     """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
@@ -193,7 +194,7 @@ def expand(config: SweepConfig, where: str) -> Sweep:
         launch = config.launch
         layers = [config.settings] + [entry["settings"] for entry in overrides if _matches(entry["where"], values)]
         for layer in [*layers, values]:
-            train = config_io.from_dict(_nested(layer, told), train, told)
+            train = config_io.from_dict(nested(layer.items(), told), train, told)
         for entry in overrides:
             if _matches(entry["where"], values):
                 launch = overlay(launch, entry["launch"], told, "launch.")
@@ -250,26 +251,6 @@ def _mapping(value: Any, where: str, what: str) -> Any:
     if not isinstance(value, Mapping):
         raise ConfigError(f"{where}: {what}: got {value!r} ({type(value).__name__}), expected a mapping of settings")
     return value
-
-
-def _nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Dotted keys taken apart; nested ones stay."""
-    nested: dict[str, Any] = {}
-    for key, value in settings.items():
-        *sections, last = str(key).split(".")
-        place = nested
-        for section in sections:
-            place = place.setdefault(section, {})
-            if not isinstance(place, dict):
-                raise ConfigError(f"{where}: {key}: {section} has a value already")
-        if isinstance(value, Mapping):
-            inner = place.setdefault(last, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"{where}: {key}: has a value already")
-            inner.update(_nested(value, where))
-        else:
-            place[last] = value
-    return nested
 
 
 def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
