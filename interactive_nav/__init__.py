@@ -74,7 +74,7 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     Args:
         robot: a name from `robot_names()`.
         scenes: scene folders, or sets of them (`cluttered/train`); each episode draws one.
-        **settings: fields of `NavConfig`, such as backend, num_objects, observations, k_int, episode_steps; or
+        **settings: of `NavConfig`'s parts, such as backend, num_objects, observations, k_int, episode_steps; or
             `variant="code"` for the values of the original's code where it differs from its paper.
 
     Returns:

@@ -7,16 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from interactive_nav_common.config import (
-    AtLeastOne,
-    Bounds,
-    NotNegative,
-    NotNegativeInt,
-    Positive,
-    Settings,
-    Share,
-    flat_section,
-)
+from interactive_nav_common.config import AtLeastOne, Bounds, Natural, NotNegative, Positive, Settings, Share, flat
 from interactive_nav_common.errors import ConfigError
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
@@ -53,7 +44,7 @@ class TaskRules(Settings):
     """What an action commands: a control mode of the robot; `native` is the original benchmark's."""
     symmetric_actions: bool = False
     """Action 0 commands nothing; the original's ranges are lopsided (TurtleBot's wheels: -12.5 to 25 rad/s)."""
-    num_objects: NotNegativeInt = 10
+    num_objects: Natural = 10
     """Small objects strewn about at random each episode."""
     small_objects: Literal["train", "test"] = "train"
     """Whose models the small objects are: train, or test, which no training episode shows."""
@@ -157,21 +148,21 @@ class PhysicsConfig(Settings):
     lets 0.02 s stay within 10 % of a fine reference in pushes (docs/fidelity.md)."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
     """Friction cones: pyramidal, or elliptic (native only: MJX-Warp's Newton solver fails on them)."""
-    contacts_per_env: NotNegativeInt = 0
+    contacts_per_env: Natural = 0
     """MJX-Warp contact slots per env; 0: measured when the environment is built, with head room."""
-    constraints_per_env: NotNegativeInt = 0
+    constraints_per_env: Natural = 0
     """MJX-Warp constraint rows per env; 0: measured likewise."""
-    active_furniture: NotNegativeInt = 5
+    active_furniture: Natural = 5
     """MJX backends: pieces of furniture simulated at a time, the nearest to the robot; 0: all."""
-    active_small: NotNegativeInt = 4
+    active_small: Natural = 4
     """MJX backends: small objects simulated at a time; 0: all."""
-    active_doors: NotNegativeInt = 2
+    active_doors: Natural = 2
     """MJX backends: doors simulated at a time; 0: all."""
-    active_walls: NotNegativeInt = 32
+    active_walls: Natural = 32
     """MJX backends: wall boxes that can be met at a time; 0: all."""
     sleep: bool = True
     """Native backend: objects at rest sleep until touched."""
-    threads: NotNegativeInt = 0
+    threads: Natural = 0
     """Native backend: threads; 0: all cores."""
 
     IDLE = (
@@ -257,11 +248,11 @@ class NavConfig(Settings):
     `NavConfig.of(k_int=1.0, backend="native")` takes settings by their own names, as `interactive_nav.make` does.
     """
 
-    rules: TaskRules = flat_section(TaskRules)
+    rules: TaskRules = flat(TaskRules)
     """The task."""
-    physics: PhysicsConfig = flat_section(PhysicsConfig)
+    physics: PhysicsConfig = flat(PhysicsConfig)
     """The simulation."""
-    sensors: SensorConfig = flat_section(SensorConfig)
+    sensors: SensorConfig = flat(SensorConfig)
     """What the robot perceives."""
 
 

@@ -2,7 +2,7 @@
 
 A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` (or a plain pair) for ranges. A
 dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`), or flat,
-their settings among those of the whole (`flat_section`).
+their settings among those of the whole (`flat`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 import yaml
@@ -46,22 +46,20 @@ class Bounds(NamedTuple):
         low, high = (f"{end:g}" if isinstance(end, float) else str(end) for end in self[:2])
         if self.high < math.inf:
             return f"between {low} and {high}{', both excluded' if self.open else ''}"
-        if self.open:
-            return f"above {low}" if self.low else "a positive number"
-        return f"at least {low}" if self.low else "0 or more"
+        return "a positive number" if self.open else f"at least {low}" if self.low else "0 or more"
 
 
 Seed = Annotated[int, (0, 2**32 - 1)]
 Count = Annotated[int, (1, 10**6)]
 AtLeastOne = Annotated[int, Bounds(1)]
-NotNegativeInt = Annotated[int, Bounds(0)]
+Natural = Annotated[int, Bounds(0)]
 NotNegative = Annotated[float, Bounds(0)]
 Positive = Annotated[float, Bounds(0, open=True)]
 Share = Annotated[float, (0.0, 1.0)]
 Idle = Sequence[tuple[str, str, Callable[[Any], bool]]]
 
 
-def flat_section(kind: Callable[[], Config]) -> Config:
+def flat(kind: Callable[[], Config]) -> Config:
     """A field of a dataclass of settings: another one, whose settings stand among those of the whole."""
     return dataclasses.field(default_factory=kind, metadata={"flat": True})
 
@@ -175,12 +173,33 @@ def flatten(config: Any) -> dict[str, Any]:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain values as YAML holds them: lists for tuples, `auto` for None."""
-    plain: dict[str, Any] = {}
-    for dotted, value in flatten(config).items():
-        *sections, name = dotted.split(".")
-        place = functools.reduce(lambda inner, section: inner.setdefault(section, {}), sections, plain)
-        place[name] = AUTO if value is None else list(value) if isinstance(value, tuple) else value
-    return plain
+
+    def plain(value: Any) -> Any:
+        return AUTO if value is None else list(value) if isinstance(value, tuple) else value
+
+    return nested((name, plain(value)) for name, value in flatten(config).items())
+
+
+def nested(settings: Iterable[tuple[str, Any]], where: str = "settings") -> dict[str, Any]:
+    """Dotted names taken apart; mappings among the values are merged.
+
+    Raises:
+        ConfigError: a section that was given a value; the message begins with `where`.
+    """
+    whole: dict[str, Any] = {}
+    for name, value in settings:
+        *sections, last = str(name).split(".")
+        mapping = isinstance(value, Mapping)
+        place = whole
+        for section in [*sections, last] if mapping else sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"{where}: {name}: {section} has a value already")
+        if mapping:
+            place.update(nested(value.items(), where))
+        else:
+            place[last] = value
+    return whole
 
 
 def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") -> dict[str, Any]:
@@ -191,7 +210,7 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
     Raises:
         ConfigError: a word without `=`, or a section that was given a value.
     """
-    nested: dict[str, Any] = {}
+    settings = []
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or not name:
@@ -200,15 +219,8 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             value = text
-        *sections, last = name.split(".")
-        place = nested
-        for section in sections:
-            inner = place.setdefault(section, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"override {word!r}: {section} was given a value by an earlier override")
-            place = inner
-        place[last] = value
-    return nested
+        settings.append((name, value))
+    return nested(settings, "override")
 
 
 @functools.cache
@@ -230,7 +242,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
 
     Args:
         base: what `plain` does not name.
-        plain: nested mapping as read from YAML.
+        plain: nested mapping as read from YAML; None, as of an empty file or section: nothing.
         where: file or word the values come from, for messages.
         prefix: dotted name of `base` inside the whole, with its dot.
         known: dotted names elsewhere that a wrong key may have meant.
@@ -238,6 +250,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
+    plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
         section = prefix.rstrip(".") or "the file"
         raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
@@ -308,6 +321,11 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         return _convert(value, arguments[0], where)
     if origin is Annotated:
         return _convert(value, arguments[0], where)
+    if origin in (Mapping, Sequence):  # whose items are checked by who reads them
+        expected, empty = ("a mapping of settings", {}) if origin is Mapping else ("a list", [])
+        if not isinstance(empty if value is None else value, type(empty)):
+            raise ConfigError(f"{where}: got {value!r}, expected {expected}")
+        return value or empty
     if origin is Literal:  # which choices there are is checked with the bounds
         return value
     if origin is tuple:

@@ -7,16 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from interactive_nav.config import PhysicsConfig, SensorConfig, TaskRules
-from interactive_nav_common.config import (
-    AtLeastOne,
-    NotNegative,
-    Positive,
-    Seed,
-    Settings,
-    Share,
-    flat_section,
-    replace,
-)
+from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, flat, replace
 from interactive_nav_common.errors import ConfigError
 
 
@@ -24,11 +15,11 @@ from interactive_nav_common.errors import ConfigError
 class EnvConfig(Settings):
     """The task: every setting of the environment, and which robot and scenes to make it from."""
 
-    rules: TaskRules = flat_section(TaskRules)
+    rules: TaskRules = flat(TaskRules)
     """What the task is."""
-    physics: PhysicsConfig = flat_section(PhysicsConfig)
+    physics: PhysicsConfig = flat(PhysicsConfig)
     """How it is simulated."""
-    sensors: SensorConfig = flat_section(SensorConfig)
+    sensors: SensorConfig = flat(SensorConfig)
     """What the robot perceives."""
     robot: str = "turtlebot"
     """Robot to drive."""

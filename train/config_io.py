@@ -33,7 +33,7 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    return overlay(base or TrainConfig(), {} if plain is None else plain, where, known=list(flatten(TrainConfig())))
+    return overlay(base or TrainConfig(), plain, where, known=list(flatten(TrainConfig())))
 
 
 def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:

@@ -126,7 +126,7 @@ class InteractiveNavEnv(gymnasium.Env):
             scenes: scene folders; each episode draws one.
             render_mode: none, or "rgb_array": `render` returns a third-person view.
             slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
-            **settings: fields of `NavConfig`.
+            **settings: of `NavConfig`'s parts.
 
         Raises:
             ValueError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
@@ -207,7 +207,7 @@ class InteractiveNavVectorEnv(VectorEnv):
             autoreset_mode: an `AutoresetMode` or its value ("SameStep", "NextStep", "Disabled").
             arrays: "numpy", "jax" or "torch".
             render_mode: none, or "rgb_array": `render` returns a third-person view of each.
-            **settings: fields of `NavConfig`.
+            **settings: of `NavConfig`'s parts.
 
         Raises:
             ValueError: as `interactive_nav.make`, or another choice that does not exist.

@@ -13,12 +13,13 @@ import yaml
 
 from interactive_nav_common.config import (
     AtLeastOne,
+    Natural,
     NotNegative,
-    NotNegativeInt,
     Positive,
     Settings,
     flatten,
     nearest,
+    nested,
     overlay,
     settings_help,
 )
@@ -29,8 +30,6 @@ from train.config import TrainConfig, validate
 SWEEP_DIR = config_io.PRESET_DIR / "sweeps"
 BARE = ("algorithm", "env.robot")
 """Axes whose values name themselves in a run's name."""
-FREE = {"grid": Mapping, "settings": Mapping, "overrides": list, "skip": list}
-"""Keys of a sweep's file whose values name settings of the runs."""
 PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
 
@@ -42,7 +41,7 @@ class EvaluateConfig(Settings):
     """Scene folders; empty: those that the run was trained on."""
     episodes: AtLeastOne = 1000
     """Episodes of each run."""
-    seed: NotNegativeInt = 1_000_000
+    seed: Natural = 1_000_000
     """Which episodes."""
     balanced: bool = True
     """Scenes take turns; otherwise each episode draws one."""
@@ -50,7 +49,7 @@ class EvaluateConfig(Settings):
     """best, last or a number of env steps."""
     stochastic: bool = True
     """Sample actions instead of taking their mode."""
-    record: NotNegativeInt = 8
+    record: Natural = 8
     """First episodes whose paths are kept for pictures."""
     batch: AtLeastOne | None = None
     """Episodes played at a time; auto: by backend."""
@@ -75,7 +74,7 @@ class LaunchConfig(Settings):
     """Runs at a time on a machine without a GPU; each gets its part of the cores."""
     cpus_per_run: AtLeastOne = 1
     """CPU cores that a run reserves on a Ray cluster."""
-    retries: NotNegativeInt = 2
+    retries: Natural = 2
     """Times that a crashed run is started again by one command; a refused config or diverged numbers are not."""
     grace_s: NotNegative = 300.0
     """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
@@ -87,7 +86,7 @@ class LaunchConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepConfig:
+class SweepConfig(Settings):
     """A sweep as its file says it."""
 
     name: str = ""
@@ -158,16 +157,12 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    _expected(Mapping, plain, where, "the file")
-    given = {key: value for key, value in plain.items() if value is not None}
-    free = {key: _expected(kind, given.pop(key), where, key) for key, kind in FREE.items() if key in given}
-    config = overlay(SweepConfig(**free), given, where)
-    config = dataclasses.replace(config, name=config.name or default_name)
+    config = overlay(SweepConfig(), plain, where)
     if config.name != Path(config.name).name or config.name == "..":
         raise ConfigError(f"{where}: name is {config.name!r}, expected one folder name (out_dir says where it lies)")
     if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
-    return config
+    return dataclasses.replace(config, name=config.name or default_name)
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
@@ -199,7 +194,7 @@ def expand(config: SweepConfig, where: str) -> Sweep:
         launch = config.launch
         layers = [config.settings] + [entry["settings"] for entry in overrides if _matches(entry["where"], values)]
         for layer in [*layers, values]:
-            train = config_io.from_dict(_nested(layer, told), train, told)
+            train = config_io.from_dict(nested(layer.items(), told), train, told)
         for entry in overrides:
             if _matches(entry["where"], values):
                 launch = overlay(launch, entry["launch"], told, "launch.")
@@ -252,46 +247,26 @@ def help_text() -> str:
     return settings_help(SweepConfig(), equals=": ")
 
 
-def _expected(kind: type, value: Any, where: str, what: str) -> Any:
-    if not isinstance(value, kind):
-        raise ConfigError(f"{where}: {what}: got {value!r}, expected {'a list' if kind is list else 'a mapping'}")
+def _mapping(value: Any, where: str, what: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{where}: {what}: got {value!r}, expected a mapping")
     return value
-
-
-def _nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Dotted keys taken apart; nested ones stay."""
-    nested: dict[str, Any] = {}
-    for key, value in settings.items():
-        *sections, last = str(key).split(".")
-        place = nested
-        for section in sections:
-            place = place.setdefault(section, {})
-            if not isinstance(place, dict):
-                raise ConfigError(f"{where}: {key}: {section} has a value already")
-        if isinstance(value, Mapping):
-            inner = place.setdefault(last, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"{where}: {key}: has a value already")
-            inner.update(_nested(value, where))
-        else:
-            place[last] = value
-    return nested
 
 
 def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
     known = ("where", "settings", "launch")
-    _expected(Mapping, entry, where, "the entry")
+    _mapping(entry, where, "the entry")
     for key in entry:
         if key not in known:
             raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), known)}")
-    made = {key: _expected(Mapping, entry.get(key) or {}, where, key) for key in known}
+    made = {key: _mapping(entry.get(key) or {}, where, key) for key in known}
     return {**made, "where": _where(made["where"], config, where)}
 
 
 def _where(entry: Any, config: SweepConfig, where: str) -> dict[str, list[Any]]:
     """Axis -> the values that match."""
     wanted = {}
-    for axis, value in _expected(Mapping, entry, where, "where").items():
+    for axis, value in _mapping(entry, where, "where").items():
         if axis not in config.grid:
             near = nearest(str(axis), list(config.grid))
             raise ConfigError(f"{where}: {axis!r} is no axis of the grid{near}; axes: {', '.join(config.grid)}")
