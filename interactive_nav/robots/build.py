@@ -188,9 +188,10 @@ def _affine_law(
         if yaw_gain:
             turn = command[..., 1] + yaw_gain * (command[..., 1] - state.qvel[..., 5])
             command = xp.stack([command[..., 0], turn], -1)
-        controls = command @ xp.asarray(matrix).T + xp.asarray(offset)
+        controls = command @ xp.asarray(matrix).T
+        controls = controls + xp.broadcast_to(xp.asarray(offset), controls.shape)
         if moved:
-            controls = controls + xp.asarray(relative) * state.qpos[..., address]
+            controls = controls + xp.broadcast_to(xp.asarray(relative), controls.shape) * state.qpos[..., address]
         return controls
 
     return law

@@ -99,9 +99,10 @@ def gait_law(legs: Legged) -> ControlLaw:
 
     def law(command, state, xp):
         phase = 2.0 * math.pi * legs.frequency_hz * state.time_s
-        low, high = xp.asarray(legs.ranges).T
-        wanted = xp.asarray(legs.home) + legs.reference(phase, command, base_motion(state, xp), xp)
-        return xp.clip(wanted, low, high)
+        offsets = legs.reference(phase, command, base_motion(state, xp), xp)
+        of_joints = (legs.home, *zip(*legs.ranges, strict=True))
+        home, low, high = (xp.broadcast_to(xp.asarray(x), offsets.shape) for x in of_joints)
+        return xp.clip(home + offsets, low, high)
 
     return law
 

@@ -107,7 +107,7 @@ def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
 
 def _thrusts(acceleration_up, angular_acceleration, xp):
     """Body-frame specific thrust [...] and angular acceleration [..., 3] to four thrusts [..., 4] in 0 .. 10 N."""
-    torque = angular_acceleration * xp.asarray(INERTIA)
+    torque = angular_acceleration * xp.broadcast_to(xp.asarray(INERTIA), angular_acceleration.shape)
     wrench = xp.concatenate([MASS_KG * acceleration_up[..., None], torque], -1)
     return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
 
