@@ -24,7 +24,7 @@ class EnvConfig(Settings):
     robot: str = "turtlebot"
     """Robot to drive."""
     scenes: tuple[str, ...] = ()
-    """Scene folders, relative to the current folder; each episode draws one."""
+    """Scene folders, relative to the current folder, or sets of them (`sparse/train`); each episode draws one."""
 
 
 @dataclasses.dataclass(frozen=True)

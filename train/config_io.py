@@ -11,6 +11,7 @@ import yaml
 
 from interactive_nav_common.config import flatten, nearest, overlay, read_words, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.sets import scene_folders
 from train.config import AUTO as AUTO_SIZES
 from train.config import TrainConfig, validate
 
@@ -86,8 +87,18 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
     if not config.run.name:
         run = dataclasses.replace(config.run, name=f"{path.stem}-seed{config.run.seed}")
         config = dataclasses.replace(config, run=run)
+    config = with_scenes(config)
     validate(config)
     return config
+
+
+def with_scenes(config: TrainConfig) -> TrainConfig:
+    """The config with the scene folders of the sets that `env.scenes` names (`cluttered/train`).
+
+    Raises:
+        SceneError: a set whose scenes are not there.
+    """
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(config.env.scenes)))
 
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:

@@ -20,6 +20,7 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
+from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
@@ -98,7 +99,7 @@ def _wanted(
     if folder:
         return config_to_play(folder, words, arguments.scenes, console)
     config = config_io.apply_overrides(_config_of_yardsticks(policies, arguments), words)
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 
 @reports_errors("train.evaluate")

@@ -155,3 +155,10 @@ def test_the_preset_of_the_original_code_holds_all_its_values():
     config = config_io.load("turtlebot_ppo_code")
     assert {key: getattr(config.env, key) for key in ORIGINAL_CODE} == ORIGINAL_CODE
     assert config.ppo.discounting == 0.98
+
+
+def test_a_set_of_scenes_stands_for_its_folders():
+    assert config_io.load("turtlebot_ppo", ["env.scenes=sparse/test"]).env.scenes == (
+        "scenes_mjcf/rowan",
+        "scenes_mjcf/willow",
+    )

@@ -14,6 +14,7 @@ from rich.console import Console
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.signals import stop_signals
+from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
 from topological_nav.commands.progress import bar, say, stopping
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
@@ -27,7 +28,7 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     from topological_nav.evaluate.contest import Contest
 
     contest = Contest(
-        scenes=tuple(Path(scene) for scene in scenes),
+        scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
         contenders=tuple(contenders),
         out=out,
         config=overridden(EvaluationConfig(), arguments.settings),

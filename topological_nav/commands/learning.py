@@ -7,6 +7,7 @@ from pathlib import Path
 
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.signals import stop_signals
+from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.progress import asked_by, bar, stopping, tell_line
 from topological_nav.config import (
     DATASET,
@@ -33,7 +34,7 @@ def data(arguments: argparse.Namespace) -> None:
     from topological_nav.figures.maps import dataset_figure, save
 
     with stop_signals() as stops, bar() as tell:
-        header = make_dataset([Path(s) for s in arguments.scenes], out, config, stopping(tell, stops))
+        header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, stopping(tell, stops))
     save(dataset_figure(out), out / "preview.png")
     images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
     for s in header["scenes"]:
@@ -48,7 +49,7 @@ def data(arguments: argparse.Namespace) -> None:
 
 def _drives(arguments: argparse.Namespace) -> None:
     config = overridden(DriveConfig(), arguments.settings)
-    out, scenes = arguments.out or DRIVES, [Path(s) for s in arguments.scenes]
+    out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
     from topological_nav.data.folders import folder_bytes
     from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
     from topological_nav.figures.drive_figures import drives_figure

@@ -63,7 +63,7 @@ def _data(command: Command) -> None:
         DataConfig(),
         drives=DriveConfig(),
     )
-    data.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
+    data.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders or sets of them")
     data.add_argument("--drives", action="store_true", help="drive through the scenes, and render what the robot sees")
     data.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"dataset (default {DATASET}; drives: {DRIVES})")
 
@@ -103,7 +103,7 @@ def _episodes(command: Command) -> None:
     one.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"picture (default {RUNS}/navigate/SCENE-N.png)")
     one.add_argument("--video", type=Path, metavar="PATH", help="film it as well (.mp4), ten times as fast")
     several = command("evaluate", "Plays fixed episodes of scenes and scores them.", EvaluationConfig())
-    several.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
+    several.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders or sets of them")
     several.add_argument(
         "--contenders",
         metavar="NAMES",

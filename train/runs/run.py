@@ -27,6 +27,7 @@ from interactive_nav_common.metrics_file import mean_over_episodes
 from interactive_nav_common.locks import locked
 from interactive_nav_common.signals import stop_signals
 from train.runs import checkpoint, tracking
+from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.learners.algorithms import ALGORITHMS
 from train.runs.checkpoint import CheckpointMeta
@@ -61,14 +62,14 @@ def config_to_play(
     Args:
         folder: of the run.
         words: `env.key=value`; a backend that they name is taken as it is.
-        scenes: folders; None: those that it was trained on.
+        scenes: folders or sets of scenes; None: those that it was trained on.
         console: told of another backend.
 
     Raises:
         UserError: the folder is no run, or a word is wrong.
     """
     config = config_io.apply_overrides(folder.read_config(), words)
-    env = dataclasses.replace(config.env, scenes=tuple(scenes) if scenes else config.env.scenes)
+    env = dataclasses.replace(config.env, scenes=scene_folders(scenes) if scenes else config.env.scenes)
     if not any(word.startswith("env.backend=") for word in words):
         try:
             resolve_backend(env.backend)

@@ -24,6 +24,7 @@ from interactive_nav_common.config import (
     settings_help,
 )
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import TrainConfig, validate
 
@@ -162,7 +163,8 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
         raise ConfigError(f"{where}: name is {config.name!r}, expected one folder name (out_dir says where it lies)")
     if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
-    return dataclasses.replace(config, name=config.name or default_name)
+    evaluate = dataclasses.replace(config.evaluate, scenes=scene_folders(config.evaluate.scenes))
+    return dataclasses.replace(config, name=config.name or default_name, evaluate=evaluate)
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
@@ -199,7 +201,7 @@ def expand(config: SweepConfig, where: str) -> Sweep:
             if _matches(entry["where"], values):
                 launch = overlay(launch, entry["launch"], told, "launch.")
         run = dataclasses.replace(train.run, name=name, out_dir=str(root / "runs"))
-        train = dataclasses.replace(train, run=run)
+        train = config_io.with_scenes(dataclasses.replace(train, run=run))
         validate(train)
         if name in runs:
             raise ConfigError(f"{where}: two runs are named {name!r}; give the grid values that can be told apart")
