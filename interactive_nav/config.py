@@ -176,8 +176,9 @@ class PhysicsConfig(Settings):
         super().__post_init__()
         ratio = self.control_dt_s / self.sim_dt_s
         if abs(ratio - round(ratio)) > 1e-6:
-            told = f"sim_dt_s is {self.sim_dt_s!r}"
-            raise ConfigError(f"{told}, expected a divisor of control_dt_s ({self.control_dt_s} s)")
+            raise ConfigError(
+                f"sim_dt_s is {self.sim_dt_s}, expected a divisor of control_dt_s ({self.control_dt_s} s)"
+            )
 
     @property
     def substeps(self) -> int:
@@ -254,11 +255,6 @@ class NavConfig(Settings):
     """The simulation."""
     sensors: SensorConfig = flat(SensorConfig)
     """What the robot perceives."""
-
-
-def original_code(**settings: Any) -> NavConfig:
-    """All values of the original's code at once (`ORIGINAL_CODE`), and settings by name over them."""
-    return make_config(variant="code", **settings)
 
 
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import interactive_nav
-from interactive_nav.config import ORIGINAL_CODE, make_config, original_code
+from interactive_nav.config import ORIGINAL_CODE, make_config
 from interactive_nav.scenes.contacts import from_sensors, rolling_geoms, sensor_addresses
 from interactive_nav.task.env import SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
@@ -91,7 +91,7 @@ def paper(pushed):
 
 
 def test_the_original_code_at_once():
-    config = original_code(episode_steps=200)
+    config = make_config(variant="code", episode_steps=200)
     changed = {k: getattr(config, k) for k in ORIGINAL_CODE}
     assert changed == {**ORIGINAL_CODE, "episode_steps": 200}
     assert ORIGINAL_CODE["episode_steps"] == 500 and not config.bootstrap_at_time_limit
