@@ -174,10 +174,9 @@ class PhysicsConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        ratio = self.control_dt_s / self.sim_dt_s
-        if abs(ratio - round(ratio)) > 1e-6:
-            told = f"sim_dt_s is {self.sim_dt_s!r}"
-            raise ConfigError(f"{told}, expected a divisor of control_dt_s ({self.control_dt_s} s)")
+        control, sim = self.control_dt_s, self.sim_dt_s
+        if abs(control / sim - round(control / sim)) > 1e-6:
+            raise ConfigError(f"sim_dt_s is {sim}, expected a divisor of control_dt_s ({control} s)")
 
     @property
     def substeps(self) -> int:

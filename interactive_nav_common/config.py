@@ -56,7 +56,6 @@ Natural = Annotated[int, Bounds(0)]
 NotNegative = Annotated[float, Bounds(0)]
 Positive = Annotated[float, Bounds(0, open=True)]
 Share = Annotated[float, (0.0, 1.0)]
-Idle = Sequence[tuple[str, str, Callable[[Any], bool]]]
 
 
 def flat(kind: Callable[[], Config]) -> Config:
@@ -70,7 +69,7 @@ class Settings:
     Lists become tuples. Settings of flat sections can be read from the whole by their names.
     """
 
-    IDLE: ClassVar[Idle] = ()
+    IDLE: ClassVar[Sequence[tuple[str, str, Callable[[Any], bool]]]] = ()
     """Settings that change nothing but where something holds: their names, what, and the test of it. Where it does not,
     they are refused unless they are 0 or their default."""
 
@@ -110,11 +109,9 @@ def _places(config_type: type) -> dict[str, tuple[str, Any]]:
     hints = typing.get_type_hints(config_type, include_extras=True)
     places: dict[str, tuple[str, Any]] = {}
     for field in dataclasses.fields(config_type):
-        inner = _places(hints[field.name]) if "flat" in field.metadata else None
-        if inner is None:
-            places[field.name] = ("", hints[field.name])
-        else:
-            places |= {name: (field.name, hint) for name, (_, hint) in inner.items()}
+        hint = hints[field.name]
+        inner = _places(hint).items() if "flat" in field.metadata else ()
+        places |= {name: (field.name, kind) for name, (_, kind) in inner} or {field.name: ("", hint)}
     return places
 
 
