@@ -26,7 +26,7 @@ from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import RoomImages, load_rooms, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.errors import Asked, RunError, go_on
-from topological_nav.learn.learning import compiled_epoch, initial
+from topological_nav.learn.learning import compiled_epoch, initial, shuffled
 from topological_nav.learn.networks import Network, joined, normalised
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, load_trained, localisation, rows_by_scene, save_trained
@@ -99,9 +99,8 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
     tx, critic_tx = _optimisers(config)
 
     def steps(images, key):
-        size = min(config.batch, len(images))
         key_order, key_source = jax.random.split(key)
-        order = jax.random.permutation(key_order, len(images))[: len(images) // size * size].reshape(-1, size)
+        order = shuffled(key_order, len(images), config.batch)
         return order, jax.random.split(key_source, len(order))
 
     def critic_loss(weights, source, target):

@@ -56,14 +56,11 @@ def export_runs(arguments: argparse.Namespace) -> None:
     config = overridden(ExportConfig(), arguments.settings)
     from topological_nav.figures.export_figure import export_figure
     from topological_nav.figures.maps import save
-    from topological_nav.learn.training import load_trained
-    from topological_nav.weights.export import export, level_images, size_lines
+    from topological_nav.weights.export import export, size_lines
 
     with stop_signals() as stops, bar() as tell:
-        networks = load_trained(arguments.localiser), load_trained(arguments.detector)
-        images = level_images(arguments.images, networks, config.places, stopping(tell, stops))
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
-        made = export(*runs, images, arguments.out, config, stopping(tell, stops))
+        made = export(*runs, arguments.images, arguments.out, config, stopping(tell, stops))
     picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
     save(export_figure(made, config.limit_mib), picture)
     for name, value in made.compared.scores.items():

@@ -40,7 +40,7 @@ from topological_nav.drives.sequences import (
     turning_share,
 )
 from topological_nav.errors import Asked, RunError, go_on
-from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, initial
+from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, initial, shuffled
 from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
@@ -147,7 +147,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
     Labels: the fields of `Sequences`, and numbers `alpha`, `lam` and `jointly` as `policy_loss` has them: one program
     serves a whole grid.
     """
-    tx, most = optax.adam(learning_rate), batch
+    tx = optax.adam(learning_rate)
 
     def loss_of(params, scale, u, batch, weights):
         x = standardised(u, scale)
@@ -172,8 +172,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
 
     def steps(features, key):
         del features
-        size = min(most, count)
-        return (jax.random.permutation(key, count)[: count // size * size].reshape(-1, size),)
+        return (shuffled(key, count, batch),)
 
     def update(learner, features, labels, step):
         (which,) = step

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 
 from interactive_nav_common.errors import ConfigError
 from topological_nav.evaluate.contenders import NavigatorPlayer
-from topological_nav.evaluate.contest import Contest, contest_scenes
+from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.episodes import Episodes
 from topological_nav.evaluate.evaluation import Played, play
 from topological_nav.figures.episode_figures import map_lines, plan_picture, plt, write_video
@@ -22,7 +22,6 @@ from topological_nav.figures.maps import floor_plan
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
 from topological_nav.scenes.simulation import Seen
-from topological_nav.scenes.space import FreeSpace
 
 FILM_EVERY_S = 0.5
 FILM_RATE = 20.0
@@ -36,14 +35,12 @@ BLUE, GREEN, RED = (31, 119, 180), (44, 160, 44), (214, 39, 40)
 class Driven:
     """An episode."""
 
-    scene: str
-    number: int
-    space: FreeSpace
+    venue: ContestScene
     map: TopologicalMap
     journey: Episodes
+    """The one alone."""
     played: Played
     goal_node: int
-    passable: float
     time_s: np.ndarray
     """[t] of every control step."""
     xy_w: np.ndarray
@@ -70,10 +67,11 @@ class Driven:
 
     def figure(self) -> Figure:
         """Path over plan and map."""
-        extent = np.ptp(self.space.centres(0.0), axis=0) + 0.8
+        space, passable = self.venue.space, self.venue.contest.config.navigator.passable
+        extent = np.ptp(space.centres(0.0), axis=0) + 0.8
         figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
-        floor_plan(axis, self.space)
-        map_lines(axis, self.map, self.passable)
+        floor_plan(axis, space)
+        map_lines(axis, self.map, passable)
         axis.plot(*self.xy_w.T, color="tab:blue", linewidth=1.2, zorder=3)
         for name, colour in (("localise", "tab:orange"), ("swing", "tab:purple"), ("lean", "tab:red")):
             here = self.xy_w[self.phase == PHASES.index(name)]
@@ -84,7 +82,9 @@ class Driven:
         style: Any = {"mfc": "none", "mec": "tab:green", "markersize": 11, "zorder": 5}
         axis.plot(*self.map.xy_w[self.goal_node], "s", label="goal's node", **style)
         axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-        axis.set_title(textwrap.fill(f"{self.scene}, episode {self.number}: {self.outcome}", 90), fontsize=9)
+        axis.set_title(
+            textwrap.fill(f"{self.venue.scene.name}, episode {self.journey.number[0]}: {self.outcome}", 90), fontsize=9
+        )
         return figure
 
     def frame(self, step: int, plan: np.ndarray, pixels: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -106,7 +106,7 @@ class Driven:
         x, y = pixels(here)
         draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=RED)
         draw.line([(x, y), tuple(pixels(nose))], fill=RED, width=3)
-        said = f"{self.scene}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}"
+        said = f"{self.venue.scene.name}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}"
         draw.text((6, 4), said, fill=(0, 0, 0))
         view = self.views.get(step)
         if view is None:
@@ -151,22 +151,8 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     played = play(player, venue.simulator, journey, contest.config, lambda _, time_s: progress(time_s))
     assert player.state is not None
     time_s, xy, yaw, phase = zip(*seen_at, strict=True)
-    return Driven(
-        venue.scene.name,
-        number,
-        venue.space,
-        made,
-        journey,
-        played,
-        int(player.state.goal[0]),
-        contest.config.navigator.passable,
-        np.array(time_s),
-        np.array(xy),
-        np.array(yaw),
-        np.array(phase),
-        views,
-        told,
-    )
+    columns = (np.array(column) for column in (time_s, xy, yaw, phase))
+    return Driven(venue, made, journey, played, int(player.state.goal[0]), *columns, views=views, told=told)
 
 
 def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
@@ -193,7 +179,7 @@ def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
 
 def film(driven: Driven, path: Path) -> int:
     """Writes a film, the plan beside the camera's images; returns the number of frames."""
-    plan, pixels = plan_picture(driven.space, driven.map, driven.passable, FILM_HEIGHT)
+    plan, pixels = plan_picture(driven.venue.space, driven.map, driven.venue.contest.config.navigator.passable, FILM_HEIGHT)
     every = (
         max(1, round(FILM_EVERY_S / max(driven.time_s[1] - driven.time_s[0], 1e-3))) if len(driven.time_s) > 1 else 1
     )

@@ -120,10 +120,8 @@ def labelled_epoch(
         return loss, (new.get("batch_stats", stats), right.mean())
 
     def steps(images, key):
-        count = len(images)
-        size = min(batch, count)
         key_order, key_steps = jax.random.split(key)
-        order = jax.random.permutation(key_order, count)[: count // size * size].reshape(-1, size)
+        order = shuffled(key_order, len(images), batch)
         return order, jax.random.split(key_steps, len(order))
 
     def update(learner, images, labels, step):
@@ -155,10 +153,8 @@ def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int)
 
     def steps(images, key):
         places, around = images.shape[:2]
-        count = places * around
-        size = min(batch, count)
         key_order, key_turn, key_steps = jax.random.split(key, 3)
-        order = jax.random.permutation(key_order, count)[: count // size * size].reshape(-1, size)
+        order = shuffled(key_order, places * around, batch)
         turn = jax.random.randint(key_turn, order.shape, -VIEW_STEPS, VIEW_STEPS + 1)
         other = order // around * around + (order % around + turn) % around
         return order, other, jax.random.split(key_steps, len(order))
@@ -173,6 +169,12 @@ def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int)
         return Learner(optax.apply_updates(learner.params, change), stats, opt_state), {"loss": loss}
 
     return compiled_epoch(steps, update)
+
+
+def shuffled(key: jax.Array, count: int, batch: int) -> jax.Array:
+    """[U, batch] rows of an epoch's updates: all in random order, but for a last, incomplete batch."""
+    size = min(batch, count)
+    return jax.random.permutation(key, count)[: count // size * size].reshape(-1, size)
 
 
 def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epoch:

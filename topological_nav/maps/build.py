@@ -84,7 +84,7 @@ def build_map(
     if not len(xy):
         raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)
-    pictures = _Pictures(scene, data, robot, progress, parts)
+    pictures = Pictures(scene, data, robot, progress, parts)
     images = pictures.draw_around(xy, around, "nodes")
     embeddings = localiser.embed(images)
 
@@ -179,10 +179,19 @@ def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
     return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
 
 
-class _Pictures:
-    """Level images of a scene, a chunk at a time, each kept in a file until the map is made."""
+class Pictures:
+    """Level images of a scene, a chunk at a time, each kept in a file until they are not needed any more."""
 
-    def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None):
+    def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None = None):
+        """Draws nothing yet.
+
+        Args:
+            scene: what is drawn.
+            data: how.
+            robot: whose camera draws.
+            progress: told what is drawn, images done and images in all.
+            parts: see `build_map`.
+        """
         self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
         self._done, self.total = 0, 0
         self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()

@@ -38,9 +38,8 @@ from topological_nav.learn.localise import nearest_node
 from topological_nav.learn.pairs import SAME, camera_of, load_pair
 from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
 from topological_nav.learn.training import Trained, load_trained
-from topological_nav.maps.build import CHUNK, renderer_of
+from topological_nav.maps.build import Pictures
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import free_space
 from topological_nav.weights.packaged import ABOUT
 
@@ -86,7 +85,7 @@ def export(
     detector: Path,
     policy: Path | None,
     maps: Path | None,
-    images: np.ndarray,
+    images: Path,
     out: Path,
     config: ExportConfig,
     progress: Progress = lambda *_: None,
@@ -98,10 +97,10 @@ def export(
         detector: of a passage detector.
         policy: of a local policy that learned with both, or None.
         maps: folder of SCENE.npz, all made with both, or None.
-        images: [P, K, H, W, 3] u8 level images around P places, by which exports are compared with runs.
+        images: by which exports are compared with runs, see `level_images`.
         out: the folder.
         config: limits.
-        progress: told what is done, parts done and in all; may raise to stop.
+        progress: told what is drawn or done, how much of it and in all; may raise to stop.
 
     Raises:
         RunError: a run cannot be used, lacks commit or device, or does not survive half precision; or the folder would
@@ -115,6 +114,7 @@ def export(
         raise MapError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
     networks = load_pair(runs["rooms"], runs["passages"], (*SAME, "headings"))
     driver = load_policy(policy, localiser, detector) if policy else None
+    pictures = level_images(images, networks, config.places, progress)
     total = len(runs) + len(files) + 1
     with whole_folder(out, overwrite=True) as made:
         about: dict[str, Any] = {"format": FORMAT, "precision": PRECISION, "networks": {}, "maps": {}}
@@ -126,7 +126,7 @@ def export(
             about["maps"][path.stem] = _export_map(path, made / "maps" / path.name, networks)
         progress("comparing", total - 1, total)
         exported = load_trained(made / "rooms"), load_trained(made / "passages")
-        compared = compare(networks, exported, driver, load_policy(made / "policy") if driver else None, images)
+        compared = compare(networks, exported, driver, load_policy(made / "policy") if driver else None, pictures)
         for name in ("largest_embedding_distance", "largest_probability_difference"):
             if not compared.scores[name] <= config.tolerance:
                 raise RunError(
@@ -263,14 +263,7 @@ def level_images(
     data, scene = camera_of(*networks), load_scene(source)
     robot = get_robot(data.robot)
     xy = free_space(scene, robot.height_m).sample(np.random.default_rng([seed, 19]), places, data.clearance_m)
-    around = headings(data)
-    poses = np.repeat(xy, len(around), 0), np.tile(around, len(xy))
-    renderer, drawn = renderer_of(scene, data), []
-    for first in range(0, len(poses[0]), CHUNK):
-        where, heading = (part[first : first + CHUNK] for part in poses)
-        progress(scene.name, first, len(poses[0]))
-        drawn.append(renderer.draw(camera_pose(robot, where, heading, np.zeros(len(where)))))
-    return np.concatenate(drawn).reshape(len(xy), len(around), *drawn[0].shape[1:])
+    return Pictures(scene, data, robot, progress).draw_around(xy, headings(data), scene.name)
 
 
 def _driven(policy: TrainedPolicy, images: np.ndarray) -> Iterator[np.ndarray]:
