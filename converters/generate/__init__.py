@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.furnish import furnish_plan, no_place
+from converters.generate.design.furnish import Effort, furnish_plan, no_place
 from converters.generate.design.instance import Instance
 from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, make_plan
@@ -62,11 +62,14 @@ def design_building(seed: int, config: BuildingConfig | None = None, max_plans: 
     cfg = (config or BuildingConfig()).validate()
     rng = _streams(seed)[0]
     floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
+    effort = Effort()
     for _ in range(max_plans):
         plan = make_plan(cfg, rng)
-        items = furnish_plan(plan, cfg, rng)
+        items = furnish_plan(plan, cfg, rng, effort)
         if items is not None:
             return Building(plan, tuple(items), floor_height_m)
+        if effort.places <= 0:
+            break
     raise no_place(cfg, seed)
 
 
