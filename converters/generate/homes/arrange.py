@@ -188,7 +188,7 @@ def _satellites(
     out: list[Piece] = []
     sides = list(rng.permutation([1, -1]))
     seats = _seats(host, count, 0.45, rng) if satellite.relation == "around" else []
-    for k in range(count):
+    for k in range(len(seats) or count):
         piece, gap = show.piece(satellite.category, rng), float(rng.uniform(*satellite.gap_m))
         width, _, depth = piece.size_m
         if satellite.relation == "beside":

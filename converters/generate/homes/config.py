@@ -41,7 +41,7 @@ class HomeConfig:
     must_push_turtlebot: Range | None = (0.0, 0.10)
     """Share of the pairs of places between which a disc of the TurtleBot's radius finds no way round the movables
     although there is one with them away; None: any."""
-    must_push_fetch: Range | None = None
+    must_push_fetch: Range | None = (0.0, 0.40)
     """The same for Fetch's."""
 
     @property

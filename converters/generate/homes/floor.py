@@ -28,8 +28,10 @@ STEP_M = 0.05
 """Between places tried along a wall; those in the open are two such steps apart."""
 WINDOW_STRIP_M = 0.25
 """Before a window, where tall furniture does not stand."""
-LOST_M2 = 0.6
-"""Floor that a robot may no longer get to besides what a group stands on, and half as much again."""
+BEYOND_M = 0.8
+"""Floor behind a doorway that is looked at, as if nothing stood there."""
+STRANDED_M2 = 0.2
+"""Floor where a robot fits but does not get to that a group may cut off."""
 
 
 @dataclasses.dataclass
@@ -254,26 +256,31 @@ class Floor:
             boxes: of further furniture.
 
         Returns:
-            Whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, that
-            its middle may be in.
+            Whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, in
+            which its middle could be but to which it does not get from there.
         """
         r = self.plan.rooms[room]
-        rows, columns = self.cells(Rect(r.x0 - 0.3, r.y0 - 0.3, r.x1 + 0.3, r.y1 + 0.3))
-        free = self.inside[rows, columns] & (self.covered[rows, columns] == 0)
+        rows, columns = self.cells(Rect(r.x0 - BEYOND_M, r.y0 - BEYOND_M, r.x1 + BEYOND_M, r.y1 + BEYOND_M))
+        corner = np.array([rows.start, columns.start])
+
+        def here(rect: Rect) -> tuple[slice, slice]:
+            window = zip(self.cells(rect), corner, free.shape, strict=True)
+            y, x = (slice(max(s.start - low, 0), min(max(s.stop - low, 0), n)) for s, low, n in window)
+            return y, x
+
+        own = self.room[rows, columns] == room
+        free = own.copy()
         doorways = [d for d in self.plan.doorways if room in d.rooms]
-        passable = self.room[rows, columns] == room
-        for doorway in doorways:
-            y, x = self.cells(doorway.rect)
-            passable[y.start - rows.start : y.stop - rows.start, x.start - columns.start : x.stop - columns.start] = True
-        free &= passable
+        for doorway in doorways:  # the floor behind a doorway counts as free
+            free[here(doorway_zone(doorway, BEYOND_M, 0.0))] = True
+        free &= ~own | (self.covered[rows, columns] == 0)
         for box in boxes or []:
-            y, x = self.cells(box)
-            free[max(y.start - rows.start, 0) : y.stop - rows.start, max(x.start - columns.start, 0) : x.stop - columns.start] = False
+            free[here(box)] = False
         region = regions(clearance_m(free, CELL_M) >= radius_m)
         at = []
         for doorway in doorways:
             x, y = doorway.rect.centre
-            column, row = int((x - self.low[0]) / CELL_M) - columns.start, int((y - self.low[1]) / CELL_M) - rows.start
-            at.append(int(region[row, column]))
+            row, column = (np.array([y, x]) - self.low[::-1]) // CELL_M - corner
+            at.append(int(region[int(row), int(column)]))
         main = at[0] if at else int(np.bincount(region.ravel())[1:].argmax() + 1) if region.any() else 0
-        return main > 0 and set(at) <= {main}, float((region == main).sum() * CELL_M**2) if main else 0.0
+        return main > 0 and set(at) <= {main}, float(((region > 0) & (region != main)).sum() * CELL_M**2)

@@ -12,7 +12,7 @@ from converters.generate.design.furnish import hang_doors
 from converters.generate.design.plan import Plan, Rect
 from converters.generate.homes.arrange import Arrangement, Showroom, arrange, stand
 from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
-from converters.generate.homes.floor import LOST_M2, Floor, Places
+from converters.generate.homes.floor import STRANDED_M2, Floor, Places
 from converters.generate.homes.groups import GROUPS, ROOM_SETS, RoomSet
 from converters.geometry.density import ROBOT_RADIUS_M
 
@@ -95,12 +95,11 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
         best = possible[np.argsort(-liking, kind="stable")[:LOOKS]]
         ranked += [(liking[possible == i][0], way, places.origin[i], int(places.side[i]), fits[i]) for i in best]
     ranked.sort(key=lambda r: -r[0])
-    joined, area_m2 = floor.reach(room, radius_m)
+    joined, stranded_m2 = floor.reach(room, radius_m)
     for _, way, origin, side, fits in ranked[:LOOKS]:
         boxes = _boxes(way, fits, origin, side)
-        still, left_m2 = floor.reach(room, radius_m, boxes)
-        lost_m2 = LOST_M2 + 1.5 * sum(b.area_m2 for b in boxes)
-        if (still or not joined) and left_m2 >= area_m2 - lost_m2:
+        still, cut_off_m2 = floor.reach(room, radius_m, boxes)
+        if (still or not joined) and cut_off_m2 <= stranded_m2 + STRANDED_M2:
             _stand_group(home, name, way, origin, side, fits, room)
             return True
     return False
@@ -181,13 +180,18 @@ def stand_clutter(home: Home) -> None:
         _clutter(home, int(room))
 
 
+def clutter_category(home: Home, room: int) -> str | None:
+    """A category of what lies about in a room; None where there are no models of any."""
+    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c)]
+    if not odds:
+        return None
+    weights = np.array([w for _, w in odds])
+    return odds[home.rng.choice(len(odds), p=weights / weights.sum())][0]
+
+
 def _clutter(home: Home, room: int) -> bool:
-    odds = ROOM_SETS[home.uses[room]].clutter
-    names = [c for c, _ in odds if home.show.has(c)]
-    if not names:
-        return False
-    weights = np.array([w for c, w in odds if c in names])
-    return try_group(home, names[home.rng.choice(len(names), p=weights / weights.sum())], room, home.narrow_m)
+    name = clutter_category(home, room)
+    return name is not None and try_group(home, name, room, home.narrow_m)
 
 
 def grow(home: Home) -> None:

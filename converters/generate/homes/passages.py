@@ -1,0 +1,188 @@
+"""A furnished home in; the same home with passages narrowed or cleared until as much must be pushed as asked for, out.
+
+A bounded search: one light piece is taken from where it stands and put into a passage or out of the way, what is then
+reached is measured, and the piece stays there where that is nearer to the ranges asked for.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+
+from converters.generate.design.config import GenerationError
+from converters.generate.design.instance import Instance, place
+from converters.generate.homes.arrange import Arrangement, Piece
+from converters.generate.homes.config import SHARE_TOLERANCE, Range
+from converters.generate.homes.floor import CELL_M, Standing
+from converters.generate.homes.furnish import Home, clutter_category, settle
+from converters.generate.homes.groups import LIGHT, Group
+from converters.geometry.density import ROBOT_RADIUS_M, Ways, clearance_m
+
+MOST_MOVES = 400
+"""Moves tried."""
+BEFORE_M = (0.15, 0.85)
+"""From a doorway's middle to a piece that narrows it, along the way through."""
+PASSAGE_M = (0.15, 0.60)
+"""Clearance in the middle of what is taken for a passage."""
+
+
+GROUP_ALONE = Group("", "anywhere")
+
+
+def miss(shares: dict[str, float], wanted: dict[str, Range]) -> float:
+    """How far shares lie from their ranges, summed."""
+    return sum(max(low - shares[robot], shares[robot] - high, 0.0) for robot, (low, high) in wanted.items())
+
+
+class Passages:
+    """A home's floor as robots see it. Mutable, private to one search."""
+
+    def __init__(self, home: Home):
+        self.home = home
+        floor = home.floor
+        static = floor.inside & ~floor.fixed
+        self.ways = {robot: Ways.of(static, CELL_M, radius) for robot, radius in ROBOT_RADIUS_M.items()}
+        self.shares = self.measure()
+
+    def measure(self) -> dict[str, float]:
+        """Robot -> share of pairs between which it must push, as the furniture stands now."""
+        room_m = self.room_m()
+        return {robot: ways.must_push_share(room_m) for robot, ways in self.ways.items()}
+
+    def room_m(self) -> np.ndarray:
+        """Clearance of the floor as the furniture stands now."""
+        floor = self.home.floor
+        return clearance_m(floor.inside & (floor.covered == 0), CELL_M)
+
+    def miss(self) -> float:
+        """How far the measured shares lie from what is asked for."""
+        return miss(self.shares, self.home.cfg.must_push)
+
+    def light(self) -> list[Standing]:
+        """What can be moved: light pieces, seats round tables among them."""
+        return [s for s in self.home.floor.standing if s.item.model.category in LIGHT]
+
+    def try_move(self, piece: Standing | None, item: Instance, room: int) -> bool:
+        """Puts a piece (None: a new one) where the item says, if that is nearer to what is asked for."""
+        floor = self.home.floor
+        before, standing = self.shares, floor.standing
+        if piece is not None:
+            floor.remove(piece)
+        window, shadow = floor.raster([item.footprint.buffer(0.02)])
+        free = floor.inside[window] & (floor.covered[window] == 0) & ~floor.swept[window]
+        added = floor.add(item, room, item.model.category) if (free | ~shadow).all() else None
+        if added is not None:
+            self.shares = self.measure()
+            if miss(self.shares, self.home.cfg.must_push) < miss(before, self.home.cfg.must_push) - 1e-4:
+                return True
+            floor.cover(added, -1)
+        if piece is not None:
+            floor.cover(piece, 1)
+        floor.standing, self.shares = standing, before
+        return False
+
+    def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
+        """A random place in a passage, half of the time before a doorway, and its room."""
+        floor, plan = self.home.floor, self.home.plan
+        if rng.random() < 0.5:
+            d = plan.doorways[rng.integers(len(plan.doorways))]
+            side = int(rng.integers(2))
+            xy = np.array(d.rect.centre)
+            xy[d.axis] += (1 if side else -1) * (d.rect.size[d.axis] / 2 + rng.uniform(*BEFORE_M))
+            xy[1 - d.axis] += rng.uniform(-0.5, 0.5)
+            return xy, d.rooms[side]
+        room_m = self.room_m()
+        # The ridge of the clearance: as far from what stands left as from what stands right.
+        ridge = (room_m > PASSAGE_M[0]) & (room_m < PASSAGE_M[1]) & (floor.room >= 0)
+        ridge &= _ridge(room_m)
+        cells = np.argwhere(ridge)
+        if not len(cells):
+            return None
+        row, column = cells[rng.integers(len(cells))]
+        xy = floor.low + (np.array([column, row]) + 0.5) * CELL_M + rng.uniform(-0.1, 0.1, 2)
+        return xy, int(floor.room[row, column])
+
+
+def _ridge(room_m: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: cells that are at least as clear as both neighbours across, along rows or columns."""
+    out = np.zeros(room_m.shape, bool)
+    for axis in (0, 1):
+        out |= (room_m >= np.roll(room_m, 1, axis)) & (room_m >= np.roll(room_m, -1, axis))
+    return out
+
+
+def adjust(home: Home) -> dict[str, float]:
+    """Moves light pieces until the shares that must be pushed lie in the ranges asked for.
+
+    Args:
+        home: changed in place; how full it is stays as it is, within its tolerance.
+
+    Returns:
+        Robot -> share of pairs between which it must push.
+
+    Raises:
+        GenerationError: the ranges are not reached.
+    """
+    rng, passages = home.rng, Passages(home)
+    wanted = home.cfg.must_push
+    for _ in range(MOST_MOVES):
+        if passages.miss() < 1e-6:
+            return passages.shares
+        too_low = any(passages.shares[robot] < low for robot, (low, _) in wanted.items())
+        too_high = any(passages.shares[robot] > high for robot, (_, high) in wanted.items())
+        if too_low and (not too_high or rng.random() < 0.5):
+            _narrow(home, passages)
+        else:
+            _clear(home, passages)
+    if passages.miss() < 1e-6:
+        return passages.shares
+    got = ", ".join(f"must_push_{robot} is {list(wanted[robot])}, got {passages.shares[robot]:.2f}" for robot in wanted)
+    raise GenerationError(f"{got} after {MOST_MOVES} moves: ask for a wider range or another furniture_share")
+
+
+def _narrow(home: Home, passages: Passages) -> None:
+    """Tries one light piece in a passage."""
+    rng, floor = home.rng, home.floor
+    place_at = passages.narrowing(rng)
+    if place_at is None:
+        return
+    xy, room = place_at
+    alone = [s for s in passages.light() if ":" not in s.group]
+    if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
+        piece = alone[rng.integers(len(alone))]
+        model, scale = piece.item.model, piece.item.scale
+    else:
+        piece, category = None, clutter_category(home, room)
+        if category is None or floor.share > home.cfg.furniture_share + 0.6 * SHARE_TOLERANCE:
+            return
+        model, scale = home.show.draw(category, rng)
+    passages.try_move(piece, place(model, scale, xy, float(rng.uniform(-math.pi, math.pi))), room)
+
+
+def _clear(home: Home, passages: Passages) -> None:
+    """Tries to put one piece out of the way that bars it: to where its room, or another, has place for it."""
+    rng, floor = home.rng, home.floor
+    light = passages.light()
+    if not light:
+        return
+    piece = light[rng.integers(len(light))]
+    before, standing = passages.shares, floor.standing
+    floor.remove(piece)
+    passages.shares = passages.measure()
+    if miss(passages.shares, home.cfg.must_push) < miss(before, home.cfg.must_push) - 1e-4:
+        alone = Arrangement(GROUP_ALONE, (Piece(piece.item.model, piece.item.scale, 0.0, 0.0, float(rng.uniform(-3, 3))),), None)
+        for room in (piece.room, *rng.permutation(len(home.plan.rooms))[:3]):
+            if settle(home, piece.item.model.category, alone, int(room), home.narrow_m):
+                passages.shares = passages.measure()
+                break
+        if (
+            miss(passages.shares, home.cfg.must_push) < miss(before, home.cfg.must_push) - 1e-4
+            and floor.share > home.cfg.furniture_share - SHARE_TOLERANCE
+        ):
+            return
+        for added in [s for s in floor.standing if not any(s is old for old in standing)]:
+            floor.remove(added)
+    floor.cover(piece, 1)
+    floor.standing, passages.shares = standing, before
