@@ -150,9 +150,7 @@ def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, _Wall, R
     )
 
 
-def _split(
-    rect: Rect, parts: Parts, cfg: BuildingConfig, rng: np.random.Generator
-) -> tuple[list[Rect], list[_Wall]]:
+def _split(rect: Rect, parts: Parts, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Rect], list[_Wall]]:
     """Cuts a rectangle into rooms, always across its longer side (mostly)."""
     n = len(parts.weights)
     if n == 1:
@@ -359,9 +357,7 @@ def _windows(
     return boxes
 
 
-def make_plan(
-    cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000, parts: Parts | None = None
-) -> Plan:
+def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000, parts: Parts | None = None) -> Plan:
     """Draws a plan.
 
     Args:

@@ -24,6 +24,8 @@ from scenes_mjcf.categories import CATEGORIES
 WALL_GAP_M = (0.02, 0.06)
 """Between a wall and what stands at it; what is built in touches it."""
 UNDER_STEP_M = 0.04
+SEAT_M = 0.52
+"""Of a table's side for each seat."""
 TOUCH_M = 0.004
 """Parts this close are taken to touch: boxes that stand for them when physics runs are a little larger."""
 
@@ -54,6 +56,12 @@ class Piece:
         return (c * width + s * depth) / 2, (s * width + c * depth) / 2
 
     @property
+    def corners_m(self) -> tuple[float, float, float, float]:
+        """u0, v0, u1, v1 of the rectangle around it."""
+        (hu, hv), u, v = self.half_m, self.u, self.v
+        return u - hu, v - hv, u + hu, v + hv
+
+    @property
     def built_in(self) -> bool:
         """It is part of the building."""
         return not CATEGORIES[self.model.category].is_object
@@ -76,10 +84,15 @@ class Arrangement:
         return Arrangement(self.group, pieces, front)
 
 
+def on_floor(origin: np.ndarray, facing_rad: float, u: float, v: float) -> np.ndarray:
+    """(2,) place on the floor of a point of a group's frame."""
+    c, s = math.cos(facing_rad), math.sin(facing_rad)
+    return origin + np.array([s * u + c * v, -c * u + s * v])
+
+
 def stand(piece: Piece, origin: np.ndarray, facing_rad: float) -> Instance:
     """A piece where it stands, its group's origin at (2,) `origin` of the floor and the v axis along `facing_rad`."""
-    c, s = math.cos(facing_rad), math.sin(facing_rad)
-    xy = origin + np.array([s * piece.u + c * piece.v, -c * piece.u + s * piece.v])
+    xy = on_floor(origin, facing_rad, piece.u, piece.v)
     return place(piece.model, piece.scale, xy, facing_rad + piece.turn_rad)
 
 
@@ -164,13 +177,13 @@ def _facing(
     return _pulled_out(host, others, poses)
 
 
-def _seats(host: Piece, count: int, width_m: float, rng: np.random.Generator) -> list[tuple[int, float]]:
+def _seats(host: Piece, count: int, at_wall: bool, rng: np.random.Generator) -> list[tuple[int, float]]:
     """(side, slide along it) of seats round a table: long sides first, as many as fit beside each other."""
     width, _, depth = host.size_m
     places: list[tuple[int, float]] = []
-    room = {side: max(1, int((width, depth)[side % 2] / (width_m + 0.06))) for side in range(4)}
+    room = {side: max(1, int((width, depth)[side % 2] / SEAT_M)) for side in range(4)}
     order = (0, 2, 1, 3) if width >= depth else (1, 3, 0, 2)
-    for side in order:
+    for side in (k for k in order if k != 2 or not at_wall):
         length = (width, depth)[side % 2]
         places += [(side, length * ((k + 0.5) / room[side] - 0.5)) for k in range(room[side])]
     left = list(places[: max(count, 2)])
@@ -187,7 +200,7 @@ def _satellites(
 
     out: list[Piece] = []
     sides = list(rng.permutation([1, -1]))
-    seats = _seats(host, count, 0.45, rng) if satellite.relation == "around" else []
+    seats = _seats(host, count, host.v > 0, rng) if satellite.relation == "around" else []
     for k in range(len(seats) or count):
         piece, gap = show.piece(satellite.category, rng), float(rng.uniform(*satellite.gap_m))
         width, _, depth = piece.size_m

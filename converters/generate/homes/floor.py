@@ -113,7 +113,9 @@ class Floor:
         x1, y1 = bounds[:, 2:].max(axis=0)
         window = self.cells(Rect(x0 - CELL_M, y0 - CELL_M, x1 + CELL_M, y1 + CELL_M))
         window = tuple(slice(s.start, min(s.stop, n)) for s, n in zip(window, self.shape, strict=True))
-        ys, xs = ((np.arange(s.start, s.stop) + 0.5) * CELL_M + low for s, low in zip(window, self.low[::-1], strict=True))
+        ys, xs = (
+            (np.arange(s.start, s.stop) + 0.5) * CELL_M + low for s, low in zip(window, self.low[::-1], strict=True)
+        )
         grid = np.meshgrid(xs, ys)
         inside = np.zeros(grid[0].shape, bool)
         for shape in shapes:
@@ -224,7 +226,7 @@ class Floor:
         low, sums = self._room_sums(room)
         fits = np.ones((len(places.side), len(arrangement.pieces)), bool)
         for k, piece in enumerate(arrangement.pieces):
-            box = np.array([piece.u, piece.v, piece.u, piece.v]) + np.array([-1, -1, 1, 1]) * np.tile(piece.half_m, 2)
+            box = np.array(piece.corners_m)
             fits[:, k] = self.hindered(box, places, low, sums["wall"]) == 0
             fits[:, k] &= self.hindered(box, places, low, sums["taken"], GAP_M) == 0
             fits[:, k] &= self.hindered(box, places, low, sums["swept"]) == 0

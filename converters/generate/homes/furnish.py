@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 
 import numpy as np
 
 from converters.generate.design.config import GenerationError
 from converters.generate.design.furnish import hang_doors
 from converters.generate.design.plan import Plan, Rect
-from converters.generate.homes.arrange import Arrangement, Showroom, arrange, stand
+from converters.generate.homes.arrange import Arrangement, Showroom, arrange, on_floor, stand
 from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
-from converters.generate.homes.floor import STRANDED_M2, Floor, Places
-from converters.generate.homes.groups import GROUPS, ROOM_SETS, RoomSet
+from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
+from converters.generate.homes.groups import ALIKE, GROUPS, ROOM_SETS, RoomSet
 from converters.geometry.density import ROBOT_RADIUS_M
 
 LOOKS = 8
@@ -49,14 +50,17 @@ class Home:
         return sum(s.group == group and s.room == room for s in self.floor.standing)
 
 
-def _preference(arrangement: Arrangement, places: Places, floor: Floor, room: int, rng: np.random.Generator) -> np.ndarray:
+def _preference(
+    arrangement: Arrangement, places: Places, floor: Floor, room: int, rng: np.random.Generator
+) -> np.ndarray:
     """(n,) how much a group likes each place."""
     liking = rng.uniform(0.0, 0.6, len(places.side))
     at, half = arrangement.group.at, arrangement.pieces[0].half_m[0]
     if at == "corner":
         return liking - 6.0 * np.minimum(places.ends.min(axis=1) - half, 0.5)
     if at == "window":
-        return liking + 2.0 * (floor.windows_behind(arrangement, places, room) > 0)
+        before = floor.windows_behind(arrangement, places, room) > 0
+        return np.where(before, liking + 2.0, -np.inf if arrangement.pieces[0].built_in else liking)
     if at == "free":
         return liking + 0.8 * np.minimum(places.ends.min(axis=1), 1.5)
     if at == "anywhere":  # most things lie near walls, some in the way
@@ -66,16 +70,17 @@ def _preference(arrangement: Arrangement, places: Places, floor: Floor, room: in
     return liking - 0.5 * ((slit > 0.06) & (slit < 0.5))
 
 
+def _on_floor(corners: tuple[float, float, float, float], origin: np.ndarray, side: int) -> Rect:
+    """A rectangle u0, v0, u1, v1 of a group's frame, on the floor."""
+    a, b = (on_floor(origin, side * math.pi / 2, *corner) for corner in (corners[:2], corners[2:]))
+    (x0, y0), (x1, y1) = np.minimum(a, b), np.maximum(a, b)
+    return Rect(x0, y0, x1, y1)
+
+
 def _boxes(arrangement: Arrangement, fits: np.ndarray, origin: np.ndarray, side: int) -> list[Rect]:
     """Bounding rectangles of the pieces that fit."""
-    c, s = (1, 0, -1, 0)[side], (0, 1, 0, -1)[side]
-    out = []
-    for piece, here in zip(arrangement.pieces, fits, strict=True):
-        if here:
-            x, y = origin + np.array([s * piece.u + c * piece.v, -c * piece.u + s * piece.v])
-            hx, hy = piece.half_m if side % 2 else piece.half_m[::-1]
-            out.append(Rect(x - hx, y - hy, x + hx, y + hy))
-    return out
+    there = [piece for piece, here in zip(arrangement.pieces, fits, strict=True) if here]
+    return [_on_floor(piece.corners_m, origin, side) for piece in there]
 
 
 def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m: float) -> bool:
@@ -92,6 +97,7 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
         needed = np.array([k == 0 or p.needed for k, p in enumerate(way.pieces)])
         possible = np.flatnonzero(fits[:, needed].all(axis=1))
         liking = _preference(way, places, floor, room, rng)[possible] + 0.7 * fits[possible].sum(axis=1)
+        possible, liking = possible[liking > -np.inf], liking[liking > -np.inf]
         best = possible[np.argsort(-liking, kind="stable")[:LOOKS]]
         ranked += [(liking[possible == i][0], way, places.origin[i], int(places.side[i]), fits[i]) for i in best]
     ranked.sort(key=lambda r: -r[0])
@@ -115,14 +121,15 @@ def _stand_group(
         if fits[k]:
             floor.add(stand(piece, origin, facing), room, name if k == 0 else f"{name}: {piece.model.category}")
     if way.front is not None:
-        c, s = (1, 0, -1, 0)[side], (0, 1, 0, -1)[side]
-        u0, v0, u1, v1 = way.front
-        xs, ys = zip(*(origin + np.array([s * u + c * v, -c * u + s * v]) for u, v in ((u0, v0), (u1, v1))), strict=True)
-        floor.front[floor.cells(Rect(min(xs), min(ys), max(xs), max(ys)))] = True
+        floor.front[floor.cells(_on_floor(way.front, origin, side))] = True
 
 
 def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
-    """Tries to stand a group in a room, with several models and shorter rows; False where it does not fit or is too much."""
+    """Tries to stand a group in a room, with several models and shorter rows.
+
+    Returns:
+        False where it does not fit, or is more than the share asked for.
+    """
     rows = any(s.relation == "next" for s in GROUPS[name].satellites) if name in GROUPS else False
     most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
     for fewer in range(FEWEST + 1 if rows else REDRAWS if name in GROUPS else 1):
@@ -130,7 +137,7 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
         if arrangement is None:
             return False
         area_m2 = sum(p.size_m[0] * p.size_m[2] for p in arrangement.pieces)
-        more = area_m2 / (home.floor.floor_cells * 0.025**2)
+        more = area_m2 / (home.floor.floor_cells * CELL_M**2)
         if home.floor.share + more <= most and settle(home, name, arrangement, room, radius_m):
             return True
     return False
@@ -182,7 +189,8 @@ def stand_clutter(home: Home) -> None:
 
 def clutter_category(home: Home, room: int) -> str | None:
     """A category of what lies about in a room; None where there are no models of any."""
-    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c)]
+    here = Counter(s.item.model.category for s in home.floor.standing if s.room == room)
+    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c) and here[c] < ALIKE.get(c, 4)]
     if not odds:
         return None
     weights = np.array([w for _, w in odds])

@@ -64,7 +64,7 @@ def _row(*categories: str) -> tuple[Satellite, ...]:
     return tuple(Satellite(c, "next", gap_m=(0.0, 0.01), turn_deg=0.0, needed=True) for c in categories)
 
 
-_CHAIR_AT_DESK = Satellite("chair", "before", gap_m=(-0.14, 0.10), turn_deg=25)
+_CHAIR_AT_DESK = Satellite("chair", "before", gap_m=(-0.14, 0.10), turn_deg=25, needed=True)
 GROUPS: dict[str, Group] = {
     # To sleep.
     "bed": Group("bed", "wall", (
@@ -86,7 +86,9 @@ GROUPS: dict[str, Group] = {
         Satellite("coffee_table", "before", gap_m=(0.32, 0.45)),
         Satellite("armchair", "flank", (0, 1), (0.30, 0.45), 20, host="coffee_table"),
     )),
-    "reading corner": Group("armchair", "corner", (Satellite("floor_lamp", "beside", gap_m=(0.05, 0.15), share=0.8),), 0.3),
+    "reading corner": Group("armchair", "corner", (
+        Satellite("floor_lamp", "beside", gap_m=(0.05, 0.15), share=0.8),
+    ), 0.3),
     "bench": Group("bench", "wall", (), 0.4),
     # To eat and cook.
     "dining table": Group("table", "free", (Satellite("chair", "around", (3, 6), (-0.16, 0.02), 15),)),
@@ -124,8 +126,8 @@ GROUPS: dict[str, Group] = {
 
 ROOM_SETS: dict[str, RoomSet] = {
     "living": RoomSet(
-        (("television", 1.0), ("bookcase", 0.8), ("sideboard", 0.6), ("reading corner", 0.5), ("plant", 0.8), ("lamp", 0.4),
-         ("desk", 0.2)),
+        (("television", 1.0), ("bookcase", 0.8), ("sideboard", 0.6), ("reading corner", 0.5), ("plant", 0.8),
+         ("lamp", 0.4), ("desk", 0.2)),
         (("sofa", 1.0), ("bookcase", 2.0), ("sideboard", 1.5), ("reading corner", 1.5), ("plant", 1.5), ("lamp", 1.0),
          ("dresser", 0.7), ("small table", 0.7), ("desk", 0.5), ("stored boxes", 0.5)),
         (("box", 1.0), ("bag", 1.0), ("pouf", 1.5), ("stool", 0.7), ("chair", 0.7), ("cart", 0.4), ("plant", 0.5),
@@ -145,8 +147,9 @@ ROOM_SETS: dict[str, RoomSet] = {
     ),
     "bedroom": RoomSet(
         (("bed", 1.0), ("wardrobe", 0.9), ("dresser", 0.7), ("desk", 0.4), ("laundry", 0.4), ("plant", 0.3)),
-        (("wardrobe", 1.5), ("dresser", 1.5), ("desk", 1.0), ("bookcase", 1.2), ("second bed", 0.8), ("reading corner", 1.0),
-         ("shelf", 0.4), ("laundry", 1.0), ("plant", 0.7), ("lamp", 0.7), ("stored boxes", 0.7), ("bench", 0.4)),
+        (("wardrobe", 1.5), ("dresser", 1.5), ("desk", 1.0), ("bookcase", 1.2), ("second bed", 0.8),
+         ("reading corner", 1.0), ("shelf", 0.4), ("laundry", 1.0), ("plant", 0.7), ("lamp", 0.7),
+         ("stored boxes", 0.7), ("bench", 0.4)),
         (("laundry_basket", 1.0), ("box", 1.0), ("bag", 1.5), ("suitcase", 1.0), ("drying_rack", 0.7), ("chair", 0.8),
          ("pouf", 0.8), ("stool", 0.5)),
         1.15,
@@ -158,8 +161,8 @@ ROOM_SETS: dict[str, RoomSet] = {
     ),
     "office": RoomSet(
         (("desk", 1.0), ("bookcase", 0.9), ("reading corner", 0.5), ("shelf", 0.3), ("waste", 0.5)),
-        (("bookcase", 2.0), ("second desk", 1.2), ("sofa", 0.7), ("shelf", 1.0), ("dresser", 0.7), ("stored boxes", 1.0),
-         ("plant", 1.0), ("lamp", 0.7), ("reading corner", 0.7)),
+        (("bookcase", 2.0), ("second desk", 1.2), ("sofa", 0.7), ("shelf", 1.0), ("dresser", 0.7),
+         ("stored boxes", 1.0), ("plant", 1.0), ("lamp", 0.7), ("reading corner", 0.7)),
         (("box", 2.0), ("bag", 1.5), ("chair", 1.0), ("bin", 0.7), ("pouf", 0.5), ("cart", 0.4)),
     ),
     "hall": RoomSet(
@@ -176,7 +179,9 @@ ROOM_SETS: dict[str, RoomSet] = {
         1.2,
     ),
 }  # fmt: skip
-"""Use of a room -> what it has. A room without a kitchen or a dining room beside it has its table in the living room."""
+"""Use of a room -> what it has. A home without a dining room may have its table in the living room."""
+ALIKE = {"laundry_basket": 1, "drying_rack": 1, "bin": 1, "cart": 1, "shoe_rack": 1, "plant": 2, "chair": 3}
+"""Category -> most that lie about in one room; of others, four."""
 
 LIGHT = frozenset(
     ("chair", "stool", "pouf", "box", "bag", "bin", "plant", "laundry_basket", "suitcase", "cart", "drying_rack")

@@ -7,12 +7,12 @@ reached is measured, and the piece stays there where that is nearer to the range
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
-import shapely
 
 from converters.generate.design.config import GenerationError
-from converters.generate.design.instance import Instance, place
+from converters.generate.design.instance import place
 from converters.generate.homes.arrange import Arrangement, Piece
 from converters.generate.homes.config import SHARE_TOLERANCE, Range
 from converters.generate.homes.floor import CELL_M, Standing
@@ -28,7 +28,10 @@ PASSAGE_M = (0.15, 0.60)
 """Clearance in the middle of what is taken for a passage."""
 
 
-GROUP_ALONE = Group("", "anywhere")
+ROUND_M = 0.02
+"""Between a piece put into a passage and what stands there."""
+LEAST_GAIN = 1e-4
+"""A move that brings less is none."""
 
 
 def miss(shares: dict[str, float], wanted: dict[str, Range]) -> float:
@@ -64,23 +67,25 @@ class Passages:
         """What can be moved: light pieces, seats round tables among them."""
         return [s for s in self.home.floor.standing if s.item.model.category in LIGHT]
 
-    def try_move(self, piece: Standing | None, item: Instance, room: int) -> bool:
-        """Puts a piece (None: a new one) where the item says, if that is nearer to what is asked for."""
-        floor = self.home.floor
-        before, standing = self.shares, floor.standing
-        if piece is not None:
-            floor.remove(piece)
-        window, shadow = floor.raster([item.footprint.buffer(0.02)])
-        free = floor.inside[window] & (floor.covered[window] == 0) & ~floor.swept[window]
-        added = floor.add(item, room, item.model.category) if (free | ~shadow).all() else None
-        if added is not None:
+    def trial(self, change: Callable[[], bool]) -> bool:
+        """Keeps a change of what stands where that is nearer to what is asked for; undoes it otherwise.
+
+        Args:
+            change: changes the home; False where it could not.
+        """
+        floor, cfg = self.home.floor, self.home.cfg
+        shares, standing = self.shares, floor.standing
+        if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
             self.shares = self.measure()
-            if miss(self.shares, self.home.cfg.must_push) < miss(before, self.home.cfg.must_push) - 1e-4:
+            if miss(self.shares, cfg.must_push) < miss(shares, cfg.must_push) - LEAST_GAIN:
                 return True
-            floor.cover(added, -1)
-        if piece is not None:
-            floor.cover(piece, 1)
-        floor.standing, self.shares = standing, before
+        for piece in floor.standing:
+            if not any(piece is old for old in standing):
+                floor.cover(piece, -1)
+        for piece in standing:
+            if not any(piece is new for new in floor.standing):
+                floor.cover(piece, 1)
+        floor.standing, self.shares = standing, shares
         return False
 
     def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
@@ -150,39 +155,46 @@ def _narrow(home: Home, passages: Passages) -> None:
         return
     xy, room = place_at
     alone = [s for s in passages.light() if ":" not in s.group]
+    piece, category = None, clutter_category(home, room)
     if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
         piece = alone[rng.integers(len(alone))]
         model, scale = piece.item.model, piece.item.scale
-    else:
-        piece, category = None, clutter_category(home, room)
-        if category is None or floor.share > home.cfg.furniture_share + 0.6 * SHARE_TOLERANCE:
-            return
+    elif category in LIGHT and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
         model, scale = home.show.draw(category, rng)
-    passages.try_move(piece, place(model, scale, xy, float(rng.uniform(-math.pi, math.pi))), room)
+    else:
+        return
+    item = place(model, scale, xy, float(rng.uniform(-math.pi, math.pi)))
+
+    def change() -> bool:
+        if piece is not None:
+            floor.remove(piece)
+        window, shadow = floor.raster([item.footprint.buffer(ROUND_M)])
+        free = floor.inside[window] & (floor.covered[window] == 0) & ~floor.swept[window]
+        if not (free | ~shadow).all():
+            return False
+        floor.add(item, room, model.category)
+        return True
+
+    passages.trial(change)
 
 
 def _clear(home: Home, passages: Passages) -> None:
-    """Tries to put one piece out of the way that bars it: to where its room, or another, has place for it."""
+    """Tries to put one light piece that bars a way to where its room, or another, has place for it."""
     rng, floor = home.rng, home.floor
     light = passages.light()
     if not light:
         return
     piece = light[rng.integers(len(light))]
-    before, standing = passages.shares, floor.standing
-    floor.remove(piece)
-    passages.shares = passages.measure()
-    if miss(passages.shares, home.cfg.must_push) < miss(before, home.cfg.must_push) - 1e-4:
-        alone = Arrangement(GROUP_ALONE, (Piece(piece.item.model, piece.item.scale, 0.0, 0.0, float(rng.uniform(-3, 3))),), None)
-        for room in (piece.room, *rng.permutation(len(home.plan.rooms))[:3]):
-            if settle(home, piece.item.model.category, alone, int(room), home.narrow_m):
-                passages.shares = passages.measure()
-                break
-        if (
-            miss(passages.shares, home.cfg.must_push) < miss(before, home.cfg.must_push) - 1e-4
-            and floor.share > home.cfg.furniture_share - SHARE_TOLERANCE
-        ):
-            return
-        for added in [s for s in floor.standing if not any(s is old for old in standing)]:
-            floor.remove(added)
-    floor.cover(piece, 1)
-    floor.standing, passages.shares = standing, before
+    model, scale = piece.item.model, piece.item.scale
+    group = Group(model.category, "anywhere")
+    alone = Arrangement(group, (Piece(model, scale, 0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),), None)
+    rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
+
+    def change() -> bool:
+        floor.remove(piece)
+        if miss(passages.measure(), home.cfg.must_push) >= passages.miss() - LEAST_GAIN:
+            return False
+        any(settle(home, model.category, alone, room, home.narrow_m) for room in rooms)
+        return True
+
+    passages.trial(change)

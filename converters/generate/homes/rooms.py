@@ -56,7 +56,7 @@ EVENER = 0.75
 
 def programme(n_rooms: int, rng: np.random.Generator) -> list[str]:
     """The uses of so many rooms, corridor not counted, in the order in which they lie."""
-    uses = list(FIRST[:n_rooms])
+    uses: list[str] = list(FIRST[:n_rooms])
     if n_rooms == 3 and rng.random() < 0.5:
         uses[2] = "kitchen"
     while len(uses) < n_rooms:

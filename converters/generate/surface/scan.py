@@ -20,10 +20,10 @@ from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
-from scenes_mjcf.categories import CATEGORIES
+from scenes_mjcf.categories import TABLE
 
-NYU40 = {"wall": 1, "floor": 2, "cabinet": 3}
-"""Class of the building itself -> NYU40 id; that of furniture is its category's."""
+NYU40 = {"wall": 1, "floor": 2, "cabinet": 3} | {c.name: c.labels[0] for c in TABLE if c.labels}
+"""What a scan shows -> NYU40 id: the building itself, cupboards of a plan, categories of furniture."""
 
 RANGE_M = 5.0
 """A depth camera's reach."""
@@ -53,7 +53,7 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
     solids += [solid_from_box(w.low, w.high, NYU40["wall"], "paint") for w in plan.walls]
     solids += [solid_from_box(f.low, f.high, NYU40["cabinet"], "cabinet") for f in plan.fixtures]
     for owner, item in [(-1, i) for i in plan.built_in] + list(enumerate(items)):
-        label = CATEGORIES[item.model.category].labels[0]
+        label = NYU40[item.model.category]
         for part in item.model.parts:
             mesh = item.to_floor(part.vertices), part.faces
             solids.append(solid_from_mesh(*mesh, label, part.material, owner))
