@@ -134,9 +134,12 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.generate import generate_building
+    from converters.recipes import MODELS, building_of, parse_settings
 
+    settings = parse_settings(arguments.settings)
+    config = building_of(arguments.tier, settings, MODELS[arguments.split], "settings")
     with stage_progress(console) as report:
-        generate_building(arguments.out, arguments.seed, report)
+        generate_building(arguments.out, arguments.seed, report, config)
     console.print(
         f"{arguments.out}: building of seed {arguments.seed}; convert it with "
         f"'python -m converters convert {arguments.out} SCENE_DIR'",
@@ -293,6 +296,11 @@ def _add_generate(commands: _Commands) -> None:
     command = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
     command.add_argument("out", type=Path, metavar="OUT", help="folder to make")
     command.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
+    command.add_argument("--tier", default="sparse", help="sparse (default), furnished or cluttered")
+    command.add_argument("--split", choices=("train", "test"), default="train", help="whose CAD models (default train)")
+    command.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="of the tier's buildings, such as floor_area_m2=80"
+    )
     command.set_defaults(run=_generate, writes=("{}",))
 
 
@@ -324,6 +332,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    """The command line's words; settings of `generate` may stand before and after its options."""
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    if rest and ("settings" not in arguments or any(word.startswith("-") for word in rest)):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        arguments.settings = [*arguments.settings, *rest]
+    return arguments
+
+
 def _standing(arguments: argparse.Namespace) -> dict[str, int]:
     """What stands where the command writes: path -> inode, another one once something was put in its place."""
     target = glob.escape(str(getattr(arguments, "out", None) or getattr(arguments, "output", "")))
@@ -336,7 +355,7 @@ def _standing(arguments: argparse.Namespace) -> dict[str, int]:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parse(argv)
     signal.signal(signal.SIGTERM, _on_sigterm)
     console = Console()
     before = _standing(arguments)

@@ -1,6 +1,6 @@
 """A recipe file in, scene folders out: every scene of a set generated, converted and drawn by one call.
 
-A recipe names a seed, a split and how the building departs from `BuildingConfig`'s defaults; the split decides
+A recipe names a seed, a split, a tier and how the building departs from the tier's defaults; the split decides
 which CAD models may be used. The same recipes give the same scenes, byte for byte.
 """
 
@@ -17,6 +17,7 @@ import yaml
 from converters.check.preview import preview
 from converters.generate import generate_building
 from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
+from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_config, home_fields
 from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, convert
 from interactive_nav_common.files import part_folder, publish
@@ -25,6 +26,8 @@ MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
 """Split -> CAD models: held-out models are held out here."""
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 _FIXED = ("models",)
+SPARSE = "sparse"
+"""Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
 GENERATE, CONVERT, DRAW = 0.55, 0.35, 0.10
 """Shares of one scene's time, hulls cached: weights of the progress bar."""
 
@@ -39,7 +42,7 @@ class SceneRecipe:
     name: str
     split: str
     seed: int
-    building: BuildingConfig
+    building: BuildingConfig | HomeConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,39 +63,82 @@ def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> N
             raise GenerationError(f"{where}: unknown key '{key}'; {hint}")
 
 
-def _building(settings: dict[str, Any], split: str, where: str) -> BuildingConfig:
-    fields = {f.name: f.default for f in dataclasses.fields(BuildingConfig) if f.name not in _FIXED}
+def _value(key: str, value: Any, default: Any, where: str) -> Any:
+    """A setting as its field takes it: one number stands for a range of that number."""
+    if key in NAMES:
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
+        return tuple(value)
+    if value is None and key in OPTIONAL:
+        return None
+    if isinstance(default, tuple):
+        pair = value if isinstance(value, list) else [value, value]
+        if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
+            raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
+        return tuple(pair)
+    if not isinstance(value, int | float) or isinstance(value, bool) != isinstance(default, bool):
+        raise GenerationError(f"{where}: {key} is {value!r}, expected a {type(default).__name__}")
+    return value
+
+
+def building_of(
+    tier: str, settings: dict[str, Any], models: tuple[str, ...], where: str
+) -> BuildingConfig | HomeConfig:
+    """What to build, from a tier's name and settings as a recipe or a command line gives them.
+
+    Args:
+        tier: `sparse`, or one of `converters.generate.homes.config.TIERS`.
+        settings: by name: those of `BuildingConfig`, or of `HomeConfig` and its shell.
+        models: names of the CAD models that may be used.
+        where: named in errors.
+
+    Raises:
+        GenerationError: an unknown tier or setting, a wrong type, or values that are refused.
+    """
+    if tier not in (SPARSE, *TIERS):
+        raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
+    sparse = {f.name: f.default for f in dataclasses.fields(BuildingConfig) if f.name not in _FIXED}
+    fields = sparse if tier == SPARSE else home_fields()
     _refuse_unknown(settings, fields, where)
-    values: dict[str, Any] = {}
-    for key, value in settings.items():
-        if key in NAMES:
-            if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-                raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
-            value = tuple(value)
-        elif isinstance(fields[key], tuple):
-            pair = value if isinstance(value, list) else [value, value]
-            if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
-                raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
-            value = tuple(pair)
-        elif not isinstance(value, int | float) or isinstance(value, bool) != isinstance(fields[key], bool):
-            raise GenerationError(f"{where}: {key} is {value!r}, expected a {type(fields[key]).__name__}")
-        values[key] = value
+    values = {key: _value(key, value, fields[key], where) for key, value in settings.items()}
     try:
-        return BuildingConfig(**values, models=MODELS[split]).validate()
+        if tier == SPARSE:
+            return BuildingConfig(**values, models=models).validate()
+        return home_config(tier, values, models)
     except GenerationError as error:
         raise GenerationError(f"{where}: {error}") from error
+
+
+def parse_settings(words: Iterable[str]) -> dict[str, Any]:
+    """KEY=VALUE words of a command line -> settings, their values read as YAML.
+
+    Raises:
+        GenerationError: a word without '=', or with a value that is no YAML.
+    """
+    settings = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise GenerationError(f"got '{word}', expected KEY=VALUE, such as floor_area_m2=80")
+        try:
+            settings[key] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise GenerationError(
+                f"{key}: '{value}' is not readable as YAML; give a number or [lowest, highest]"
+            ) from error
+    return settings
 
 
 def parse_recipes(data: Any, where: str) -> Recipes:
     """Decoded YAML -> recipes.
 
     Args:
-        data: the decoded file: `scenes` {name: {split, seed, building}}, `conversion`, and `shared`, which only
+        data: the decoded file: `scenes` {name: {split, seed, tier, building}}, `conversion`, and `shared`, which only
             holds anchors.
         where: file named in errors.
 
     Raises:
-        GenerationError: an unknown or missing key, a wrong type, or a building that `BuildingConfig` refuses.
+        GenerationError: an unknown or missing key, a wrong type, or a building that is refused.
     """
     if not isinstance(data, dict) or not isinstance(data.get("scenes"), dict):
         raise GenerationError(f"{where}: expected a mapping with the key 'scenes', each a name and its recipe")
@@ -109,13 +155,14 @@ def parse_recipes(data: Any, where: str) -> Recipes:
         here = f"{where}: scenes: {name}"
         if not isinstance(recipe, dict):
             raise GenerationError(f"{here}: got {recipe!r}, expected a mapping with split, seed and building")
-        _refuse_unknown(recipe, ("split", "seed", "building"), here)
+        _refuse_unknown(recipe, ("split", "seed", "tier", "building"), here)
         if recipe.get("split") not in MODELS:
             raise GenerationError(f"{here}: split is {recipe.get('split')!r}, expected one of {', '.join(MODELS)}")
         seed = recipe.get("seed")
         if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
             raise GenerationError(f"{here}: seed is {seed!r}, expected a whole number of 0 or more")
-        building = _building(recipe.get("building") or {}, recipe["split"], f"{here}: building")
+        models, settings = MODELS[recipe["split"]], recipe.get("building") or {}
+        building = building_of(recipe.get("tier", SPARSE), settings, models, f"{here}: building")
         scenes.append(SceneRecipe(str(name), recipe["split"], seed, building))
     return Recipes(tuple(scenes), dict(conversion))
 

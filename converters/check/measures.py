@@ -31,12 +31,13 @@ LEAST_APART_M = 1.0
 
 def shadow(objects: Sequence[PlacedObject], maps: SceneMaps) -> np.ndarray:
     """[rows, columns] bool: cells of the map whose middle lies below a hull of a movable."""
-    out = np.zeros(maps.traversable.shape, bool)
+    out = np.zeros_like(maps.traversable)
+    rows, columns = out.shape
     step, (x, y) = maps.resolution_m, maps.origin_w
     for placed in objects:
         for hull in placed.hulls_b:
             outline = shapely.MultiPoint(to_world(placed, hull.vertices)[:, :2]).convex_hull
-            (x0, y0, x1, y1), (rows, columns) = outline.bounds, out.shape
+            x0, y0, x1, y1 = outline.bounds
             c = slice(max(int((x0 - x) / step), 0), min(int((x1 - x) / step) + 1, columns))
             r = slice(max(int((y0 - y) / step), 0), min(int((y1 - y) / step) + 1, rows))
             xs, ys = np.arange(c.start, c.stop), np.arange(r.start, r.stop)
@@ -75,12 +76,13 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float, seed
     if not region.any():
         return 1.0
     mask = region == 1 + np.bincount(region.ravel())[1:].argmax()
-    number = np.full(mask.shape, -1)
+    height, width = mask.shape
+    number = np.full((height, width), -1)
     number[mask] = np.arange(mask.sum())
     rows, columns, lengths = [], [], []
     for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        a = number[: number.shape[0] - dr, max(-dc, 0) : number.shape[1] - max(dc, 0)]
-        b = number[dr:, max(dc, 0) : number.shape[1] + min(dc, 0)]
+        a = number[: height - dr, max(-dc, 0) : width - max(dc, 0)]
+        b = number[dr:, max(dc, 0) : width + min(dc, 0)]
         both = (a >= 0) & (b >= 0)
         rows.append(a[both])
         columns.append(b[both])

@@ -25,6 +25,10 @@ COUNTED = (
 """Settings of `BuildingConfig` that say how much of what stands where: a home's rooms and shares say it instead."""
 
 
+OPTIONAL = ("must_push_turtlebot", "must_push_fetch")
+"""Settings that may be None."""
+
+
 @dataclasses.dataclass(frozen=True)
 class HomeConfig:
     """What kind of home. Pairs are inclusive ranges."""
