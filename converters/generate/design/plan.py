@@ -96,7 +96,7 @@ class Plan:
     """Index of the corridor in `rooms`."""
     wall_height_m: float
     door_height_m: float
-    built_in: tuple[Instance, ...] = ()
+    built_in: tuple[Instance, ...] = dataclasses.field(default=(), compare=False)
     """Furniture that stays: part of the static structure as the fixtures are."""
 
 

@@ -208,7 +208,7 @@ class Floor:
         corners = [places.origin + np.stack([s * u + c * v, -c * u + s * v], 1) for u, v in (boxes[:2], boxes[2:])]
         lowest, highest = np.minimum(*corners) - gap_m - low, np.maximum(*corners) + gap_m - low
         c0, r0 = np.clip(np.floor(lowest / CELL_M + 0.3), 0, None).astype(int).T
-        c1, r1 = np.ceil(highest / CELL_M - 0.3).astype(int).T
+        c1, r1 = np.clip(np.ceil(highest / CELL_M - 0.3), 0, None).astype(int).T
         rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
         out = sums[-1, -1] * ((c1 > columns) | (r1 > rows) | (lowest.min(axis=1) < 0))
         r0, r1, c0, c1 = np.minimum(r0, rows), np.minimum(r1, rows), np.minimum(c0, columns), np.minimum(c1, columns)
