@@ -240,12 +240,12 @@ class Floor:
                 fits[:, 0] &= self.hindered(np.array(arrangement.front), places, low, sums[layer]) == 0
         return fits
 
-    def windows_behind(self, arrangement: Arrangement, places: Places, room: int) -> np.ndarray:
-        """(n,) cells of the strip before a window that the anchor covers."""
+    def before_window(self, arrangement: Arrangement, places: Places, room: int) -> np.ndarray:
+        """(n,) share of the anchor's width that stands before a window."""
         low, sums = self._room_sums(room)
-        anchor = arrangement.pieces[0]
-        box = np.array([-anchor.half_m[0], 0.0, anchor.half_m[0], 0.2])
-        return self.hindered(box, places, low, sums["glass"])
+        half = arrangement.pieces[0].half_m[0]
+        strip = np.array([-half, 0.0, half, WINDOW_STRIP_M - 2 * CELL_M])
+        return self.hindered(strip, places, low, sums["glass"]) * CELL_M**2 / (2 * half * strip[3])
 
     # -- whether one still gets through ---------------------------------
 

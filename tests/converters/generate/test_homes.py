@@ -61,6 +61,12 @@ def drawn(b: Building, cell_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return inside, below[0], below[1]
 
 
+def labelled(mask: np.ndarray) -> np.ndarray:
+    out = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, output=out)
+    return out
+
+
 def facing(item: Instance) -> np.ndarray:
     """(2,) direction of its front."""
     angle = item.yaw_rad - math.pi / 2 + (math.pi if item.model.front < 0 else 0.0)
@@ -129,15 +135,14 @@ def test_as_much_must_be_pushed_as_asked_for(seed, tier):
             np.asarray(ndimage.distance_transform_edt(np.pad(f, 1)))[1:-1, 1:-1] * cell_m > radius
             for f in (inside & ~fixed, inside & ~fixed & ~below)
         ]
-        with_them_away, now = (np.asarray(ndimage.label(f)[0])[fits[1]] for f in fits)
+        with_them_away, now = (labelled(f)[fits[1]] for f in fits)
         rng = np.random.default_rng(0)
         start, goal = rng.integers(len(now), size=(2, 40_000))
         possible = with_them_away[start] == with_them_away[goal]
         share = (now[start] != now[goal])[possible].mean()
         told = b.measured["must_push_share"][robot]
         assert low <= told <= high
-        # Gaps within a cell of the robot's width are told apart by luck: they may open or close a whole room.
-        assert share == pytest.approx(told, abs=0.2)
+        assert low - 0.03 <= share <= high + 0.03
 
 
 @complete
@@ -146,7 +151,7 @@ def test_every_room_is_reached_with_the_movables_away(seed):
     b = building(seed, "cluttered")
     inside, fixed, _ = drawn(b, 0.025)
     fits = np.asarray(ndimage.distance_transform_edt(np.pad(inside & ~fixed, 1)))[1:-1, 1:-1] * 0.025 > 0.31
-    regions = np.asarray(ndimage.label(fits)[0])
+    regions = labelled(fits)
     main = regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])
     o = b.plan.outer
     for r in b.plan.rooms:
@@ -164,7 +169,7 @@ def test_a_share_that_does_not_fit_is_refused_within_bounded_work(monkeypatch):
         GenerationError, match=r"furniture_share is 0\.5: nothing more fits at 0\.\d\d \(the emptiest room"
     ):
         design_building(1, cfg)
-    assert len(tries) < 5 * 2500
+    assert len(tries) < 3 * 2500
 
 
 def test_shares_that_cannot_be_met_by_moving_things_are_refused(monkeypatch):
@@ -251,8 +256,8 @@ def pieces_overlap(a: Instance, b: Instance) -> bool:
     for p, q in itertools.product(a.model.parts, b.model.parts):
         u, v = a.to_floor(p.vertices), b.to_floor(q.vertices)
         if u[:, 2].min() < v[:, 2].max() and v[:, 2].min() < u[:, 2].max():
-            shapes = (shapely.MultiPoint(x[:, :2]).convex_hull for x in (u, v))
-            if shapely.intersection(*shapes).area > 1e-4:
+            p_seen, q_seen = (shapely.MultiPoint(x[:, :2]).convex_hull for x in (u, v))
+            if p_seen.intersection(q_seen).area > 1e-4:
                 return True
     return False
 
@@ -280,6 +285,7 @@ def test_doors_turn_freely(seed, tier):
     b = building(seed, tier)
     others = shapely.union_all([i.footprint for i in (*b.items, *b.plan.built_in) if i.hinge is None])
     for leaf in (i for i in b.items if i.hinge is not None):
+        assert leaf.hinge is not None
         for angle in np.linspace(*leaf.hinge.range_rad, 12):
             assert turned(leaf, angle).footprint.intersection(others).area < 1e-4
 
