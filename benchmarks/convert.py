@@ -13,9 +13,6 @@ depends on it little.
 
 from __future__ import annotations
 
-import argparse
-import datetime
-import importlib.metadata
 import json
 import os
 import subprocess
@@ -25,6 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measurement import append_row, command_line, origin
 from converters.generate import BuildingConfig, generate_building
 
 PACKAGES = ("mujoco", "coacd", "trimesh", "numpy", "scipy", "xatlas")
@@ -79,14 +77,6 @@ def building_config(faces: int, objects: int) -> BuildingConfig:
     )
 
 
-def _commit() -> str:
-    try:
-        out = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return out.stdout.strip()
-
-
 def measure(raw: Path, out: Path, cache: Path, jobs: int) -> dict[str, Any]:
     """Converts in a fresh process, so that its memory and imports are its own."""
     command = [sys.executable, "-c", MEASURE, str(raw), str(out), str(cache), str(jobs)]
@@ -101,7 +91,7 @@ def count_faces(raw: Path) -> int:
 
 def main() -> None:
     """Measures and appends two rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "convert")
     parser.add_argument("--faces", type=int, default=150_000, help="of the raw scan, about")
     parser.add_argument("--objects", type=int, default=25, help="movable objects, doors included")
     parser.add_argument("--seed", type=int, default=0, help="of the building")
@@ -109,8 +99,6 @@ def main() -> None:
         "--raw", type=Path, default=None, help="convert this raw Gibson folder instead of generating one"
     )
     parser.add_argument("--jobs", type=int, default=2, help="decompositions side by side")
-    parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
-    parser.add_argument("--out", default="benchmarks/results/convert.jsonl")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="convert-") as folder:
         base = Path(folder)
@@ -130,16 +118,12 @@ def main() -> None:
                 "memory_bound_mib": row["peak_mib"] + args.jobs * row["peak_child_mib"],
                 "generate_s": generate_s,
                 "jobs": args.jobs,
-                "device": f"cpu, {os.cpu_count()} cores",
                 "load_before": round(load, 1),
                 "load_after": round(os.getloadavg()[0], 1),
-                "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
-                "commit": args.commit or _commit(),
-                "date": datetime.date.today().isoformat(),
+                **origin(args.commit, PACKAGES),
+                "device": f"cpu, {os.cpu_count()} cores",
             }
-            with open(args.out, "a", encoding="utf-8") as out:
-                out.write(json.dumps(row) + "\n")
-            print(json.dumps(row), flush=True)
+            append_row(args.out, row)
             kept = row["wall_s"] <= LIMITS[f"{kind}_s"] and row["memory_bound_mib"] <= LIMITS["memory_mib"]
             print(f"{kind}: {'within' if kept else 'BEYOND'} {LIMITS[f'{kind}_s']:.0f} s and 6 GiB", file=sys.stderr)
 

@@ -9,7 +9,6 @@ rest is the rim of a patch where nothing was scanned. Hulls come from the conver
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 from pathlib import Path
@@ -19,6 +18,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
+from benchmarks.measurement import command_line
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, cache_folder, decompose_all
 from converters.bodies.objects import name_objects, place_object
 from converters.fill.holes import hidden_surfaces
@@ -182,7 +182,7 @@ def measure(filled: Filled) -> tuple[dict[int, OpenBorder], dict[int, OpenBorder
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("source", type=Path)
     narrow, wide = measure(fill(parser.parse_args().source))
     rows = [[narrow[k].border_m, narrow[k].open_m, narrow[k].crack_m, wide[k].crack_m] for k in narrow]

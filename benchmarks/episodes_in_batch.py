@@ -23,10 +23,12 @@ from typing import Any
 import jax
 
 from interactive_nav_common.config import overridden
+from interactive_nav_common.rows import markdown
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contenders import NavigatorPlayer
-from topological_nav.evaluate.contest import Contest, ContestScene, load_networks, local_policy
+from topological_nav.evaluate.contest import Contest, ContestScene, local_policy
 from topological_nav.evaluate.evaluation import Played, Tell, play
+from topological_nav.learn.pairs import load_networks
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.weights.packaged import packaged_weights
 
@@ -115,19 +117,18 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
         return draw(xy_w, yaw_rad)
 
     journeys = clock.timed("episodes drawn", lambda: venue.episodes)()
-    player = NavigatorPlayer(Navigator(made, sight, policy, contest.config), simulator, camera, contest.config)
+    player = NavigatorPlayer(Navigator(made, sight, policy, contest.config.navigator), simulator, camera)
     played = clock.timed(REST, play)(player, simulator, journeys, contest.config, tell)
     return dict(clock.parts), played, images, time.perf_counter() - began
 
 
-def table(parts: dict[str, Spent]) -> list[str]:
-    """Lines of Markdown, the dearest part first."""
-    lines = ["| Part | Calls | Seconds | XLA compiling | Longest call |", "|---|---|---|---|---|"]
-    for name, spent in sorted(parts.items(), key=lambda item: -item[1].seconds):
-        lines.append(
-            f"| {name} | {spent.calls:,} | {spent.seconds:.1f} | {spent.compiling:.1f} | {spent.longest:.2f} |"
-        )
-    return lines
+def table(parts: dict[str, Spent]) -> str:
+    """Markdown, the dearest part first."""
+    lines = [
+        (name, f"{spent.calls:,}", f"{spent.seconds:.1f}", f"{spent.compiling:.1f}", f"{spent.longest:.2f}")
+        for name, spent in sorted(parts.items(), key=lambda item: -item[1].seconds)
+    ]
+    return markdown(("Part", "Calls", "Seconds", "XLA compiling", "Longest call"), lines)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -158,11 +159,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         nonlocal told
         if time.monotonic() - told > 5.0:
             told = time.monotonic()
-            most = contest.config.limit_s
+            most = contest.config.navigator.limit_s
             print(f"{over} over, simulated {simulated_s:.0f} s of {most:.0f} s at most", file=sys.stderr, flush=True)
 
     parts, played, images, seconds = measure(contest, tell)
-    print("\n".join(table(parts)))
+    print(table(parts), end="")
     simulated_h, device = played.duration_s.sum() / 3600, jax.devices()[0].device_kind
     print(
         f"{len(played.success)} episodes, {simulated_h:.2f} h simulated in {seconds:.0f} s on {device}; "

@@ -12,7 +12,6 @@ since a single stick-slip push says little. Rows are appended to `benchmarks/res
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import math
@@ -26,16 +25,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.steps_per_second import _commit, _versions
-from interactive_nav.config import NavConfig
+from benchmarks.measurement import SCENE, append_row, command_line, origin
+from interactive_nav.config import NavConfig, PhysicsConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
-from interactive_nav.robots import get_robot, robot_names
+from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Movable, Scene, load_scene
 from interactive_nav.scenes.world import World, build_world
+from interactive_nav_common.rows import markdown
 
-SCENE = "scenes_mjcf/apartment_0"
-RESULTS = Path("benchmarks/results/fidelity.jsonl")
 REFERENCE = {"sim_dt_s": 1 / 240, "solver_iterations": 100}
 TOLERANCE = 1e-12
 GAP_M = 0.05
@@ -64,7 +62,6 @@ SCENARIOS = (
     Scenario("TurtleBot pushes a door", "turtlebot", "door", 0.35),
     Scenario("Fetch pushes a table", "fetch", "table", 0.35),
 )
-ENVIRONMENT = {"sim_dt_s": NavConfig.sim_dt_s, "solver_iterations": NavConfig.solver_iterations}
 SWEEP = (
     {},
     *({"sim_dt_s": dt} for dt in (1 / 240, 0.005, 0.01, 0.025, 0.05)),
@@ -149,7 +146,7 @@ def push(scenario: Scenario, source: Scene, settings: dict, tolerance: float | N
         steps, `robot_m` [N, T, 2] positions, `seconds` of stepping (compiling apart).
     """
     basket = scenario.category == "basket"
-    config = NavConfig(**{"num_objects": 1 if basket else 0, "sleep": False, **settings})
+    config = NavConfig.of(**{"num_objects": 1 if basket else 0, "sleep": False, **settings})
     world, slot, radius_m = _world(scenario, source, config)
     if tolerance is not None:
         for model in world.models:
@@ -169,7 +166,7 @@ def push(scenario: Scenario, source: Scene, settings: dict, tolerance: float | N
     start = time.perf_counter()
     force, path = np.zeros(len(qpos)), []
     q = world.layout.robot_qpos
-    for _ in range(round(SECONDS / config.control_dt_s)):
+    for _ in range(round(SECONDS / config.physics.control_dt_s)):
         state, signals = step(scene, state, command)
         force += np.asarray(signals.force_n)
         path.append(np.asarray(state.qpos[:, q : q + 2]))
@@ -205,10 +202,12 @@ def compare(run: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> dic
     }
 
 
-def measure(backend: str, scenarios: tuple[Scenario, ...], only: str, scene: str, console: Console) -> list[dict]:
-    """All rows of one backend."""
+def measure(
+    backend: str, scenarios: list[Scenario], only: str, scene: str, console: Console, out: Path, commit: str | None
+) -> list[dict]:
+    """All rows of one backend, appended to a file."""
     source = load_scene(scene)
-    base = {"backend": resolve_backend(backend), "scene": source.name, "versions": _versions(), "commit": _commit()}
+    base = {"backend": resolve_backend(backend), "scene": source.name, **origin(commit)}
     rows = []
     for scenario in scenarios:
         reference = push(scenario, source, {"backend": "native", "collision": "boxes", **REFERENCE}, TOLERANCE)
@@ -223,10 +222,10 @@ def measure(backend: str, scenarios: tuple[Scenario, ...], only: str, scene: str
                 **base,
                 "scenario": scenario.name,
                 "collision": collision,
-                "sim_dt_s": NavConfig.sim_dt_s,
-                "solver_iterations": NavConfig.solver_iterations,
-                "cone": NavConfig.cone,
-                "contact_time_constant_s": NavConfig.contact_time_constant_s,
+                "sim_dt_s": PhysicsConfig.sim_dt_s,
+                "solver_iterations": PhysicsConfig.solver_iterations,
+                "cone": PhysicsConfig.cone,
+                "contact_time_constant_s": PhysicsConfig.contact_time_constant_s,
                 **settings,
                 "against_boxes": compare(run, reference),
                 "against_hulls": compare(run, truth),
@@ -239,9 +238,7 @@ def measure(backend: str, scenarios: tuple[Scenario, ...], only: str, scene: str
                 f"path {100 * row['against_boxes']['path_rms_m']:.1f} cm",
                 soft_wrap=True,
             )
-            RESULTS.parent.mkdir(exist_ok=True)
-            with open(RESULTS, "a", encoding="utf-8") as out:
-                out.write(json.dumps(row) + "\n")
+            append_row(out, row, hidden=None)
     return rows
 
 
@@ -262,15 +259,13 @@ def report(rows: list[dict], figure: Path) -> str:
         latest[(row["scenario"], row["backend"], row["collision"], _setting(row))] = row
     rows = list(latest.values())
     scenarios = list(dict.fromkeys(r["scenario"] for r in rows))
-    lines = ["| scenario | backend | collision | setting | displacement | error | force sum | error | path rms |"]
-    lines.append("|---|---|---|---|---|---|---|---|---|")
+    lines = []
     for row in sorted(rows, key=lambda r: (scenarios.index(r["scenario"]), r["backend"], r["collision"], _setting(r))):
         e = row["against_boxes" if row["collision"] == "boxes" else "against_hulls"]
-        lines.append(
-            f"| {row['scenario']} | {row['backend']} | {row['collision']} | {_setting(row)} | "
-            f"{e['displacement_m']:.3f} m | {e['displacement_error']:+.1%} | {e['force_sum_n']:.0f} N | "
-            f"{e['force_error']:+.1%} | {100 * e['path_rms_m']:.1f} cm |"
-        )
+        moved, force = f"{e['displacement_m']:.3f} m", f"{e['force_sum_n']:.0f} N"
+        errors = f"{e['displacement_error']:+.1%}", f"{e['force_error']:+.1%}", f"{100 * e['path_rms_m']:.1f} cm"
+        where = row["scenario"], row["backend"], row["collision"], _setting(row)
+        lines.append((*where, moved, errors[0], force, *errors[1:]))
     boxes = [r for r in rows if r["collision"] == "boxes" and r["backend"] == "native"]
     names = sorted({_setting(r) for r in boxes}, key=lambda n: float(n.split()[0]))
     fig, axes = plt.subplots(1, 2, figsize=(13, 5), sharey=True)
@@ -293,12 +288,13 @@ def report(rows: list[dict], figure: Path) -> str:
     fig.suptitle("C MuJoCo with boxes, against 1/240 s, 100 iterations; grey: within 10 %")
     fig.tight_layout()
     fig.savefig(figure, dpi=110)
-    return "\n".join(lines)
+    header = ("scenario", "backend", "collision", "setting", "displacement", "error", "force sum", "error", "path rms")
+    return markdown(header, lines)
 
 
 def main(argv: list[str] | None = None) -> None:
     """Measures, or reports what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, "fidelity")
     parser.add_argument("--backend", default="native")
     parser.add_argument("--only", choices=("sweep", "environment"), default="sweep", help="environment: the defaults")
     parser.add_argument("--scene", default=SCENE)
@@ -307,12 +303,11 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     console = Console()
     if args.report:
-        rows = [json.loads(line) for line in RESULTS.read_text(encoding="utf-8").splitlines()]
-        print(report(rows, Path("docs/fidelity.png")))
+        rows = [json.loads(line) for line in args.out.read_text(encoding="utf-8").splitlines()]
+        print(report(rows, Path("docs/fidelity.png")), end="")
         return
     chosen = [s for i, s in enumerate(SCENARIOS) if args.scenarios is None or i in args.scenarios]
-    known = tuple(s for s in chosen if s.robot in robot_names())
-    rows = measure(args.backend, known, args.only, args.scene, console)
+    rows = measure(args.backend, chosen, args.only, args.scene, console, args.out, args.commit)
     table = Table("setting", "worst displacement error", "worst force error")
     for name in dict.fromkeys((r["collision"], _setting(r)) for r in rows):
         own = [r["against_boxes"] for r in rows if (r["collision"], _setting(r)) == name]

@@ -11,10 +11,7 @@ The kernels' row is appended to `benchmarks/results/kernels.jsonl`.
 
 from __future__ import annotations
 
-import argparse
 import collections
-import datetime
-import json
 import re
 import tempfile
 from pathlib import Path
@@ -25,7 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 import interactive_nav
-from benchmarks.steps_per_second import MODES, _commit, _versions, step_of
+from benchmarks.measurement import append_row, command_line, origin, random_driving
+from benchmarks.steps_per_second import MODES, step_of
 from interactive_nav.task.wrappers import AutoResetEnv
 
 PARTS = (
@@ -95,17 +93,11 @@ def profile(env: Any, num_envs: int, steps: int, part: str = "simulation") -> di
     batch = AutoResetEnv(env)
     step = step_of(env, part, num_envs, batch)
 
-    def advance(state, key):
-        def one(state, key):
-            action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
-            return step(state, action), None
-
-        return jax.lax.scan(one, state, jax.random.split(key, steps))[0]
-
     state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
-    program = jax.jit(advance)
+    drive = random_driving(lambda state, action: (step(state, action), None), (num_envs, env.action_size), steps)
+    program = jax.jit(drive)
     for i in range(3):
-        state = jax.block_until_ready(program(state, jax.random.PRNGKey(i)))
+        state, _ = jax.block_until_ready(program(state, jax.random.PRNGKey(i)))
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             jax.block_until_ready(program(state, jax.random.PRNGKey(9)))
@@ -135,28 +127,16 @@ def profile(env: Any, num_envs: int, steps: int, part: str = "simulation") -> di
 
 def main(argv: list[str] | None = None) -> int:
     """Measures, prints and appends a row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
-    parser.add_argument("--robot", default="turtlebot")
+    parser = command_line(__doc__, "kernels", settings=True)
     parser.add_argument("--num-envs", type=int, default=8192)
     parser.add_argument("--part", choices=MODES[:-1], default="simulation")
     parser.add_argument("--steps", type=int, default=4, help="environment steps under the profiler")
-    parser.add_argument("--set", nargs="*", default=[], metavar="key=value", help="environment settings")
-    parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
-    parser.add_argument("--out", default="benchmarks/results/kernels.jsonl")
     args = parser.parse_args(argv)
-    settings = {k: json.loads(v) for k, v in (item.split("=", 1) for item in args.set)}
+    settings = dict(args.settings)
     env = interactive_nav.make(args.robot, args.scenes, backend="warp", **settings)
     row: dict[str, Any] = {"robot": args.robot, "scenes": args.scenes, "settings": settings, "part": args.part}
-    row |= profile(env, args.num_envs, args.steps, args.part)
-    row |= {
-        "device": jax.devices()[0].device_kind,
-        "versions": _versions(),
-        "commit": args.commit or _commit(),
-        "date": datetime.date.today().isoformat(),
-    }
-    with open(args.out, "a", encoding="utf-8") as out:
-        out.write(json.dumps(row) + "\n")
+    row |= profile(env, args.num_envs, args.steps, args.part) | origin(args.commit)
+    append_row(args.out, row, hidden=None)
     console = Console(width=120)
     table = Table("kernel", "part", "ms a step", "launches a step", title=f"{row['device_ms_per_step']} ms a step")
     for kernel in row["kernels"][:25]:

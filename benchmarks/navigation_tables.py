@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.measurement import command_line, timed
 from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
 from interactive_nav.navigation import lookup
 from interactive_nav.navigation.tables import navigation_tables
@@ -87,10 +87,9 @@ def reference(seed: int, xy: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, 
     return np.ma.filled(want, np.inf), ~np.ma.getmaskarray(want) & even.filled(False)
 
 
-def plan(seed: int, side_m: float = 13.0, resolution_m: float = 0.05) -> np.ndarray:
-    """[260, 260] bool: a square building of 4 x 4 rooms."""
-    rng = np.random.default_rng(seed)
-    n = int(side_m / resolution_m)
+def plan(seed: int) -> np.ndarray:
+    """[260, 260] bool at 0.05 m: a square building of 4 x 4 rooms."""
+    rng, n = np.random.default_rng(seed), 260
     free = np.ones((n, n), bool)
     free[:4] = free[-4:] = free[:, :4] = free[:, -4:] = False
     for k in (1, 2, 3):
@@ -151,17 +150,13 @@ def look_up_ms(values: dict[str, Any], graphs: list[CornerGraph], rounds: int = 
         near = lookup.geodesic_at(tables, s, field, xy)
         return near, lookup.waypoints_at(tables, s, field, xy, 10, 0.2)
 
-    times = []
-    for _ in range(rounds + 1):
-        began = time.perf_counter()
-        jax.block_until_ready(look(index, fields, start))
-        times.append(time.perf_counter() - began)
-    return 1e3 * float(np.median(times[1:]))
+    times = [timed(look, index, fields, start)[1] for _ in range(rounds + 1)]
+    return 1e3 * float(np.median(times[1:]))  # the first call compiles
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Prints a line a scene and the totals."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("scenes", nargs="*", metavar="SCENE_DIR")
     parser.add_argument("--plans", type=int, default=0, metavar="N")
     parser.add_argument("--accuracy", type=int, default=0, metavar="ROOMS")

@@ -11,20 +11,17 @@ side, the project's `native` backend steps 64 environments, with one thread and 
 
 from __future__ import annotations
 
-import argparse
-import datetime
-import json
 import math
 import os
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.steps_per_second import _commit, _versions
+import interactive_nav
+from benchmarks.measurement import SCENE, append_row, command_line, origin, random_driving, timed
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
@@ -32,7 +29,6 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 
 WHEEL_RADIUS_M, HALF_TRACK_M, BODY_RADIUS_M = 0.0352, 0.115, 0.176
-RESULTS = Path("benchmarks/results/pybullet_peer.jsonl")
 
 
 def _xyzw(quat_wxyz: np.ndarray) -> list[float]:
@@ -165,33 +161,23 @@ def native_rate(world, config: NavConfig, qpos: np.ndarray, steps: int) -> float
     state = PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
     scene = jnp.zeros(len(qpos), jnp.int32)
 
-    def chunk(state, key):
-        def one(state, key):
-            command = jax.random.uniform(key, (len(qpos), 2), minval=-12.5, maxval=25.0)
-            return jax.vmap(physics.step)(scene, state, command)[0], None
+    def step(state, command):
+        return jax.vmap(physics.step)(scene, state, command)[0], None
 
-        return jax.lax.scan(one, state, jax.random.split(key, 20))[0]
-
-    program = jax.jit(chunk)
-    state = jax.block_until_ready(program(state, jax.random.PRNGKey(0)))
-    rates = []
-    for i in range(max(1, steps // 20)):
-        clock = time.perf_counter()
-        state = jax.block_until_ready(program(state, jax.random.PRNGKey(1 + i)))
-        rates.append(20 * len(qpos) / (time.perf_counter() - clock))
-    return float(np.median(rates))
+    program, seconds = jax.jit(random_driving(step, (len(qpos), 2), 20, -12.5, 25.0)), []
+    for i in range(1 + max(1, steps // 20)):
+        (state, _), took_s = timed(program, state, jax.random.PRNGKey(i))
+        seconds.append(took_s)
+    return float(np.median([20 * len(qpos) / s for s in seconds[1:]]))  # the first call compiles
 
 
 def main() -> None:
     """Measures and appends a row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", default="scenes_mjcf/apartment_0")
+    parser = command_line(__doc__, "pybullet_peer")
+    parser.add_argument("--scene", default=SCENE)
     parser.add_argument("--steps", type=int, default=400, help="control steps of PyBullet, and of each environment")
     parser.add_argument("--num-envs", type=int, default=64, help="of the native backend")
-    parser.add_argument("--out", default=str(RESULTS))
     args = parser.parse_args()
-    import interactive_nav
-
     scene = load_scene(args.scene)
     env = interactive_nav.make("turtlebot", [args.scene], backend="native")
     world = build_world(get_robot("turtlebot"), (scene,), NavConfig())
@@ -209,10 +195,9 @@ def main() -> None:
             travelled += went
     cores = os.cpu_count() or 1
     native = {
-        f"native_{threads}_threads": native_rate(world, NavConfig(threads=threads), qpos, args.steps)
+        f"native_{threads}_threads": native_rate(world, NavConfig.of(threads=threads), qpos, args.steps)
         for threads in sorted({1, cores})
     }
-    device = jax.devices()[0]
     row = {
         "scene": args.scene,
         "movables": int(world.occupied[0].sum()),
@@ -224,15 +209,9 @@ def main() -> None:
         "ratio_one_thread": round(native["native_1_threads"] / float(np.median(peers["4x1/40"])), 2),
         "cores": cores,
         "load_before": os.getloadavg()[0],
-        "device": device.device_kind,
-        "versions": _versions(),
-        "commit": _commit(),
-        "date": datetime.date.today().isoformat(),
+        **origin(args.commit),
     }
-    Path(args.out).parent.mkdir(exist_ok=True)
-    with open(args.out, "a", encoding="utf-8") as out:
-        out.write(json.dumps(row) + "\n")
-    print(json.dumps(row))
+    append_row(args.out, row)
 
 
 if __name__ == "__main__":

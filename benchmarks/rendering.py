@@ -11,10 +11,7 @@ carries `error` instead of a rate. Rows are appended to `benchmarks/results/rend
 
 from __future__ import annotations
 
-import argparse
-import datetime
-import json
-import os
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -24,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from benchmarks.steps_per_second import _commit, _versions
+from benchmarks.measurement import SCENE, append_row, command_line, origin, timed
 from interactive_nav.pictures.shading import colours, normals
 from interactive_nav.sensing import CameraPose, Lens, make_renderer
 
@@ -54,16 +51,17 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
     if stream == "rgb_textured":
         if renderer_name != "warp":
             raise Skip("textures are drawn by warp only")
-        from interactive_nav.pictures.visual import VISUAL_GROUP, build_visual
+        from interactive_nav.pictures.scene_model import SCENE, SceneModel
         from interactive_nav.sensing.warp import WarpColour
 
-        visual = build_visual(env.world, 0)
-        data = visual.pose(np.asarray(qpos[0]))
+        visual = SceneModel(env.robot, env.scenes[0], env.world.small_objects)
+        visual.pose(env.world, 0, np.asarray(qpos[0]))
+        data = visual.data
         n = len(scene)
         position = jnp.broadcast_to(jnp.asarray(data.geom_xpos, jnp.float32), (n, visual.model.ngeom, 3))
         matrix = jnp.asarray(data.geom_xmat.reshape(-1, 3, 3), jnp.float32)
         matrix = jnp.broadcast_to(matrix, (n, visual.model.ngeom, 3, 3))
-        painter = WarpColour(visual.model, lens, n, [VISUAL_GROUP])
+        painter = WarpColour(visual.model, lens, n, list(SCENE))
         return lambda angle: painter.draw(position, matrix, _turned(camera, angle))
     renderer = make_renderer(sensors.boxes, lens, renderer_name, env.backend)
 
@@ -82,9 +80,7 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
 
 def measure(draw: Callable[[jax.Array], Any], num_envs: int, to_host: bool, seconds: float) -> dict[str, float]:
     """Rate of calls that follow each other for `seconds`, after one that is not counted."""
-    clock = time.perf_counter()
-    out = jax.block_until_ready(draw(jnp.float32(0.0)))
-    first_s = time.perf_counter() - clock
+    out, first_s = timed(draw, jnp.float32(0.0))
     nbytes = sum(x.nbytes for x in jax.tree.leaves(out))
     calls, clock = 0, time.perf_counter()
     while calls < 3 or time.perf_counter() - clock < seconds:
@@ -102,8 +98,8 @@ def measure(draw: Callable[[jax.Array], Any], num_envs: int, to_host: bool, seco
 
 def main(argv: list[str] | None = None) -> int:
     """Measures and appends rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
+    parser = command_line(__doc__, "rendering")
+    parser.add_argument("--scenes", nargs="+", default=[SCENE])
     parser.add_argument("--renderer", nargs="+", choices=("auto", "warp", "rays"), default=["auto"])
     parser.add_argument("--size", type=int, nargs="+", default=[68, 256, 512, 1024], help="side of the frames, pixels")
     parser.add_argument("--num-envs", type=int, nargs="+", default=[1])
@@ -111,19 +107,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--where", nargs="+", choices=("device", "host"), default=["device", "host"])
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement")
     parser.add_argument("--max-megapixels", type=float, default=512.0, help="a call; larger ones are left out")
-    parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
-    parser.add_argument("--out", default="benchmarks/results/rendering.jsonl")
     args = parser.parse_args(argv)
     env = interactive_nav.make("turtlebot", args.scenes, backend="native")
-    device = jax.devices()[0]
-    common = {
-        "scenes": args.scenes,
-        "boxes": env.sensors.boxes.num_boxes,
-        "device": device.device_kind if device.platform != "cpu" else f"cpu, {os.cpu_count()} cores",
-        "versions": _versions(),
-        "commit": args.commit or _commit(),
-        "date": datetime.date.today().isoformat(),
-    }
+    common = {"scenes": args.scenes, "boxes": env.sensors.boxes.num_boxes, **origin(args.commit)}
+    append = functools.partial(append_row, args.out, hidden=("versions", "scenes"))
     for num_envs in args.num_envs:
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
         for renderer in args.renderer:
@@ -137,22 +124,16 @@ def main(argv: list[str] | None = None) -> int:
                         draw = program(env, state, stream, renderer, lens)
                         for where in args.where:
                             measured = measure(draw, num_envs, where == "host", args.seconds)
-                            _append(args.out, row | {"frames_on": where} | measured | common)
+                            append(row | {"frames_on": where} | measured | common)
                     except Skip:
                         continue
                     except Exception as error:  # noqa: BLE001  (one size that does not fit must not end the others)
                         text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-                        _append(args.out, row | {"error": text[:300]} | common)
+                        append(row | {"error": text[:300]} | common)
                     # Programs hold their buffers until they are dropped.
                     draw = None
                     jax.clear_caches()
     return 0
-
-
-def _append(path: str, row: dict[str, Any]) -> None:
-    with open(path, "a", encoding="utf-8") as out:
-        out.write(json.dumps(row) + "\n")
-    print(json.dumps({k: v for k, v in row.items() if k not in ("versions", "scenes")}), flush=True)
 
 
 if __name__ == "__main__":

@@ -11,17 +11,11 @@ logs, compiling and checkpoints apart. Rows carry device, versions and commit, a
 
 from __future__ import annotations
 
-import argparse
-import datetime
 import functools
-import importlib.metadata
 import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from typing import Any
 
 import jax
@@ -29,33 +23,18 @@ import jax.numpy as jnp
 from rich.console import Console
 
 import interactive_nav
+from benchmarks.measurement import append_row, command_line, origin, random_driving, timed
 from interactive_nav.physics import resolve_backend
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
-from interactive_nav_common.versions import commit
 from train import config_io
 from train.runs.run import train_run
+from train.sweep.devices import gpu_listing
 
 MODES = ("physics", "task", "observed", "simulation", "train")
 CHUNK = 20
 """Steps in one compiled scan."""
-PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def _commit() -> str:
-    found = commit()
-    return "unknown" if found is None else found[:7] + ("+dirty" if found.endswith("+dirty") else "")
 
 
 @functools.lru_cache(maxsize=1)
@@ -66,11 +45,8 @@ def _make(robot: str, scenes: tuple[str, ...], backend: str, settings: str):
 
 def _gpu_memory_mib() -> float | None:
     """Memory in use on the first GPU, by everything (Warp allocates beside JAX), or None without one."""
-    command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "-i", "0"]
-    try:
-        return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0])
-    except (OSError, subprocess.CalledProcessError, ValueError, IndexError):
-        return None
+    used = gpu_listing("memory.used").split()
+    return float(used[0]) if used and used[0].isdecimal() else None
 
 
 def _peak_memory_mib() -> dict[str, float] | None:
@@ -120,11 +96,10 @@ def step_of(env: Any, part: str, num_envs: int, batch: Any = None) -> Any:
     return parts[part]
 
 
-def _chunk_of(step: Any, num_envs: int, action_size: int) -> Any:
-    """State and key to the state after `CHUNK` steps of random driving, and what was counted in each."""
+def _counting(step: Any) -> Any:
+    """The step, and what is counted in it."""
 
-    def one(state, key):
-        action = jax.random.uniform(key, (num_envs, action_size), minval=-1.0, maxval=1.0)
+    def counted(state, action):
         state = step(state, action)
         finished = state.info["episode_metrics"]
         ended = state.info["episode_done"] > 0
@@ -133,7 +108,7 @@ def _chunk_of(step: Any, num_envs: int, action_size: int) -> Any:
         bad = sum(jnp.sum(~jnp.isfinite(x.astype(jnp.float32))) for x in obs)
         return state, {**seen, "episodes": ended.sum(), "nonfinite_observations": bad}
 
-    return lambda state, key: jax.lax.scan(one, state, jax.random.split(key, CHUNK))
+    return counted
 
 
 def simulation(
@@ -155,19 +130,16 @@ def simulation(
     batch: Any = AutoResetEnv(env)
     if devices > 1:
         batch = ShardedEnv(batch, jax.devices()[:devices])
-    advance = _chunk_of(step_of(env, part, num_envs, batch), num_envs, env.action_size)
+    step = _counting(step_of(env, part, num_envs, batch))
     state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
-    clock = time.perf_counter()
     # Not donated: the first state may share buffers with constants.
-    program = jax.jit(advance).lower(state, jax.random.PRNGKey(1)).compile()
-    state, _ = jax.block_until_ready(program(state, jax.random.PRNGKey(1)))
-    compile_s = time.perf_counter() - clock
+    program = jax.jit(random_driving(step, (num_envs, env.action_size), CHUNK))
+    (state, _), compile_s = timed(program, state, jax.random.PRNGKey(1))
     rates, totals = [], {name: 0.0 for name in (*FAILURES, "episodes", "nonfinite_observations")}
     memory = [_gpu_memory_mib()]
     for i in range(max(1, steps // CHUNK)):
-        clock = time.perf_counter()
-        state, seen = jax.block_until_ready(program(state, jax.random.PRNGKey(2 + i)))
-        rates.append(CHUNK * num_envs / (time.perf_counter() - clock))
+        (state, seen), took_s = timed(program, state, jax.random.PRNGKey(2 + i))
+        rates.append(CHUNK * num_envs / took_s)
         for name in totals:
             totals[name] += float(seen[name].sum())
         if i % 10 == 0:
@@ -234,9 +206,7 @@ def training(
 
 def main() -> None:
     """Measures and appends rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
-    parser.add_argument("--robot", default="turtlebot")
+    parser = command_line(__doc__, "steps_per_second", settings=True)
     parser.add_argument("--backend", default="auto")
     parser.add_argument("--devices", type=int, default=1, help="spread the environments over this many")
     parser.add_argument("--num-envs", type=int, nargs="+", default=[64])
@@ -244,12 +214,8 @@ def main() -> None:
     parser.add_argument("--mode", nargs="+", choices=MODES, default=["simulation"])
     parser.add_argument("--preset", default="turtlebot_ppo", help="of `python -m train`, for train")
     parser.add_argument("--learner", nargs="*", default=[], metavar="key=value", help="laid over the preset, for train")
-    parser.add_argument("--set", nargs="*", default=[], metavar="key=value", help="environment settings")
-    parser.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
-    parser.add_argument("--out", default="benchmarks/results/steps_per_second.jsonl")
     args = parser.parse_args()
-    settings = {k: json.loads(v) for k, v in (item.split("=", 1) for item in args.set)}
-    device = jax.devices()[0]
+    settings = dict(args.settings)
     for num_envs in args.num_envs:
         for mode in args.mode:
             row: dict[str, Any] = {
@@ -258,10 +224,7 @@ def main() -> None:
                 "num_envs": num_envs,
                 "scenes": args.scenes,
                 "settings": settings,
-                "device": device.device_kind if device.platform != "cpu" else f"cpu, {os.cpu_count()} cores",
-                "versions": _versions(),
-                "commit": args.commit or _commit(),
-                "date": datetime.date.today().isoformat(),
+                **origin(args.commit),
             }
             measure = (args.scenes, args.backend, num_envs, args.steps, settings)
             if mode == "train":
@@ -269,9 +232,7 @@ def main() -> None:
             else:
                 row |= {"robot": args.robot, "devices": args.devices}
                 row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
-            with open(args.out, "a", encoding="utf-8") as out:
-                out.write(json.dumps(row) + "\n")
-            print(json.dumps(row), flush=True)
+            append_row(args.out, row)
 
 
 if __name__ == "__main__":

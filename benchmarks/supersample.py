@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.measurement import timed
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.rows import markdown
 from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import Trained, load_trained
 from topological_nav.maps.build import renderer_of
@@ -75,9 +76,8 @@ def compare(
     for by in range(data.supersample, 0, -1):
         renderer = renderer_of(scene, dataclasses.replace(data, supersample=by))
         renderer.draw(pose)  # compiles
-        began = time.perf_counter()
-        images = renderer.draw(pose)
-        rate = places / (time.perf_counter() - began)
+        images, took_s = timed(renderer.draw, pose)
+        rate = places / took_s
         embedding = localiser.embed(images)
         p = np.stack([detector.passage(images, np.full(places, ahead_m)) for ahead_m in AHEAD_M])
         largest = largest or (embedding, p)
@@ -98,13 +98,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = made.parse_args(argv)
     networks = load_trained(arguments.localiser), load_trained(arguments.detector)
     rows, typical = compare(load_scene(arguments.scene), *networks, arguments.places)
-    print("| supersample | images/s | embeddings apart | p: mean difference | largest | other side of 0.5 |")
-    print("|---|---|---|---|---|---|")
-    for row in rows:
-        print(
-            f"| {row.supersample} | {row.images_per_s:.1f} | {row.embedding:.3f} | {row.mean_p:.3f} | "
-            f"{row.largest_p:.3f} | {row.flips:.3f} |"
-        )
+    header = ("supersample", "images/s", "embeddings apart", "p: mean difference", "largest", "other side of 0.5")
+    lines = [(r.supersample, f"{r.images_per_s:.1f}", *(f"{value:.3f}" for value in r[2:])) for r in rows]
+    print(markdown(header, lines), end="")
     print(f"embeddings of different places are {typical:.3f} apart")
 
 

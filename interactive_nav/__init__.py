@@ -73,8 +73,8 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
 
     Args:
         robot: a name from `robot_names()`.
-        scenes: scene folders; each episode draws one.
-        **settings: fields of `NavConfig`, such as backend, num_objects, observations, k_int, episode_steps; or
+        scenes: scene folders, or sets of them (`cluttered/train`); each episode draws one.
+        **settings: of `NavConfig`'s parts, such as backend, num_objects, observations, k_int, episode_steps; or
             `variant="code"` for the values of the original's code where it differs from its paper.
 
     Returns:
@@ -88,11 +88,13 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     from interactive_nav.robots import get_robot
     from interactive_nav.scenes.scene import load_scene
     from interactive_nav.task.env import InteractiveNav
+    from scenes_mjcf.sets import scene_folders
 
     if isinstance(scenes, (str, Path)):
         raise ValueError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
-    return InteractiveNav(get_robot(robot, config.control_mode), tuple(load_scene(s) for s in scenes), config)
+    loaded = tuple(load_scene(s) for s in scene_folders(scenes))
+    return InteractiveNav(get_robot(robot, config.rules.control_mode), loaded, config)
 
 
 __all__ = [

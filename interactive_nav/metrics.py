@@ -6,21 +6,10 @@ returns arrays of those axes; nothing here reads a simulator.
 
 from __future__ import annotations
 
-from typing import Any
-
-import jax
-import numpy as np
-
-Array = Any
-"""A NumPy or JAX array, or a number."""
+from interactive_nav_common.rotations import Array, namespace
 
 GRAVITY = 9.81
 """m/s^2."""
-
-
-def _xp(*values: Any):
-    """`jax.numpy` when any value is a JAX array or tracer, else `numpy`."""
-    return jax.numpy if any(isinstance(v, jax.Array) for v in values) else np
 
 
 def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array, clip: bool = True) -> Array:
@@ -38,7 +27,7 @@ def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array,
     Returns:
         [...] float in [0, 1], without `clip` 0 or more.
     """
-    xp = _xp(success, shortest_path_m, robot_path_m)
+    xp = namespace(success, shortest_path_m, robot_path_m)
     shortest = xp.asarray(shortest_path_m) * 1.0
     travelled = xp.asarray(robot_path_m) * 1.0
     moved = travelled > 0.0
@@ -56,7 +45,7 @@ def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:
     Returns:
         [...] float in [0, 1]; 1 where nothing moved at all.
     """
-    xp = _xp(masses_kg, path_lengths_m)
+    xp = namespace(masses_kg, path_lengths_m)
     work = xp.asarray(masses_kg) * xp.asarray(path_lengths_m) * 1.0
     total = work.sum(-1)
     moved = total > 0.0
@@ -75,7 +64,7 @@ def dynamic_effort(robot_mass_kg: Array, force_sum_n: Array, num_steps: Array, g
     Returns:
         [...] float in (0, 1].
     """
-    xp = _xp(robot_mass_kg, force_sum_n, num_steps)
+    xp = namespace(robot_mass_kg, force_sum_n, num_steps)
     weight = xp.asarray(robot_mass_kg) * gravity * xp.asarray(num_steps)
     total = weight + xp.asarray(force_sum_n)
     some = total > 0.0
@@ -97,7 +86,7 @@ def effort_efficiency(
     Returns:
         [...] float in [0, 1]; a robot that neither moved nor touched anything scores 1.
     """
-    xp = _xp(masses_kg, path_lengths_m, forces_n, num_steps)
+    xp = namespace(masses_kg, path_lengths_m, forces_n, num_steps)
     dynamic = dynamic_effort(xp.asarray(masses_kg)[..., 0], xp.asarray(forces_n).sum(-1), num_steps, gravity)
     return 0.5 * (kinematic_effort(masses_kg, path_lengths_m) + dynamic)
 

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.ndimage import gaussian_filter1d
 
-from interactive_nav.pictures.replay import Replay, ReplayError, load
+from interactive_nav.pictures.replay import Replay, ReplayError, load, replay_path
 from interactive_nav.pictures.views import (
     INSIDE,
     OUTSIDE,
@@ -216,7 +216,7 @@ def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
     Raises:
         ReplayError: it has none; the message says who plays one.
     """
-    path = run / "replays" / f"{policy}-episode{episode}.npz"
+    path = replay_path(run, policy, episode)
     if not path.is_file():
         words = f"{run} --episode {episode} --policy {policy} -o {out}"
         raise ReplayError(f"{path}: no such replay; play the episode and draw it: python -m train.record {words}")

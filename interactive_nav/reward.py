@@ -5,11 +5,7 @@ R = R_suc + R_pot + R_int. Pure functions on NumPy or JAX arrays with any leadin
 
 from __future__ import annotations
 
-from typing import Any
-
-from interactive_nav.metrics import _xp
-
-Array = Any
+from interactive_nav_common.rotations import Array, namespace
 
 
 def success_reward(success: Array, success_value: float = 10.0) -> Array:
@@ -22,7 +18,7 @@ def success_reward(success: Array, success_value: float = 10.0) -> Array:
     Returns:
         [...] 0 or `success_value`.
     """
-    return _xp(success).asarray(success) * success_value
+    return namespace(success).asarray(success) * success_value
 
 
 def potential_reward(geodesic_before_m: Array, geodesic_after_m: Array) -> Array:
@@ -35,7 +31,7 @@ def potential_reward(geodesic_before_m: Array, geodesic_after_m: Array) -> Array
     Returns:
         [...] metres, negative where the robot went away; over an episode it adds up to first less last distance.
     """
-    xp = _xp(geodesic_before_m, geodesic_after_m)
+    xp = namespace(geodesic_before_m, geodesic_after_m)
     return xp.asarray(geodesic_before_m) - xp.asarray(geodesic_after_m)
 
 
@@ -49,7 +45,7 @@ def interaction_reward(interacts: Array, k_int: float) -> Array:
     Returns:
         [...] -k_int or 0.
     """
-    return -k_int * _xp(interacts).asarray(interacts)
+    return -k_int * namespace(interacts).asarray(interacts)
 
 
 def interactive_navigation_reward(

@@ -28,6 +28,7 @@ from interactive_nav.pictures.replay import Replay, ReplayError, load
 from interactive_nav.pictures.views import COLOURS
 from interactive_nav.record import check_scene
 from interactive_nav.robots import get_robot
+from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
 
@@ -40,8 +41,8 @@ MOVED_M = 0.02
 def outlines(replay: Replay, scene: Scene) -> dict[str, tuple[str, np.ndarray]]:
     """Boxes of everything movable: body name -> (category, [n, 10] centre, quaternion, half sizes, body frame)."""
     found = {m.name: (m.category, m.boxes) for m in scene.movables}
-    for i, obj in enumerate(replay.small):
-        found[f"{obj.category}_small_{i}"] = (obj.category, obj.rows)
+    for name, obj in zip(body_names(replay.small), replay.small, strict=True):
+        found[name] = (obj.category, obj.rows)
     return found
 
 

@@ -29,14 +29,6 @@ class SceneTables:
     """[S, M + 1] f32, index 0 the robot; 0 for an empty slot."""
     com_m: jax.Array
     """[S, M, 3] f32 centre of mass in the body's frame."""
-    hinge_pos_w: jax.Array
-    """[S, M, 3] f32 rest position of a hinged body's frame, m, world."""
-    hinge_quat_w: jax.Array
-    """[S, M, 4] f32 rest orientation of it."""
-    hinge_axis: jax.Array
-    """[S, M, 3] f32 in the body's frame."""
-    hinge_anchor_m: jax.Array
-    """[S, M, 3] f32 in the body's frame."""
     node_of_cell: jax.Array
     """[S, rows, columns] i32 the node that stands for each cell."""
     grid_origin_w: jax.Array

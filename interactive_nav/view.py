@@ -19,8 +19,9 @@ import numpy as np
 
 from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.navigation.tables import furniture_map
+from interactive_nav.pictures.scene_model import furnished_spec
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
-from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, pick
+from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.errors import UserError
 
@@ -124,31 +125,17 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
     radii = [robot.footprint_radius_m] if robot else []
     height_m = max([robot.height_m if robot else 0.0, *(o.height_m for o in small)], default=0.0)
     places = place_discs(scene, [*radii, *(o.radius_m for o in small)], max(height_m, 0.1), rng)
-    spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+    spec = furnished_spec(scene, robot, small)
+
+    def put(name: str, xy: np.ndarray, z: float) -> None:
+        yaw, body = rng.uniform(-np.pi, np.pi), spec.body(name)
+        body.pos, body.quat = [*xy, z], [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+
     if robot is not None:
-        robot.add_to(spec)
-        base = spec.body(robot.base_body)
-        base.pos = [*places[0], robot.spawn_height_m]
-        yaw = rng.uniform(-np.pi, np.pi)
-        base.quat = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
-    for i, (obj, xy) in enumerate(zip(small, places[len(radii) :], strict=True)):
-        yaw = rng.uniform(-np.pi, np.pi)
-        name = f"{obj.category}_small_{i}"
-        body = spec.worldbody.add_body(name=name, pos=[*xy, 0.0], quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-        body.add_freejoint(name=f"{name}_joint")
-        volume = sum(8 * float(np.prod(b.half_m)) for b in obj.boxes)
-        for k, box in enumerate(obj.boxes):
-            body.add_geom(
-                name=f"{name}_box_{k}",
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                pos=box.centre_m,
-                quat=box.quat,
-                size=box.half_m,
-                density=obj.mass_kg / volume,
-                friction=[obj.friction, 0.005, 0.0001],
-                group=3,
-            )
-        add_shapes(body, obj, name)
+        put(robot.base_body, places[0], robot.spawn_height_m)
+    for name, obj, xy in zip(body_names(small), small, places[len(radii) :], strict=True):
+        put(name, xy, 0.0)
+        add_shapes(spec.body(name), obj, name)
     model = spec.compile()
     if robot is not None:
         _show_robot(model, robot)

@@ -1,4 +1,9 @@
-"""`key=value` words and plain mappings -> a frozen dataclass of settings; every mistake named in one line."""
+"""`key=value` words and plain mappings -> a frozen dataclass of settings; every mistake named in one line.
+
+A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` (or a plain pair) for ranges. A
+dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`), or flat,
+their settings among those of the whole (`flat`).
+"""
 
 from __future__ import annotations
 
@@ -12,8 +17,8 @@ import math
 import textwrap
 import types
 import typing
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 import yaml
 
@@ -25,38 +30,176 @@ Config = TypeVar("Config")
 AUTO = "auto"  # how None ("chosen for you") is written in files and on the command line
 
 
+class Bounds(NamedTuple):
+    """Numbers that a setting may be; a plain pair `(low, high)` means the same."""
+
+    low: float
+    high: float = math.inf
+    open: bool = False
+    """Both ends are excluded."""
+
+    def hold(self, value: float) -> bool:
+        """Whether a number is within."""
+        return self.low < value < self.high if self.open else self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        low, high = (f"{end:g}" if isinstance(end, float) else str(end) for end in self[:2])
+        if self.high < math.inf:
+            return f"between {low} and {high}{', both excluded' if self.open else ''}"
+        return "a positive number" if self.open else f"at least {low}" if self.low else "0 or more"
+
+
 Seed = Annotated[int, (0, 2**32 - 1)]
 Count = Annotated[int, (1, 10**6)]
+AtLeastOne = Annotated[int, Bounds(1)]
+Natural = Annotated[int, Bounds(0)]
+NotNegative = Annotated[float, Bounds(0)]
+Positive = Annotated[float, Bounds(0, open=True)]
 Share = Annotated[float, (0.0, 1.0)]
+Idle = Sequence[tuple[str, str, Callable[[Any], bool]]]
+
+
+def flat(kind: Callable[[], Config]) -> Config:
+    """A field of a dataclass of settings: another one, whose settings stand among those of the whole."""
+    return dataclasses.field(default_factory=kind, metadata={"flat": True})
 
 
 class Settings:
-    """Base of a frozen dataclass that refuses numbers out of their bounds, as in `p: Annotated[float, (0.0, 1.0)]`."""
+    """Base of a frozen dataclass of settings, each with a default, that refuses what their types do not allow.
+
+    Lists become tuples. Settings of flat sections can be read from the whole by their names.
+    """
+
+    IDLE: ClassVar[Idle] = ()
+    """Settings that change nothing but where something holds: their names, what, and the test of it. Where it does not,
+    they are refused unless they are 0 or their default."""
 
     def __post_init__(self) -> None:
-        for name, hint in _hints(type(self)).items():
-            value = getattr(self, name)
-            for low, high in getattr(hint, "__metadata__", ()) if value is not None else ():  # None: still to be chosen
-                if not low <= value <= high:
-                    raise ConfigError(f"{name} is {value!r}, expected between {low:g} and {high:g}")
+        for name, (section, hint) in _places(type(self)).items():
+            if not section:
+                if isinstance(value := getattr(self, name), list):
+                    object.__setattr__(self, name, tuple(value))
+                _check(name, getattr(self, name), hint)
+        for names, needs, used in self.IDLE:
+            for name in () if used(self) else names.split():
+                if (value := getattr(self, name)) not in (0, getattr(type(self), name)):
+                    told = f"{name} is {value!r}, which changes nothing here"
+                    raise ConfigError(f"{told}: expected {needs}; or leave it out")
+
+    if not TYPE_CHECKING:  # the house itself reads settings from their sections, where types are known
+
+        def __getattr__(self, name: str) -> Any:
+            section, _ = _places(type(self)).get(name, ("", None))
+            if not section:
+                raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
+            return getattr(getattr(self, section), name)
+
+    @classmethod
+    def of(cls, **settings: Any) -> Self:
+        """The defaults but for these settings, wherever they stand.
+
+        Raises:
+            ConfigError: there is no such setting (the message names the nearest one), or it cannot be this.
+        """
+        return replace(cls(), **settings)
 
 
 @functools.cache
-def _hints(config_type: type) -> dict[str, Any]:
-    return typing.get_type_hints(config_type, include_extras=True)
+def _places(config_type: type) -> dict[str, tuple[str, Any]]:
+    """Name of each setting -> the flat section that it is in ('': none), and its type."""
+    hints = typing.get_type_hints(config_type, include_extras=True)
+    places: dict[str, tuple[str, Any]] = {}
+    for field in dataclasses.fields(config_type):
+        inner = _places(hints[field.name]) if "flat" in field.metadata else None
+        if inner is None:
+            places[field.name] = ("", hints[field.name])
+        else:
+            places |= {name: (field.name, hint) for name, (_, hint) in inner.items()}
+    return places
+
+
+def _check(name: str, value: Any, hint: Any) -> None:
+    """Raises `ConfigError` for a value that its type does not allow; None is still to be chosen."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if value is None or origin is None:
+        return
+    if origin is Literal:
+        if value not in arguments:
+            choices = [str(choice) for choice in arguments]
+            near = nearest(str(value), choices)
+            raise ConfigError(f"{name} is {value!r}, expected one of {', '.join(choices)}{near}")
+    elif origin is tuple:
+        for item in value:
+            _check(name, item, arguments[0])
+    else:  # `X | None`, Annotated[X, bounds]
+        _check(name, value, arguments[0])
+        for bounds in arguments[1:] if origin is Annotated else ():
+            if not Bounds(*bounds).hold(value):
+                raise ConfigError(f"{name} is {value!r}, expected {Bounds(*bounds)}")
+
+
+def replace(config: Config, **changes: Any) -> Config:
+    """As `dataclasses.replace`, with settings of flat sections by their own names.
+
+    Raises:
+        ConfigError: there is no such setting (the message names the nearest one), or it cannot be this.
+    """
+    places, own, inner = _places(type(config)), {}, {}
+    for name, value in changes.items():
+        if name not in places:
+            near = nearest(name, list(places)).removeprefix(", ")
+            known = f"known settings: {', '.join(sorted(places))}"
+            raise ConfigError(f"unknown setting {name!r}; {f'{near} ' if near else ''}{known}")
+        section = places[name][0]
+        (inner.setdefault(section, {}) if section else own)[name] = value
+    own |= {section: replace(getattr(config, section), **values) for section, values in inner.items()}
+    return dataclasses.replace(config, **own)  # type: ignore[type-var]
+
+
+def _walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """Every setting in order of definition: its dotted name, the dataclass that it is a field of, its own name."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _walk(value, prefix if "flat" in field.metadata else f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", config, field.name
+
+
+def flatten(config: Any) -> dict[str, Any]:
+    """Dotted name -> value of every setting, in order of definition."""
+    return {dotted: getattr(part, name) for dotted, part, name in _walk(config)}
 
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain values as YAML holds them: lists for tuples, `auto` for None."""
-    plain: dict[str, Any] = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
-            value = to_dict(value)
-        elif isinstance(value, tuple):
-            value = list(value)
-        plain[field.name] = AUTO if value is None else value
-    return plain
+
+    def plain(value: Any) -> Any:
+        return AUTO if value is None else list(value) if isinstance(value, tuple) else value
+
+    return nested((name, plain(value)) for name, value in flatten(config).items())
+
+
+def nested(settings: Iterable[tuple[str, Any]], where: str = "settings") -> dict[str, Any]:
+    """Dotted names taken apart; mappings among the values are merged.
+
+    Raises:
+        ConfigError: a section that was given a value; the message begins with `where`.
+    """
+    whole: dict[str, Any] = {}
+    for name, value in settings:
+        *sections, last = str(name).split(".")
+        mapping = isinstance(value, Mapping)
+        place = whole
+        for section in [*sections, last] if mapping else sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"{where}: {name}: {section} has a value already")
+        if mapping:
+            place.update(nested(value.items(), where))
+        else:
+            place[last] = value
+    return whole
 
 
 def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") -> dict[str, Any]:
@@ -67,7 +210,7 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
     Raises:
         ConfigError: a word without `=`, or a section that was given a value.
     """
-    nested: dict[str, Any] = {}
+    settings = []
     for word in words:
         name, equals, text = word.partition("=")
         if not equals or not name:
@@ -76,15 +219,8 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             value = text
-        *sections, last = name.split(".")
-        place = nested
-        for section in sections:
-            inner = place.setdefault(section, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"override {word!r}: {section} was given a value by an earlier override")
-            place = inner
-        place[last] = value
-    return nested
+        settings.append((name, value))
+    return nested(settings, "override")
 
 
 @functools.cache
@@ -106,7 +242,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
 
     Args:
         base: what `plain` does not name.
-        plain: nested mapping as read from YAML.
+        plain: nested mapping as read from YAML; None, as of an empty file or section: nothing.
         where: file or word the values come from, for messages.
         prefix: dotted name of `base` inside the whole, with its dot.
         known: dotted names elsewhere that a wrong key may have meant.
@@ -114,24 +250,24 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
+    plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
         section = prefix.rstrip(".") or "the file"
         raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
-    hints = typing.get_type_hints(type(base))
+    places = _places(type(base))
     changes: dict[str, Any] = {}
     for key, value in plain.items():
         name = f"{prefix}{key}"
-        if key not in hints:
-            names = [*(f"{prefix}{field}" for field in hints), *known]
+        if key not in places:
+            names = [*(f"{prefix}{field}" for field in places), *known]
             raise ConfigError(f"{where}: unknown key {name!r}{nearest(name, names)} (--help lists them)")
-        if dataclasses.is_dataclass(hints[key]):
+        hint = places[key][1]
+        if dataclasses.is_dataclass(hint):
             changes[key] = overlay(getattr(base, key), value, where, f"{name}.", known)
         else:
-            changes[key] = _convert(value, hints[key], f"{where}: {name}")
+            changes[key] = _convert(value, hint, f"{where}: {name}")
     try:
-        return dataclasses.replace(base, **changes)  # type: ignore[type-var]
-    except ConfigError:
-        raise
+        return replace(base, **changes)
     except ValueError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
         raise ConfigError(f"{where}: {prefix}{error}") from None
 
@@ -163,14 +299,15 @@ def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
             raise ConfigError(f"{name} has no effect {why}; leave it out")
 
 
-def settings_help(config: Any) -> str:
-    """One line a setting: name, default, meaning."""
-    docs, hints = field_docs(type(config)), typing.get_type_hints(type(config))
+def settings_help(config: Any, notes: Mapping[str, str] | None = None, equals: str = "=") -> str:
+    """One line a setting: dotted name, default, meaning, choices, and the note of its name."""
     lines = []
-    for name, value in to_dict(config).items():
-        shown = ",".join(map(str, value)) if isinstance(value, list) else value
-        choice = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is Literal else ()
-        lines.append((f"{name}={shown}", docs[name] + (f" [{' | '.join(choice)}]" if choice else "")))
+    for dotted, part, name in _walk(config):
+        value, doc, hint = getattr(part, name), field_docs(type(part))[name], _places(type(part))[name][1]
+        shown = AUTO if value is None else ",".join(map(str, value)) if isinstance(value, (tuple, Mapping)) else value
+        note = " | ".join(map(str, typing.get_args(hint))) if typing.get_origin(hint) is Literal else ""
+        note = note or (notes or {}).get(dotted, "")
+        lines.append((f"{dotted}{equals}{shown}", doc + (f" [{note}]" if note else "")))
     width = max(len(left) for left, _ in lines) + 2
     return "\n".join(f"  {left:<{width}}{right}" for left, right in lines)
 
@@ -178,14 +315,18 @@ def settings_help(config: Any) -> str:
 def _convert(value: Any, kind: Any, where: str) -> Any:
     """One value as the type of its field, or a `ConfigError` that says what was expected."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is types.UnionType:  # `X | None`
+    if origin in (types.UnionType, typing.Union):  # `X | None`
         if value is None or value == AUTO:
             return None
         return _convert(value, arguments[0], where)
-    if origin is Literal:
-        if value not in arguments:
-            near = nearest(str(value), arguments)
-            raise ConfigError(f"{where}: got {_shown(value)}, expected one of {', '.join(arguments)}{near}")
+    if origin is Annotated:
+        return _convert(value, arguments[0], where)
+    if origin in (Mapping, Sequence):  # whose items are checked by who reads them
+        expected, empty = ("a mapping of settings", {}) if origin is Mapping else ("a list", [])
+        if not isinstance(empty if value is None else value, type(empty)):
+            raise ConfigError(f"{where}: got {value!r}, expected {expected}")
+        return value or empty
+    if origin is Literal:  # which choices there are is checked with the bounds
         return value
     if origin is tuple:
         items = [item for item in value.split(",") if item] if isinstance(value, str) else value

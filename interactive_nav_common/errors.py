@@ -1,5 +1,14 @@
 """What a user can cause or mend: each error is one clear line (what, got, expected, remedy)."""
 
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import ParamSpec
+
+Arguments = ParamSpec("Arguments")
+
 
 class UserError(ValueError):
     """Base of the errors that programs print as one line and exit with 2."""
@@ -11,3 +20,20 @@ class ConfigError(UserError):
 
 class FileError(UserError):
     """A file or folder that cannot be read, written or locked."""
+
+
+def reports_errors(program: str) -> Callable[[Callable[Arguments, int]], Callable[Arguments, int]]:
+    """Of a program's `main`: a user's error is printed as one line, and its exit code is 2."""
+
+    def of(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
+        @functools.wraps(main)
+        def reported(*arguments: Arguments.args, **keywords: Arguments.kwargs) -> int:
+            try:
+                return main(*arguments, **keywords)
+            except UserError as error:
+                print(f"{program}: {error}", file=sys.stderr)
+                return 2
+
+        return reported
+
+    return of

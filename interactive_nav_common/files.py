@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import re
 import secrets
@@ -11,36 +12,67 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.locks import release, take_lock
 from interactive_nav_common.signals import signals_wait
 
 STALE_S = 1.0
-"""An unfinished folder younger than this may be one whose maker has not locked it yet."""
+"""Something unfinished younger than this may be what its maker has not locked yet."""
+PARTIAL = ".partial-"
+"""Begins the names of unfinished files."""
+
+
+@contextlib.contextmanager
+def writing(place: object, remedy: str, what: str = "cannot be written") -> Iterator[None]:
+    """Says in one line what could not be written in the block, why, and what helps.
+
+    Raises:
+        FileError: the system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"{place}: {what} ({error.strerror or error}); {remedy}") from None
 
 
 @contextlib.contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path beside `path` of the same ending, which replaces it once the block has written it.
 
-    Each writer has its own temporary file: of two that write one path at the same time, the last one stands.
+    Each writer has its own temporary file, locked while it writes: of two that write one path at the same time, the
+    last one stands.
 
     Raises:
         FileError: it cannot be written; what stood at `path` is untouched.
     """
     path = Path(path)
-    partial = path.with_name(f".partial-{secrets.token_hex(4)}-{path.name}")
+    partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name}"), None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        os.replace(partial, path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise FileError(f"{path}: cannot be written ({reason}); make room or choose another place") from None
+        with writing(path, "make room or choose another place"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = os.open(partial, os.O_CREAT | os.O_RDWR, 0o666)
+            with contextlib.suppress(OSError):  # a file system without locks: what a killed writer leaves stays there
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            yield partial
+            os.replace(partial, path)
     finally:
         with contextlib.suppress(OSError):
             partial.unlink()
+        release(lock)
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes unfinished files of a folder whose writers were killed; those of writers that run are locked and stay."""
+    for path in folder.glob(f"{PARTIAL}*"):
+        with contextlib.suppress(OSError, FileError):
+            lock = None if time.time() - path.stat().st_mtime < STALE_S else take_lock(path)
+            if lock is not None:
+                path.unlink()
+                release(lock)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -51,6 +83,16 @@ def write_text(path: str | Path, text: str) -> None:
     """
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_arrays(path: str | Path, **arrays: Any) -> None:
+    """Writes arrays as a packed npz file, whole or not at all.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 @contextlib.contextmanager
@@ -83,12 +125,10 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     if target.exists() and not target.is_dir():
         raise FileError(f"{target}: is a file, expected a folder to write; give another place")
     part = target.parent / f".{target.name}.part-{os.getpid()}-{secrets.token_hex(4)}"
-    try:
+    with writing(target, "give another place"):
         target.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
         lock = take_lock(part)
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written ({error.strerror}); give another place") from None
     try:
         yield part
     finally:
@@ -111,7 +151,7 @@ def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
     """
     placed: list[Path] = []
     moved: list[tuple[Path, Path]] = []
-    with signals_wait():
+    with signals_wait(), writing(", ".join(map(str, folders.values())), "make room or give another place"):
         try:
             for finished, target in folders.items():
                 while not _take_place(finished, target):
@@ -122,17 +162,13 @@ def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
                         target.rename(old)
                         moved.append((old, target))
                 placed.append(target)
-        except BaseException as error:
+        except BaseException:
             for target in placed:
                 shutil.rmtree(target, ignore_errors=True)
             for old, target in reversed(moved):
                 with contextlib.suppress(OSError):  # then it stays, and the next writer puts it back
                     if not _take_place(old, target):
                         shutil.rmtree(old, ignore_errors=True)
-            if isinstance(error, OSError):
-                place = ", ".join(str(target) for target in folders.values())
-                reason = error.strerror or error
-                raise FileError(f"{place}: cannot be written ({reason}); make room or give another place") from None
             raise
         for old, _ in moved:
             shutil.rmtree(old, ignore_errors=True)

@@ -120,8 +120,11 @@ def alone_in(out: Path) -> Iterator[None]:
     """Makes a folder and keeps other processes out of it for the block.
 
     Raises:
-        FileError: another one works there.
+        FileError: it cannot be made, or another one works there.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{out}: no folder can be made there ({error.strerror}); choose another one (-o)") from None
     with locked(out / LOCK, f"{out}: {{holder}} works there; wait for it or choose another folder (-o)"):
         yield

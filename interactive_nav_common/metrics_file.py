@@ -26,6 +26,13 @@ def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
         write_text(path, text)
 
 
+def mean_over_episodes(lines: Sequence[dict[str, Any]], name: str) -> float | None:
+    """Mean of a score over the episodes of some lines of metrics; None where none ended."""
+    scored = [(line[name], line["episodes"]) for line in lines if name in line]
+    episodes = sum(count for _, count in scored)
+    return sum(score * count for score, count in scored) / episodes if episodes else None
+
+
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out.
 

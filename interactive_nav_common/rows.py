@@ -1,8 +1,8 @@
-"""Tables of rows in, Parquet files out, whole or not at all, and back."""
+"""Tables of rows in, Parquet files out, whole or not at all, and back; Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,12 @@ from interactive_nav_common.files import whole_file
 
 IDENTITY = ("run", "robot", "policy", "evaluation_seed", "scene", "episode")
 """Columns that name an episode that was played."""
+
+
+def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
+    """A table for people."""
+    rows = [list(header), ["---"] * len(header), *([str(cell) for cell in line] for line in lines)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 
 def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = None) -> None:

@@ -35,6 +35,12 @@ def interval(name: str, values: np.ndarray) -> tuple[float, float]:
     return float(found.low), float(found.high)
 
 
+def mean_text(name: str, values: np.ndarray) -> str:
+    """A mean with its `interval`, for tables."""
+    low, high = interval(name, values)
+    return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]"
+
+
 @dataclasses.dataclass(frozen=True)
 class Estimate:
     """A mean over runs and its 95 % t interval; NaN ends for fewer than two runs."""

@@ -93,7 +93,7 @@ class SceneMaps:
     """Height of the floor in the scan's own frame (0 in the scene's)."""
 
 
-def _known_keys(data: Any, cls: type, where: str) -> dict[str, Any]:
+def known_keys(data: Any, cls: type, where: str) -> dict[str, Any]:
     """The JSON object, when it has the record's keys and their types."""
     if not isinstance(data, dict):
         raise SceneError(f"{where}: got {type(data).__name__}, expected a JSON object; convert the scene again")
@@ -132,7 +132,7 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
         SceneError: no JSON object, unknown or missing key, a value of another type, unknown category or split,
             non-positive mass or friction.
     """
-    data = dict(_known_keys(data, SceneManifest, where))
+    data = dict(known_keys(data, SceneManifest, where))
     if data.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
         raise SceneError(
             f"{where}: schema_version is {data['schema_version']}, expected {SCHEMA_VERSION}; convert the scene again"
@@ -140,7 +140,7 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
     objects = []
     for i, raw in enumerate(data["objects"]):
         here = f"{where}: objects[{i}]"
-        obj = SceneObject(**_known_keys(raw, SceneObject, here))
+        obj = SceneObject(**known_keys(raw, SceneObject, here))
         if obj.category not in CATEGORIES:
             raise SceneError(f"{here}: category is '{obj.category}', expected one of {', '.join(CATEGORIES)}")
         for field in ("mass_kg", "friction"):

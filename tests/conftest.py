@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import atexit
 import collections
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-# Before JAX: tests compile much and compute little.
+# Before JAX: tests compile much and compute little, and often the same as another test, worker or subprocess.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_llvm_disable_expensive_passes=true".strip()
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    compiled = tempfile.mkdtemp(prefix="interactive-nav-compiled-")
+    atexit.register(shutil.rmtree, compiled, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+# An array that silently gains an axis is an error, here and in the programs that tests start.
+os.environ["JAX_NUMPY_RANK_PROMOTION"] = "raise"
 
 import pytest
 from filelock import FileLock

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from interactive_nav_common.errors import UserError
 from topological_nav.commands import adapt, episodes, learning, maps
 from topological_nav.commands.parser import parser
-from topological_nav.commands.progress import Stopped
+from topological_nav.errors import Stopped
 
 
 def main(argv: Sequence[str] | None = None) -> int:

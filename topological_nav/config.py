@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from interactive_nav_common.config import Count, Seed, Settings, Share
+from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share, flat
 from interactive_nav_common.errors import ConfigError
 
 PITCHES = ("up", "level", "down")
@@ -55,7 +55,7 @@ class DataConfig(CameraConfig):
     """Their least distance from obstacles."""
     max_per_room: Count = 10
     """Of them kept in a room."""
-    test_share: float = 0.2
+    test_share: Annotated[float, Bounds(0, 1, open=True)] = 0.2
     """Share of a room's positions (and of its passages' sources) that are for testing only."""
     headings: int = 18
     """Images around a position, for each pitch; a multiple of 3, because testing takes every third."""
@@ -88,8 +88,6 @@ class DataConfig(CameraConfig):
                 f"passage_length_m is {self.passage_length_m:g}, expected one of passage_lengths_m {list(lengths)}; "
                 "add it there"
             )
-        if not 0.0 < self.test_share < 1.0:
-            raise ConfigError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
         if self.headings < 3 or self.headings % 3:
             raise ConfigError(f"headings is {self.headings}, expected a multiple of 3")
 
@@ -227,9 +225,11 @@ class NavigatorConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluationConfig(NavigatorConfig):
+class EvaluationConfig(Settings):
     """Episodes, and how they are scored."""
 
+    navigator: NavigatorConfig = flat(NavigatorConfig)
+    """Who plays them."""
     seed: Seed = 0
     """Of the episodes."""
     episodes: Annotated[int | None, (1, 10**6)] = None
@@ -325,15 +325,10 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
     leg_s: Annotated[float, (0.1, 1000.0)] = 12.0
     """A drive has failed that takes longer for an edge."""
-    test_share: float = 0.1
+    test_share: Annotated[float, Bounds(0, 1, open=True)] = 0.1
     """Share of the nodes whose drives are for testing only."""
     shard: Count = 10
     """Drives a file of images."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.test_share < 1.0:
-            raise ConfigError(f"test_share is {self.test_share}, expected between 0 and 1, both excluded")
 
 
 @dataclasses.dataclass(frozen=True)

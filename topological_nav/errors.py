@@ -1,7 +1,7 @@
 """What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from interactive_nav_common.errors import UserError
@@ -21,6 +21,19 @@ class RunError(UserError):
 
 class MapError(UserError):
     """A topological map that is damaged, of another version, or of another scene."""
+
+
+class Stopped(Exception):
+    """A signal asked to stop; carries its number. What was done is kept, and the same command goes on."""
+
+
+Asked = Callable[[], int]
+"""Asked at places where work can stop: the number of the signal that wants it to; 0: go on."""
+
+
+def go_on() -> int:
+    """An `Asked` that never stops."""
+    return 0
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import reports_errors
 from train import config_io
 from train.config import TrainConfig
 from train.runs.run_folder import RunFolder
@@ -42,18 +42,15 @@ def read_config(arguments: argparse.Namespace) -> TrainConfig:
     return config_io.apply_overrides(dataclasses.replace(config, run=run), arguments.overrides)
 
 
+@reports_errors("train")
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs; 0 when done, 2 on a user's error, 128 + signal when asked to stop (after saving)."""
     arguments = parser().parse_intermixed_args(argv)
-    try:
-        config = read_config(arguments)
-        # Heavy: after the config is known to be right.
-        from train.runs.run import train_run
+    config = read_config(arguments)
+    # Heavy: after the config is known to be right.
+    from train.runs.run import train_run
 
-        _, _, stopped_by = train_run(config, Console())
-    except UserError as error:
-        print(f"train: {error}", file=sys.stderr)
-        return 2
+    _, _, stopped_by = train_run(config, Console())
     return 128 + stopped_by if stopped_by else 0
 
 

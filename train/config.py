@@ -3,61 +3,45 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from interactive_nav.config import NavConfig
+from interactive_nav.config import PhysicsConfig, SensorConfig, TaskRules
+from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, flat, replace
 from interactive_nav_common.errors import ConfigError
 
 
-def require(config: Any, names: str, low: float, high: float = math.inf) -> None:
-    """Refuses values (or elements of tuples) outside [low, high]; None is still to be chosen."""
-    for name in names.split():
-        values = getattr(config, name)
-        for value in values if isinstance(values, tuple) else (values,):
-            if value is not None and not low <= value <= high:
-                interval = f"at least {low}" if high == math.inf else f"between {low} and {high}"
-                raise ValueError(f"{name} is {value!r}, expected {interval}")
-
-
-def require_positive(config: Any, names: str) -> None:
-    """Refuses values that are not finite numbers above 0; None is still to be chosen."""
-    for name in names.split():
-        value = getattr(config, name)
-        if value is not None and not 0.0 < value < math.inf:
-            raise ValueError(f"{name} is {value!r}, expected a positive number")
-
-
 @dataclasses.dataclass(frozen=True)
-class EnvConfig(NavConfig):
+class EnvConfig(Settings):
     """The task: every setting of the environment, and which robot and scenes to make it from."""
 
+    rules: TaskRules = flat(TaskRules)
+    """What the task is."""
+    physics: PhysicsConfig = flat(PhysicsConfig)
+    """How it is simulated."""
+    sensors: SensorConfig = flat(SensorConfig)
+    """What the robot perceives."""
     robot: str = "turtlebot"
     """Robot to drive."""
     scenes: tuple[str, ...] = ()
-    """Scene folders, relative to the current folder; each episode draws one."""
-
-    def nav_fields(self) -> dict[str, Any]:
-        """The keyword arguments of `interactive_nav.make` besides robot and scenes."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(NavConfig)}
+    """Scene folders, relative to the current folder, or sets of them (`sparse/train`); each episode draws one."""
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Settings):
     """Encoders of observations with images (reference benchmark, section 8.1); a vector alone needs none."""
 
-    conv_channels: tuple[int, ...] = (32, 64, 64)
+    conv_channels: tuple[AtLeastOne, ...] = (32, 64, 64)
     """Channels of the convolutions."""
-    conv_kernels: tuple[int, ...] = (8, 4, 3)
+    conv_kernels: tuple[AtLeastOne, ...] = (8, 4, 3)
     """Sides of their kernels, pixels."""
-    conv_strides: tuple[int, ...] = (4, 2, 1)
+    conv_strides: tuple[AtLeastOne, ...] = (4, 2, 1)
     """Their strides, pixels."""
-    image_features: int = 256
+    image_features: AtLeastOne = 256
     """Width of the layer behind the convolutions."""
-    state_features: int = 256
+    state_features: AtLeastOne = 256
     """Width of the layer that takes the vector."""
-    action_features: int = 256
+    action_features: AtLeastOne = 256
     """Width of the layer that takes the action of a critic."""
     share_encoder: bool = False
     """Actor and critic look through one encoder; SAC and DDPG train it with the critic."""
@@ -67,110 +51,97 @@ class NetworkConfig:
     """Arithmetic of the image encoder; parameters stay float32."""
 
     def __post_init__(self) -> None:
-        require(self, "conv_channels conv_kernels conv_strides image_features state_features action_features", 1)
+        super().__post_init__()
         if not len(self.conv_channels) == len(self.conv_kernels) == len(self.conv_strides) > 0:
-            raise ValueError(
+            raise ConfigError(
                 f"conv_channels, conv_kernels and conv_strides have {len(self.conv_channels)}, "
                 f"{len(self.conv_kernels)} and {len(self.conv_strides)} entries, expected the same number, at least 1"
             )
         if self.share_encoder and self.critic_inputs != "all":
-            raise ValueError(
+            raise ConfigError(
                 f"share_encoder is true and critic_inputs is {self.critic_inputs!r}, expected 'all': "
                 "who shares an encoder sees the same"
             )
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOConfig:
+class PPOConfig(Settings):
     """Proximal policy optimisation; names as in Brax's `ppo.train`."""
 
-    num_envs: int | None = None
+    num_envs: AtLeastOne | None = None
     """Environments stepped together."""
-    unroll_length: int | None = None
+    unroll_length: AtLeastOne | None = None
     """Steps of one environment in one training sequence."""
-    batch_size: int | None = None
+    batch_size: AtLeastOne | None = None
     """Sequences in one minibatch."""
-    num_minibatches: int | None = None
+    num_minibatches: AtLeastOne | None = None
     """Minibatches in one pass over the collected data."""
-    num_updates_per_batch: int = 4
+    num_updates_per_batch: AtLeastOne = 4
     """Passes over the collected data."""
-    learning_rate: float = 3e-4
+    learning_rate: Positive = 3e-4
     """Adam's step size; with adaptive_kl the first one."""
     learning_rate_schedule: Literal["constant", "adaptive_kl"] = "constant"
     """adaptive_kl moves the step size so that an update changes the policy by about desired_kl."""
-    desired_kl: float = 0.01
+    desired_kl: Positive = 0.01
     """Target of adaptive_kl."""
-    discounting: float = 0.99
+    discounting: Share = 0.99
     """Discount of one control step."""
-    gae_lambda: float = 0.95
+    gae_lambda: Share = 0.95
     """Lambda of the generalised advantage estimate."""
-    entropy_cost: float = 5e-3
+    entropy_cost: NotNegative = 5e-3
     """Weight of the entropy bonus."""
-    reward_scaling: float = 1.0
+    reward_scaling: Positive = 1.0
     """Factor on every reward inside the loss."""
-    clipping_epsilon: float = 0.2
+    clipping_epsilon: Positive = 0.2
     """Clip range of the probability ratio."""
-    vf_loss_coefficient: float = 0.5
+    vf_loss_coefficient: NotNegative = 0.5
     """Weight of the value loss."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Positive = 1.0
     """Gradients are scaled down to this global norm."""
     normalize_observations: bool = True
     """Normalise observations by their running mean and deviation."""
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
-    policy_hidden_layer_sizes: tuple[int, ...] = (256, 256)
+    policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of the policy network, behind its encoder if there are images."""
-    value_hidden_layer_sizes: tuple[int, ...] = (256, 256)
+    value_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of the value network, behind its encoder if there are images."""
-
-    def __post_init__(self) -> None:
-        require(self, "num_envs unroll_length batch_size num_minibatches num_updates_per_batch", 1)
-        require(self, "policy_hidden_layer_sizes value_hidden_layer_sizes", 1)
-        require(self, "entropy_cost vf_loss_coefficient", 0.0)
-        require(self, "discounting gae_lambda", 0.0, 1.0)
-        require_positive(self, "learning_rate desired_kl reward_scaling clipping_epsilon max_grad_norm")
 
 
 @dataclasses.dataclass(frozen=True)
-class OffPolicyConfig:
+class OffPolicyConfig(Settings):
     """What SAC and DDPG share: many environments, a replay on the device, a few large gradient steps an update."""
 
-    num_envs: int | None = None
+    num_envs: AtLeastOne | None = None
     """Environments stepped together."""
-    steps_per_update: int | None = None
+    steps_per_update: AtLeastOne | None = None
     """Steps of every environment in one update."""
-    grad_steps_per_update: int | None = None
+    grad_steps_per_update: AtLeastOne | None = None
     """Gradient steps in one update."""
-    batch_size: int | None = None
+    batch_size: AtLeastOne | None = None
     """Transitions in one gradient step."""
-    min_replay_size: int | None = None
+    min_replay_size: AtLeastOne | None = None
     """Transitions to collect before learning begins; a run that never learned acts at random until then."""
-    max_replay_size: int | None = None
+    max_replay_size: AtLeastOne | None = None
     """Transitions to keep, rounded down to the same number for each environment."""
-    replay_limit_gb: float = 16.0
+    replay_limit_gb: Positive = 16.0
     """A replay that would take more device memory (1e9 bytes) is refused."""
     replay_dtype: Literal["float32", "float16"] = "float32"
     """How vectors are stored; images keep their own type (env.image_dtype)."""
-    n_steps: int = 1
+    n_steps: AtLeastOne = 1
     """Rewards summed before the critic's own estimate takes over."""
-    discounting: float = 0.99
+    discounting: Share = 0.99
     """Discount of one control step."""
-    reward_scaling: float = 1.0
+    reward_scaling: Positive = 1.0
     """Factor on every reward inside the loss."""
     normalize_observations: bool = True
     """Normalise observations by their running mean and deviation."""
-    policy_hidden_layer_sizes: tuple[int, ...] = (256, 256)
+    policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of the policy network, behind its encoder if there are images."""
-    q_hidden_layer_sizes: tuple[int, ...] = (256, 256)
+    q_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of each critic, behind its encoder if there are images."""
     q_layer_norm: bool = False
     """Layer normalisation in the critics' hidden layers: they stay stable at larger steps."""
-
-    def __post_init__(self) -> None:
-        require(self, "num_envs steps_per_update grad_steps_per_update batch_size min_replay_size max_replay_size", 1)
-        require(self, "n_steps policy_hidden_layer_sizes q_hidden_layer_sizes", 1)
-        require(self, "discounting", 0.0, 1.0)
-        require_positive(self, "replay_limit_gb reward_scaling")
 
     @property
     def replay_slots(self) -> int:
@@ -183,79 +154,68 @@ class OffPolicyConfig:
 class SACConfig(OffPolicyConfig):
     """Soft actor-critic; names as in Brax's `sac.train` where it has them."""
 
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Positive = 3e-4
     """Adam's step size for the policy."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Positive = 3e-4
     """Adam's step size for the critics, and for a shared encoder."""
-    alpha_learning_rate: float = 3e-4
+    alpha_learning_rate: Positive = 3e-4
     """Adam's step size for the temperature."""
-    tau: float = 0.005
+    tau: Share = 0.005
     """Share of the critics in their targets at each gradient step."""
-    initial_alpha: float = 0.01
+    initial_alpha: Positive = 0.01
     """Temperature to begin with; 1 in the original, but rewards are a few centimetres of progress a step here."""
-    target_entropy_per_action: float = -1.0
+    target_entropy_per_action: Annotated[float, (-1e6, 1e6)] = -1.0
     """Entropy that the temperature aims at, times the number of actions: -1 in the original, -0.5 in Brax."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self, "tau", 0.0, 1.0)
-        require_positive(self, "actor_learning_rate critic_learning_rate alpha_learning_rate initial_alpha")
-        if not math.isfinite(self.target_entropy_per_action):
-            raise ValueError(f"target_entropy_per_action is {self.target_entropy_per_action!r}, expected a number")
 
 
 @dataclasses.dataclass(frozen=True)
 class DDPGConfig(OffPolicyConfig):
     """Deep deterministic policy gradient; defaults are the original benchmark's."""
 
-    actor_learning_rate: float = 1e-4
+    actor_learning_rate: Positive = 1e-4
     """Adam's step size for the policy."""
-    critic_learning_rate: float = 1e-3
+    critic_learning_rate: Positive = 1e-3
     """Adam's step size for the critic, and for a shared encoder."""
-    tau: float = 0.05
+    tau: Share = 0.05
     """Share of the networks in their targets at each target update."""
-    target_update_period: int = 5
+    target_update_period: AtLeastOne = 5
     """Gradient steps between two target updates."""
-    num_critics: int = 1
+    num_critics: AtLeastOne = 1
     """Critics; the least of several makes the target, the first leads the policy."""
     noise: Literal["ou", "gaussian"] = "ou"
     """Exploration: an Ornstein-Uhlenbeck process for each environment, or a new Gaussian at each step."""
-    noise_sd: tuple[float, ...] = (0.2,)
+    noise_sd: tuple[NotNegative, ...] = (0.2,)
     """Deviation of what a step adds to the noise: one, or least and largest, spread evenly over environments."""
-    noise_damping: float = 0.15
+    noise_damping: Share = 0.15
     """Share of the Ornstein-Uhlenbeck noise that a step takes away."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self, "target_update_period num_critics", 1)
-        require(self, "noise_sd", 0.0)
-        require(self, "tau noise_damping", 0.0, 1.0)
-        require_positive(self, "actor_learning_rate critic_learning_rate")
         if len(self.noise_sd) not in (1, 2) or tuple(sorted(self.noise_sd)) != self.noise_sd:
-            raise ValueError(f"noise_sd is {self.noise_sd!r}, expected one number, or the least and the largest")
+            raise ConfigError(f"noise_sd is {self.noise_sd!r}, expected one number, or the least and the largest")
 
 
 @dataclasses.dataclass(frozen=True)
-class RunConfig:
+class RunConfig(Settings):
     """The run: how long, from which seed, what is written where."""
 
     out_dir: str = "runs"
     """Folder of all runs."""
     name: str = ""
     """Folder of this run inside out_dir; empty: <config name>-seed<seed>."""
-    seed: int = 0
+    seed: Seed = 0
     """The one seed of networks, environments and sampling."""
-    num_timesteps: int = 20_000_000
+    num_timesteps: AtLeastOne = 20_000_000
     """Environment steps to train for, rounded up to whole updates."""
-    log_every_steps: int = 100_000
+    log_every_steps: AtLeastOne = 100_000
     """Environment steps between two lines of metrics."""
-    checkpoint_every_steps: int = 1_000_000
+    checkpoint_every_steps: AtLeastOne = 1_000_000
     """Environment steps between two checkpoints."""
-    keep_checkpoints: int = 3
+    keep_checkpoints: AtLeastOne = 3
     """Newest checkpoints to keep; the best one is kept as well."""
     best_metric: str = "ins_0.5"
     """Episode score whose mean over a checkpoint interval makes the best checkpoint."""
-    env_state_limit_mb: float = 256.0
+    env_state_limit_mb: NotNegative = 256.0
     """Checkpoints hold the environments' state up to this size; beyond it, resuming begins new episodes."""
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""
@@ -265,20 +225,18 @@ class RunConfig:
     """Project there."""
 
     def __post_init__(self) -> None:
-        require(self, "seed", 0, 2**32 - 1)
-        require(self, "num_timesteps log_every_steps checkpoint_every_steps keep_checkpoints", 1)
-        require(self, "env_state_limit_mb", 0.0)
+        super().__post_init__()
         if self.name != Path(self.name).name or self.name == "..":
-            raise ValueError(f"name is {self.name!r}, expected one folder name (out_dir says where it lies)")
+            raise ConfigError(f"name is {self.name!r}, expected one folder name (out_dir says where it lies)")
         if self.checkpoint_every_steps < self.log_every_steps:
-            raise ValueError(
+            raise ConfigError(
                 f"checkpoint_every_steps is {self.checkpoint_every_steps}, "
                 f"expected at least log_every_steps ({self.log_every_steps})"
             )
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Settings):
     """All that decides a training run."""
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
@@ -349,7 +307,7 @@ def resolve(config: TrainConfig, backend: str) -> TrainConfig:
         section = getattr(config, name)
         filled = {key: value for key, value in auto[backend].items() if getattr(section, key) is None}
         sections[name] = dataclasses.replace(section, **filled)
-    resolved = dataclasses.replace(config, env=dataclasses.replace(config.env, backend=backend), **sections)
+    resolved = dataclasses.replace(config, env=replace(config.env, backend=backend), **sections)
     validate(resolved)
     return resolved
 

@@ -3,33 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
-from interactive_nav_common.config import AUTO, field_docs, nearest, overlay, read_words, to_dict
+from interactive_nav_common.config import flatten, nearest, overlay, read_words, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.sets import scene_folders
 from train.config import AUTO as AUTO_SIZES
 from train.config import TrainConfig, validate
 
 PRESET_DIR = Path(__file__).parent / "configs"
-
-
-def flatten(config: TrainConfig) -> dict[str, Any]:
-    """Dotted name -> value of every setting, in order of definition."""
-
-    def walk(part: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-        for field in dataclasses.fields(part):
-            value = getattr(part, field.name)
-            if dataclasses.is_dataclass(value):
-                yield from walk(value, f"{prefix}{field.name}.")
-            else:
-                yield prefix + field.name, value
-
-    return dict(walk(config, ""))
 
 
 def to_yaml(config: TrainConfig) -> str:
@@ -48,7 +34,7 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    return overlay(base or TrainConfig(), {} if plain is None else plain, where, known=list(flatten(TrainConfig())))
+    return overlay(base or TrainConfig(), plain, where, known=list(flatten(TrainConfig())))
 
 
 def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
@@ -101,8 +87,18 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
     if not config.run.name:
         run = dataclasses.replace(config.run, name=f"{path.stem}-seed{config.run.seed}")
         config = dataclasses.replace(config, run=run)
+    config = with_scenes(config)
     validate(config)
     return config
+
+
+def with_scenes(config: TrainConfig) -> TrainConfig:
+    """The config with the scene folders of the sets that `env.scenes` names (`cluttered/train`).
+
+    Raises:
+        SceneError: a set whose scenes are not there.
+    """
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(config.env.scenes)))
 
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
@@ -116,27 +112,9 @@ def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
 
 def help_text() -> str:
     """One line a setting: dotted name, default, meaning."""
-    lines: list[tuple[str, str]] = []
-
-    def walk(part: Any, prefix: str) -> None:
-        docs, hints = field_docs(type(part)), typing.get_type_hints(type(part))
-        for field in dataclasses.fields(part):
-            value = getattr(part, field.name)
-            if dataclasses.is_dataclass(value):
-                walk(value, f"{prefix}{field.name}.")
-                continue
-            doc = docs[field.name]
-            if typing.get_origin(hints[field.name]) is Literal:
-                doc += f" [{' | '.join(typing.get_args(hints[field.name]))}]"
-            by_backend = AUTO_SIZES.get(prefix.rstrip("."), {}).items()
-            sizes = [f"{backend}: {auto[field.name]}" for backend, auto in by_backend if field.name in auto]
-            if value is None and sizes:
-                doc += f" [{', '.join(sizes)}]"
-            shown = AUTO if value is None else value
-            if isinstance(value, tuple):
-                shown = ",".join(map(str, value))
-            lines.append((f"{prefix}{field.name}={shown}", doc))
-
-    walk(TrainConfig(), "")
-    width = max(len(left) for left, _ in lines) + 2
-    return "\n".join(f"  {left:<{width}}{doc}" for left, doc in lines)
+    sizes: dict[str, list[str]] = {}
+    for section, backends in AUTO_SIZES.items():
+        for backend, auto in backends.items():
+            for name, size in auto.items():
+                sizes.setdefault(f"{section}.{name}", []).append(f"{backend}: {size}")
+    return settings_help(TrainConfig(), {name: ", ".join(each) for name, each in sizes.items()})

@@ -17,8 +17,10 @@ from rich.console import Console
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError
 from interactive_nav.episodes import load as load_episodes
 from interactive_nav.types import FAILURES
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.config import replace
+from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
+from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
@@ -97,61 +99,58 @@ def _wanted(
     if folder:
         return config_to_play(folder, words, arguments.scenes, console)
     config = config_io.apply_overrides(_config_of_yardsticks(policies, arguments), words)
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=tuple(arguments.scenes)))
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 
+@reports_errors("train.evaluate")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
     """Evaluates; 0 when done, 2 on a user's error."""
     arguments = parser().parse_intermixed_args(argv)
     console = Console()
-    try:
-        for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
-            if value is not None and value < 1:
-                raise ConfigError(f"{name} is {value}, expected at least 1")
-        if arguments.record < 0 or not -(2**63) <= arguments.seed < 2**63:
-            raise ConfigError(f"--record {arguments.record} --seed {arguments.seed}: expected 0 or more and 64 bits")
-        policies = tuple(name for name in arguments.policies.split(",") if name)
-        if not policies:
-            raise ConfigError(f"--policies is {arguments.policies!r}, expected at least one, such as {LEARNED}")
-        for word in arguments.words:
-            if "=" in word and not word.startswith("env."):
-                raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
-        runs = [RunFolder(Path(word)) for word in arguments.words if "=" not in word]
-        if len(runs) > 1 and arguments.out:
-            raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
-        folders = runs or [None]
-        configs = [_wanted(folder, policies, arguments, console) for folder in folders]
-        fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
-        # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
-        kinds = [dataclasses.replace(config.env, k_int=0.0) for config in configs]
-        order = sorted(range(len(folders)), key=lambda i: kinds.index(kinds[i]))
-        player, built = None, None
-        for i in order:
-            folder, config = folders[i], configs[i]
-            asked = EvaluationAsked(
-                scenes=tuple(Path(scene).name for scene in config.env.scenes),
-                policies=policies,
-                episodes=len(fixed.episodes) if fixed else arguments.episodes,
-                seed=fixed.seed if fixed else arguments.seed,
-                balanced=arguments.balanced and fixed is None,
-                checkpoint=arguments.checkpoint,
-                deterministic=not arguments.stochastic,
-                settings=tuple(sorted(word for word in arguments.words if "=" in word)),
-                episode_file=_digest(arguments.episode_file) if fixed else "",
-            )
-            out = _place(arguments, folder, config, asked)
-            claim(out.parent)
-            if player is None or kinds[i] != built:
-                player = None  # the old one's memory goes before the new one's comes
-                player, built = Player(build_env(config.env)), kinds[i]
-            rows, played = evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch)
-            trained_steps = folder.origin().get("env_steps") if folder else None
-            write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
-            write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
-            _tell(console, rows, config, player.env, out)
-    except UserError as error:
-        print(f"train.evaluate: {error}", file=sys.stderr)
-        return 2
+    for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
+        if value is not None and value < 1:
+            raise ConfigError(f"{name} is {value}, expected at least 1")
+    if arguments.record < 0 or not -(2**63) <= arguments.seed < 2**63:
+        raise ConfigError(f"--record {arguments.record} --seed {arguments.seed}: expected 0 or more and 64 bits")
+    policies = tuple(name for name in arguments.policies.split(",") if name)
+    if not policies:
+        raise ConfigError(f"--policies is {arguments.policies!r}, expected at least one, such as {LEARNED}")
+    for word in arguments.words:
+        if "=" in word and not word.startswith("env."):
+            raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
+    runs = [RunFolder(Path(word)) for word in arguments.words if "=" not in word]
+    if len(runs) > 1 and arguments.out:
+        raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
+    folders = runs or [None]
+    configs = [_wanted(folder, policies, arguments, console) for folder in folders]
+    fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
+    # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
+    kinds = [replace(config.env, k_int=0.0) for config in configs]
+    order = sorted(range(len(folders)), key=lambda i: kinds.index(kinds[i]))
+    player, built = None, None
+    for i in order:
+        folder, config = folders[i], configs[i]
+        asked = EvaluationAsked(
+            scenes=tuple(Path(scene).name for scene in config.env.scenes),
+            policies=policies,
+            episodes=len(fixed.episodes) if fixed else arguments.episodes,
+            seed=fixed.seed if fixed else arguments.seed,
+            balanced=arguments.balanced and fixed is None,
+            checkpoint=arguments.checkpoint,
+            deterministic=not arguments.stochastic,
+            settings=tuple(sorted(word for word in arguments.words if "=" in word)),
+            episode_file=_digest(arguments.episode_file) if fixed else "",
+        )
+        out = _place(arguments, folder, config, asked)
+        claim(out.parent)
+        if player is None or kinds[i] != built:
+            player = None  # the old one's memory goes before the new one's comes
+            player, built = Player(build_env(config.env)), kinds[i]
+        rows, played = evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch)
+        trained_steps = folder.origin().get("env_steps") if folder else None
+        write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
+        write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
+        _tell(console, rows, config, player.env, out)
     return 0
 
 

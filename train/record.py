@@ -13,6 +13,7 @@ from typing import Any
 
 from rich.console import Console
 
+from interactive_nav.pictures.replay import replay_path
 from interactive_nav.record import add_picture_words, check_picture_words, record
 from train import replay
 from train.config import EnvConfig
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         refused = replay.main(words, build_env)
         if refused:
             return refused
-        path = replay.replay_path(Path(arguments.run), arguments.policy, arguments.episode)
+        path = replay_path(Path(arguments.run), arguments.policy, arguments.episode)
         record(path, arguments, Console())
     except (ValueError, OSError) as error:
         print(f"train.record: {error}", file=sys.stderr)

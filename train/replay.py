@@ -17,18 +17,13 @@ from typing import Any
 from rich.console import Console
 
 from interactive_nav.pictures import replay
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.errors import ConfigError, reports_errors
 from train.config import EnvConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
 from train.scoring.evaluation import LEARNED, add_playing_words, make_policies
 from train.scoring.policies import YARDSTICKS
 from train.scoring.rollout import episode_keys
-
-
-def replay_path(run: Path, policy: str, episode: int) -> Path:
-    """Where a run keeps a replay."""
-    return run / "replays" / f"{policy}-episode{episode}.npz"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -43,42 +38,39 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+@reports_errors("train.replay")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
     """Records; 0 when done, 2 on a user's error."""
     arguments = parser().parse_intermixed_args(argv)
     console = Console()
-    try:
-        if not all(word.isdecimal() for word in arguments.episodes.split(",")):
-            raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
-        episodes = [int(word) for word in arguments.episodes.split(",")]
-        folder = RunFolder(Path(arguments.run))
-        config = config_to_play(folder, arguments.overrides, arguments.scenes, console)
-        claim(folder.path / "replays")
-        env = build_env(config.env)
-        keys = episode_keys(arguments.seed, max(episodes) + 1)
-        names = list(dict.fromkeys(arguments.policies.split(",")))
-        for name in names:
-            if name not in (LEARNED, *YARDSTICKS):
-                known = ", ".join((LEARNED, *YARDSTICKS))
-                raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
-        made = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
-        for name, (policy, meta) in made.items():
-            label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
-            player = replay.Player(env, policy, name, label)
-            for episode in episodes:
-                with console.status(f"{name}, episode {episode}: compiling") as status:
-                    played = player.play(
-                        keys[episode],
-                        episode,
-                        lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
-                    )
-                path = replay_path(folder.path, name, episode)
-                replay.save(played, path)
-                score = played.metrics["ins_0.5"]
-                console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)
-    except UserError as error:
-        print(f"train.replay: {error}", file=sys.stderr)
-        return 2
+    if not all(word.isdecimal() for word in arguments.episodes.split(",")):
+        raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
+    episodes = [int(word) for word in arguments.episodes.split(",")]
+    folder = RunFolder(Path(arguments.run))
+    config = config_to_play(folder, arguments.overrides, arguments.scenes, console)
+    claim(folder.path / "replays")
+    env = build_env(config.env)
+    keys = episode_keys(arguments.seed, max(episodes) + 1)
+    names = list(dict.fromkeys(arguments.policies.split(",")))
+    for name in names:
+        if name not in (LEARNED, *YARDSTICKS):
+            known = ", ".join((LEARNED, *YARDSTICKS))
+            raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
+    made = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
+    for name, (policy, meta) in made.items():
+        label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
+        player = replay.Player(env, policy, name, label)
+        for episode in episodes:
+            with console.status(f"{name}, episode {episode}: compiling") as status:
+                played = player.play(
+                    keys[episode],
+                    episode,
+                    lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
+                )
+            path = replay.replay_path(folder.path, name, episode)
+            replay.save(played, path)
+            score = played.metrics["ins_0.5"]
+            console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)
     return 0
 
 

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import PARTIAL, whole_file
 
 T = TypeVar("T")
 
@@ -194,7 +194,7 @@ def prune(folder: Path, limit_bytes: int, now_s: float) -> None:
     for used_s, size, path in sorted(entries):
         if used_s > now_s - KEEP_S:
             return
-        if excess > 0 or path.name.startswith(".partial-"):
+        if excess > 0 or path.name.startswith(PARTIAL):
             with contextlib.suppress(OSError):
                 path.unlink()
             excess -= size

@@ -26,12 +26,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 import interactive_nav
-from interactive_nav.interop.gym_steps import STEPS, reset_all, reset_where
+from interactive_nav.interop.gym_steps import STEPS, reset_where
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.views import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
-from interactive_nav.task.wrappers import scene_of_slot
+from interactive_nav.task.wrappers import reset_all, scene_of_slot
 from interactive_nav_common.errors import ConfigError
 
 ARRAYS = ("numpy", "jax", "torch")
@@ -126,7 +126,7 @@ class InteractiveNavEnv(gymnasium.Env):
             scenes: scene folders; each episode draws one.
             render_mode: none, or "rgb_array": `render` returns a third-person view.
             slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
-            **settings: fields of `NavConfig`.
+            **settings: of `NavConfig`'s parts.
 
         Raises:
             ValueError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
@@ -207,7 +207,7 @@ class InteractiveNavVectorEnv(VectorEnv):
             autoreset_mode: an `AutoresetMode` or its value ("SameStep", "NextStep", "Disabled").
             arrays: "numpy", "jax" or "torch".
             render_mode: none, or "rgb_array": `render` returns a third-person view of each.
-            **settings: fields of `NavConfig`.
+            **settings: of `NavConfig`'s parts.
 
         Raises:
             ValueError: as `interactive_nav.make`, or another choice that does not exist.
@@ -351,10 +351,10 @@ def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.n
 
 def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
     """The scene that a single environment keeps; None: each episode draws one."""
-    chosen, count = env.config.scene_choice == "slot", len(env.scenes)
+    chosen, count = env.config.rules.scene_choice == "slot", len(env.scenes)
     if slot is not None and (not chosen or slot < 0):
         raise ConfigError(
-            f"slot is {slot} with scene_choice={env.config.scene_choice!r}, expected 0 or more, with 'slot'"
+            f"slot is {slot} with scene_choice={env.config.rules.scene_choice!r}, expected 0 or more, with 'slot'"
         )
     if chosen and slot is None and count > 1:
         raise ConfigError(

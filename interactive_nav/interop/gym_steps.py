@@ -9,22 +9,22 @@ import jax.numpy as jnp
 from gymnasium.vector import AutoresetMode
 
 from interactive_nav.task.env import InteractiveNav
-from interactive_nav.task.wrappers import scene_of_slot
+from interactive_nav.task.wrappers import draw_where
 
 
 def _where(mask: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
-def reset_all(env: InteractiveNav, keys: jax.Array) -> Any:
-    """New episodes, each in the scene that its environment keeps, if it keeps one."""
-    scene = scene_of_slot(env, jnp.arange(keys.shape[0]))
-    return jax.vmap(env.reset)(keys) if scene is None else jax.vmap(env.reset)(keys, scene)
-
-
 def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Array) -> Any:
     """New episodes where `mask`."""
-    return _where(mask, reset_all(env, keys), state)
+    info = state.info
+    physics, nav, rng = draw_where(env, (state.pipeline_state, info["nav"], _where(mask, keys, info["rng"])), mask)
+    of_step = (state.reward, state.done, state.metrics, info["truncation"], info["time_out"])
+    reward, done, metrics, truncation, time_out = jax.tree.map(lambda x: jnp.where(mask, 0.0, x), of_step)
+    info = {**info, "nav": nav, "rng": rng, "truncation": truncation, "time_out": time_out}
+    new = state.replace(pipeline_state=physics, reward=reward, done=done, metrics=metrics, info=info)
+    return new.replace(obs=_where(mask, jax.vmap(env.observe)(new).obs, state.obs))
 
 
 def _outcome(state: Any) -> tuple[Any, ...]:
@@ -41,7 +41,7 @@ def _step_same(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.A
 
 def _step_next(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
     stepped = jax.vmap(env.step)(state, actions)
-    new = jax.lax.cond(ended.any(), lambda s: _where(ended, reset_all(env, state.info["rng"]), s), lambda s: s, stepped)
+    new = jax.lax.cond(ended.any(), lambda s: reset_where(env, s, state.info["rng"], ended), lambda s: s, stepped)
     return new, ended, _outcome(new)
 
 

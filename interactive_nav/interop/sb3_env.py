@@ -37,7 +37,7 @@ class SB3VecEnv(VecEnv):
             robot: a name from `robot_names()`.
             scenes: scene folders; each episode draws one.
             num_envs: environments stepped together.
-            **settings: fields of `NavConfig`.
+            **settings: of `NavConfig`'s parts.
         """
         self.envs = InteractiveNavVectorEnv(robot, scenes, num_envs, AutoresetMode.SAME_STEP, **settings)
         self.render_mode = self.envs.render_mode

@@ -22,7 +22,8 @@ _LIFT = 1.0 + 1e-4
 def _cell(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(row, column), each [...] i32, of the navigation cell that holds each point [..., 2], clamped."""
     rows, columns = tables.node_of_cell.shape[1:]
-    at = jnp.floor((xy - tables.grid_origin_w[scene]) / tables.cell_m).astype(jnp.int32)
+    origin = jnp.broadcast_to(tables.grid_origin_w[scene], xy.shape)
+    at = jnp.floor((xy - origin) / tables.cell_m).astype(jnp.int32)
     return jnp.clip(at[..., 1], 0, rows - 1), jnp.clip(at[..., 0], 0, columns - 1)
 
 
@@ -35,15 +36,16 @@ def node_at(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Array:
 def cell_centre(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Array:
     """[..., 2] m: centre of the navigation cell that holds each world point [..., 2]."""
     r, c = _cell(tables, scene, xy)
-    return tables.grid_origin_w[scene] + tables.cell_m * (jnp.stack([c, r], -1) + 0.5)
+    offset = tables.cell_m * (jnp.stack([c, r], -1) + 0.5)
+    return jnp.broadcast_to(tables.grid_origin_w[scene], offset.shape) + offset
 
 
 def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
     """[] bool: whether the line between two world points (2,) crosses free cells only."""
     rows, columns = tables.free.shape[1:]
     share = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples
-    points = a + share[:, None] * (b - a)
-    at = jnp.floor((points - tables.grid_origin_w[scene]) / tables.fine_m).astype(jnp.int32)
+    points = a[None] + share[:, None] * (b - a)[None]
+    at = jnp.floor((points - tables.grid_origin_w[scene][None]) / tables.fine_m).astype(jnp.int32)
     r, c = jnp.clip(at[:, 1], 0, rows - 1), jnp.clip(at[:, 0], 0, columns - 1)
     return tables.free[scene, r, c].all()
 
@@ -79,7 +81,7 @@ def _from_node(
     """Distance of a point that sees what its node sees, and where its path first leads: a corner, or the goal."""
     none = tables.corner_xy_w.shape[1] - 1
     corners = tables.seen[scene, node].astype(jnp.int32)
-    around = jnp.linalg.norm(tables.corner_xy_w[scene, corners] - xy, axis=-1) + goal.corner_m[corners]
+    around = jnp.linalg.norm(tables.corner_xy_w[scene, corners] - xy[None], axis=-1) + goal.corner_m[corners]
     best = jnp.argmin(around)
     straight = jnp.linalg.norm(goal.xy_w - xy)
     direct = _in_sight(tables, scene, tables.node_xy_w[scene, node], goal.xy_w) | jnp.isinf(around[best])
@@ -127,8 +129,8 @@ def _path(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array,
 def _along(points: jax.Array, length: jax.Array, arc: jax.Array) -> jax.Array:
     """[k, 2]: points of a polyline [p, 2] at given lengths [k], its pieces measured by `length` [p - 1]."""
     before = jnp.cumsum(length) - length
-    share = jnp.clip((arc[:, None] - before) / jnp.maximum(length, 1e-6), 0.0, 1.0)
-    return points[0] + share @ (points[1:] - points[:-1])
+    share = jnp.clip((arc[:, None] - before[None]) / jnp.maximum(length, 1e-6)[None], 0.0, 1.0)
+    return points[:1] + share @ (points[1:] - points[:-1])
 
 
 def _hops(tables: SceneTables, ahead_m: float) -> int:

@@ -103,10 +103,10 @@ def _place_small(
         xys, oks = carry
         xy = places[i]
         reach = radius_m[i] + CLEARANCE_M
-        gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - radius_m
-        ok = ((gaps > reach) | ~oks).all(-1)
+        gaps = jnp.linalg.norm(xy[:, None] - xys[None], axis=-1) - radius_m[None]
+        ok = ((gaps > reach) | ~oks[None]).all(-1)
         for point in kept_free_w:
-            ok &= jnp.linalg.norm(xy - point, axis=-1) > robot_radius_m + reach
+            ok &= jnp.linalg.norm(xy - point[None], axis=-1) > robot_radius_m + reach
         ok &= tables.num_clutter[scene] > 0
         best = jnp.argmax(ok)
         return (xys.at[i].set(xy[best]), oks.at[i].set(ok[best])), None

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.config import NavConfig
+from interactive_nav.config import TaskRules
 from interactive_nav.geodesic import CornerGraph, cell_centres, corner_graph, navigation_grid, sampled_clearance
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.placement import CLEARANCE_M
@@ -73,19 +73,17 @@ def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarr
     return rest
 
 
-def _scene_places(
-    world: World, index: int, config: NavConfig
-) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:
+def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:
     """Shortest paths, start cells [p, 2], goal cells [g, 2] and clutter cells [q, 2] of one scene."""
     scene, robot = world.scenes[index], world.robot
-    maps, fine = scene.maps, config.nav_cell_m / FINE_CELLS
+    maps, fine = scene.maps, rules.nav_cell_m / FINE_CELLS
     free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, fine)
     if not free.any():
         raise SceneError(
             f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "
             "map; use a smaller robot or check the scan's floor"
         )
-    graph = corner_graph(free, fine, config.nav_cell_m, maps.origin_w)
+    graph = corner_graph(free, fine, rules.nav_cell_m, maps.origin_w)
 
     def room(blocked: np.ndarray | bool) -> np.ndarray:
         """Clearance in metres that every point of a fine cell has."""
@@ -99,18 +97,18 @@ def _scene_places(
     centres = functools.partial(cell_centres, cell_m=fine, origin_w=maps.origin_w)
     starts = centres(graph.free & (furnished >= needed))
     # Unless the option says otherwise the robot must fit at the goal too, or one under a sofa could never be reached.
-    goals = starts if config.goal_clear else centres(graph.free & (room(False) >= needed))
+    goals = starts if rules.goal_clear else centres(graph.free & (room(False) >= needed))
     clutter = centres(furnished >= largest + CLEARANCE_M)
-    far = len(starts) and len(goals) and _farthest(starts, goals) >= config.min_goal_distance_m
+    far = len(starts) and len(goals) and _farthest(starts, goals) >= rules.min_goal_distance_m
     if not far:
         raise SceneError(
-            f"{scene.path}: no room for a start and a goal {config.min_goal_distance_m} m apart for robot "
+            f"{scene.path}: no room for a start and a goal {rules.min_goal_distance_m} m apart for robot "
             f"'{robot.name}'; lower min_goal_distance_m or use a larger scene"
         )
     return graph, starts, goals, clutter
 
 
-def check_distances(world: World, tables: SceneTables, config: NavConfig) -> None:
+def check_distances(world: World, tables: SceneTables, rules: TaskRules) -> None:
     """Refuses scenes without a start and a goal at the distances that are asked for.
 
     The planar distance alone is settled with the places. Here a sample of goals is held against every start: where
@@ -119,7 +117,7 @@ def check_distances(world: World, tables: SceneTables, config: NavConfig) -> Non
     Raises:
         SceneError: a scene with no such pair.
     """
-    if not math.isfinite(config.max_goal_distance_m):
+    if not math.isfinite(rules.max_goal_distance_m):
         return
 
     # Places are anywhere in their cells: two of them may be nearer or farther than the middles by this.
@@ -130,8 +128,8 @@ def check_distances(world: World, tables: SceneTables, config: NavConfig) -> Non
         starts = tables.start_xy_w[scene]
         field = goal_field(tables, scene, goal)
         way_m = jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(starts)
-        far = jnp.linalg.norm(starts - goal, axis=-1) >= config.min_goal_distance_m - slack_m
-        fits = far & (way_m <= config.max_goal_distance_m + slack_m)
+        far = jnp.linalg.norm(starts - goal[None], axis=-1) >= rules.min_goal_distance_m - slack_m
+        fits = far & (way_m <= rules.max_goal_distance_m + slack_m)
         return (fits & (jnp.arange(len(starts)) < tables.num_starts[scene])).any()
 
     for i, scene in enumerate(world.scenes):
@@ -140,7 +138,7 @@ def check_distances(world: World, tables: SceneTables, config: NavConfig) -> Non
         if not any(bool(some_fit(jnp.asarray(i), goals[k])) for k in sample):
             raise SceneError(
                 f"{scene.path}: no start and goal of robot '{world.robot.name}' are at least "
-                f"{config.min_goal_distance_m} m apart and at most {config.max_goal_distance_m} m by the way; "
+                f"{rules.min_goal_distance_m} m apart and at most {rules.max_goal_distance_m} m by the way; "
                 "raise max_goal_distance_m or lower min_goal_distance_m"
             )
 
@@ -193,27 +191,15 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
     }
 
 
-def build_tables(world: World, config: NavConfig) -> SceneTables:
+def build_tables(world: World, rules: TaskRules) -> SceneTables:
     """Solves navigation for every scene and stacks all constants on the device.
 
     Raises:
         SceneError: a scene with no room for the robot, or for a start and a goal as far apart as asked.
     """
     with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
-        places = list(pool.map(lambda i: _scene_places(world, i, config), range(len(world.scenes))))
-    layout, slots = world.layout, world.layout.num_slots
-    com = np.stack([m.body_ipos[layout.slot_body] for m in world.models])
-    hinge = {
-        k: np.zeros((len(world.scenes), slots, n)) for k, n in (("pos", 3), ("quat", 4), ("axis", 3), ("anchor", 3))
-    }
-    hinge["quat"][..., 0] = 1.0
-    for s, model in enumerate(world.models):
-        for k in range(slots):
-            if layout.slot_kind[k] == "hinge":
-                body = layout.slot_body[k]
-                joint = model.body_jntadr[body]
-                hinge["pos"][s, k], hinge["quat"][s, k] = model.body_pos[body], model.body_quat[body]
-                hinge["axis"][s, k], hinge["anchor"][s, k] = model.jnt_axis[joint], model.jnt_pos[joint]
+        places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
+    com = np.stack([m.body_ipos[world.layout.slot_body] for m in world.models])
     mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.mass_kg], 1)
 
     def f32(value) -> jnp.ndarray:
@@ -226,10 +212,6 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
         rest_qpos=f32(world.rest_qpos),
         mass_kg=f32(mass),
         com_m=f32(com),
-        hinge_pos_w=f32(hinge["pos"]),
-        hinge_quat_w=f32(hinge["quat"]),
-        hinge_axis=f32(hinge["axis"]),
-        hinge_anchor_m=f32(hinge["anchor"]),
         **navigation_tables([p[0] for p in places]),
         start_xy_w=f32(_pad([p[1] for p in places], 1)),
         num_starts=i32([len(p[1]) for p in places]),
@@ -238,5 +220,5 @@ def build_tables(world: World, config: NavConfig) -> SceneTables:
         clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
         num_clutter=i32([len(p[3]) for p in places]),
     )
-    check_distances(world, tables, config)
+    check_distances(world, tables, rules)
     return tables

@@ -37,16 +37,17 @@ def make_physics(world: World, config: NavConfig) -> Physics:
     Raises:
         ValueError: hull collision on an MJX backend, or a backend that is not installed.
     """
-    backend = resolve_backend(config.backend)
-    if config.collision == "hulls" and backend != "native":
+    rules, physics = config.rules, config.physics
+    backend = resolve_backend(physics.backend)
+    if physics.collision == "hulls" and backend != "native":
         raise ValueError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
-    if config.cone == "elliptic" and backend != "native":
+    if physics.cone == "elliptic" and backend != "native":
         raise ValueError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
-    forces = ForceOptions(config.force_part, config.force_sum, config.needs_contacts)
+    forces = ForceOptions(rules.force_part, rules.force_sum, rules.needs_contacts)
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics
 
-        return NativePhysics(world, config.substeps, sleep=config.sleep, threads=config.threads, forces=forces)
+        return NativePhysics(world, physics.substeps, sleep=physics.sleep, threads=physics.threads, forces=forces)
     from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
     return (WarpPhysics if backend == "warp" else JaxPhysics)(world, config, forces)

@@ -48,9 +48,10 @@ class MjxPhysics(Physics):
 
     def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
         self.window = Window(world, config)
-        self._world, self._substeps = world, config.substeps
+        physics = config.physics
+        self._world, self._substeps = world, physics.substeps
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
-        self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
+        self.contacts_per_env, self.constraints_per_env = physics.contacts_per_env, physics.constraints_per_env
         self._host = self._host_model()
         self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
         layout = self.window.layout
@@ -160,7 +161,7 @@ class WarpPhysics(MjxPhysics):
         # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's carry cannot.
         collected, listed, failures = [], [], jnp.asarray(0, jnp.int32)
         for k in range(self._substeps):
-            data = mjx.step(model, control(data, k) if k else data)
+            data = _engine_step(model, control(data, k) if k else data)
             collected.append(data.sensordata[self._sensors])
             if self._contacts is not None:
                 listed.append(from_sensors(data.sensordata, self._contacts, self._forces.force_part, jnp))
@@ -188,7 +189,7 @@ class JaxPhysics(MjxPhysics):
 
     def _substep_all(self, model, data, control):
         def substep(data, k):
-            data = mjx.step(model, control(data, k))
+            data = _engine_step(model, control(data, k))
             return data, self._forces_from_contacts(data)
 
         data, forces = jax.lax.scan(substep, data, jnp.arange(self._substeps))
@@ -241,6 +242,11 @@ def _slot_of_geom(layout: Layout, model: mujoco.MjModel) -> np.ndarray:
     slot_of_body[layout.structure_body] = layout.num_slots
     slot_of_body[layout.robot_bodies] = _ROBOT
     return slot_of_body[model.geom_bodyid]
+
+
+def _engine_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    with jax.numpy_rank_promotion("allow"):  # MJX counts on it
+        return mjx.step(model, data)
 
 
 def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:

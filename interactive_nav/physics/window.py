@@ -64,7 +64,8 @@ class Window:
         self.world = world
         layout = world.layout
         kinds = np.asarray(layout.slot_kind)
-        limits = {"small": config.active_small, "free": config.active_furniture, "hinge": config.active_doors}
+        physics = config.physics
+        limits = {"small": physics.active_small, "free": physics.active_furniture, "hinge": physics.active_doors}
         model = world.models[0]
         slots: list[tuple[str, int]] = []
         picked = []
@@ -76,7 +77,7 @@ class Window:
                 picked.append((own, width, len(slots), boxes))
                 slots += [(kind, boxes)] * width
         n_walls = int(model.body_geomnum[layout.structure_body])
-        self.n_walls = min(config.active_walls or n_walls, n_walls)
+        self.n_walls = min(physics.active_walls or n_walls, n_walls)
         self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
         self.groups = tuple(self._group(*p) for p in picked)
         self._wall_tables, self._wall_rows = self._walls()
@@ -86,11 +87,6 @@ class Window:
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
         self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
-
-    @property
-    def complete(self) -> bool:
-        """Whether everything is in the window."""
-        return sum(g.width for g in self.groups) == self.world.layout.num_slots
 
     def _group(self, own: np.ndarray, width: int, first: int, boxes: int) -> _Group:
         world, layout = self.world, self.world.layout
@@ -163,7 +159,7 @@ class Window:
             else:
                 centre = state.qpos[layout.slot_qpos[group.slots][:, None] + np.arange(2)]
                 speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots][:, None] + np.arange(6)]).max(-1)
-            gap = jnp.linalg.norm(centre - robot, axis=-1) - self._radius_m[scene, group.slots]
+            gap = jnp.linalg.norm(centre - robot[None], axis=-1) - self._radius_m[scene, group.slots]
             gap = jnp.where(self._occupied[scene, group.slots], gap, _FAR_M)
             _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * (speed > _MOVING_M_S)), group.width)
             left_out = jnp.ones(len(group.slots), bool).at[index].set(False)
@@ -174,7 +170,7 @@ class Window:
         if self.n_walls == count:
             return tuple(chosen), jnp.arange(count), missed.astype(jnp.int32)
         # Planar distance from the robot to each wall box.
-        offset = jnp.einsum("wi,wij->wj", robot - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
+        offset = jnp.einsum("wi,wij->wj", robot[None] - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
         outside = jnp.maximum(jnp.abs(offset) - walls["geom_size"][scene, :, :2], 0.0)
         gap = jnp.where(walls["used"][scene] > 0, jnp.linalg.norm(outside, axis=-1), _FAR_M)
         _, index = jax.lax.top_k(-gap, self.n_walls)
@@ -205,7 +201,7 @@ class Window:
         ]
         for group, index in zip(self.groups, chosen, strict=True):
             hinge = outer.slot_kind[group.slots[0]] == "hinge"
-            q, v = np.arange(1 if hinge else 7), np.arange(1 if hinge else 6)
+            q, v = np.arange(1 if hinge else 7)[None], np.arange(1 if hinge else 6)[None]
             mine = slice(group.first, group.first + group.width)
             found.append(
                 (

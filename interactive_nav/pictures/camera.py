@@ -3,7 +3,7 @@
     frame = Camera(env).frame(state, 640, 480, streams=("rgb", "normals"), view="follow")
 
 Pictures show the scene's visual meshes. Depth, normals and segmentation come from C MuJoCo's rays, which run
-anywhere. RGB comes from MuJoCo's own renderer where a GL is (set MUJOCO_GL to egl or osmesa without a display), or
+anywhere. RGB comes from MuJoCo's own renderer where a GL is (see `interactive_nav.pictures.gl`), or
 from MJX-Warp's, both with textures; where neither is, from rays with a flat colour for each object. MJX-Warp's runs
 on a CPU too, after a compilation of ten seconds a size, so there it is used only when asked for.
 """
@@ -11,18 +11,17 @@ on a CPU too, after a compilation of ten seconds a size, so there it is used onl
 from __future__ import annotations
 
 import math
-import os
-import warnings
 from typing import Any
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from interactive_nav.physics import resolve_backend
+from interactive_nav.pictures.gl import GlPainter
+from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
 from interactive_nav.pictures.shading import BACKGROUND, PALETTE, lambert
-from interactive_nav.pictures.visual import ROBOT_GROUP, VISUAL_GROUP, VisualModel, build_visual
-from interactive_nav.sensing.base import FAR_M, CameraPose, Lens
+from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
+from interactive_nav_common.errors import UserError
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
 VIEWS = ("robot", "top", "follow")
@@ -45,8 +44,8 @@ class Camera:
         if engine not in ENGINES:
             raise ValueError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
         self._env, self._engine = env, engine
-        self._visual: dict[int, VisualModel] = {}
-        self._renderers: dict[tuple, Any] = {}
+        self._models: dict[int, _PictureModel] = {}
+        self._painters: dict[tuple, Any] = {}
 
     @property
     def engine(self) -> str:
@@ -90,134 +89,109 @@ class Camera:
                 "index it first: jax.tree.map(lambda x: x[0], state)"
             )
         scene = int(state.info["nav"].scene_index)
-        if scene not in self._visual:
-            self._visual[scene] = build_visual(self._env.world, scene, self._env.sensors.five_classes)
-        visual = self._visual[scene]
-        data = visual.pose(qpos)
-        pose, fov = self._pose(visual, data, qpos, scene, view, width / height)
-        lens, groups = Lens(width, height, fov), _groups(view != "robot")
+        if scene not in self._models:
+            self._models[scene] = _PictureModel(self._env, scene)
+        model = self._models[scene]
+        model.pose(self._env.world, scene, qpos)
+        pose, fov = self._pose(model, qpos, scene, view, width / height)
+        lens, groups = Lens(width, height, fov), SCENE if view == "robot" else (*SCENE, ROBOT, ROBOT_SOLIDS)
         out: dict[str, np.ndarray] = {}
         if "rgb" in streams:
-            drawn = self._textured(scene, visual, data, pose, lens, groups)
+            drawn = self._textured(scene, model, pose, lens, groups)
             if drawn is not None:
                 out["rgb"] = drawn
         if set(streams) - set(out):
-            out |= _by_rays(visual, data, pose, lens, groups, set(streams) - set(out))
+            out |= _by_rays(model, pose, lens, groups, set(streams) - set(out))
         return {name: out[name] for name in streams}
 
-    def _pose(self, visual: VisualModel, data: mujoco.MjData, qpos, scene: int, view: str, aspect: float):
+    def _pose(self, model: SceneModel, qpos: np.ndarray, scene: int, view: str, aspect: float):
+        """Where the camera of a view is, and its field of view in degrees."""
         env = self._env
         if view == "robot":
             pose = env.sensors.mount.pose(np.asarray(qpos, np.float32))
-            return _Pose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), env.sensors.lens.fov_deg
+            return CameraPose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), env.sensors.lens.fov_deg
         if view == "top":
             maps, fov = env.scenes[scene].maps, 40.0
             rows, columns = maps.traversable.shape
             size = np.array([columns, rows]) * maps.resolution_m
             centre = np.asarray(maps.origin_w) + size / 2
             above = max(size[1], size[0] / aspect) / 2 / math.tan(math.radians(fov / 2)) + 2.5
-            return _Pose(np.array([*centre, above]), np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float)), fov
-        base = data.body(env.world.robot.base_body)
+            down = np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float)
+            return CameraPose(np.array([*centre, above]), down), fov
+        base = model.data.body(env.world.robot.base_body)
         ahead = base.xmat.reshape(3, 3)[:, 0] * [1, 1, 0]
         ahead /= max(np.linalg.norm(ahead), 1e-6)
         target = base.xpos + [0, 0, 0.6 * env.world.robot.height_m]
         back = -1.8 * ahead + [0, 0, 1.1]
         # Not behind a wall.
-        hit = mujoco.mj_ray(visual.model, data, target, back, _groups(False), 1, -1, np.zeros(1, np.int32))
+        reach = np.linalg.norm(back)
+        hit = cast(model.model, model.data, target, back[None] / reach, SCENE)[1][0] / reach
         eye = target + back * (min(1.0, 0.9 * hit) if hit > 0 else 1.0)
-        forward = (target - eye) / np.linalg.norm(target - eye)
-        right = np.array([forward[1], -forward[0], 0.0]) / np.linalg.norm(forward[:2])
-        return _Pose(eye, np.stack([forward, right, np.cross(right, forward)], -1)), 70.0
+        return look_along(eye, target - eye), 70.0
 
-    def _textured(self, scene: int, visual: VisualModel, data, pose: _Pose, lens: Lens, groups) -> np.ndarray | None:
+    def _textured(
+        self, scene: int, model: SceneModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...]
+    ) -> np.ndarray | None:
         """RGB with textures, or None where rays must do."""
+        one = CameraPose(pose.pos_w[None], pose.axes_w[None])
         if self._engine in ("auto", "gl"):
+            key = (scene, lens.width, lens.height)
             try:
-                picture = self._gl(scene, visual, data, pose, lens, groups)
+                if key not in self._painters:
+                    self._painters[key] = GlPainter(model.model, lens.width, lens.height, sky=None)
+                picture = self._painters[key].draw(model.data, one, lens.fov_deg, groups)[0]
                 self._engine = "gl"
                 return picture
-            except Exception as error:  # noqa: BLE001  (GL bindings raise what they like where no GL is)
+            except UserError:
                 if self._engine == "gl":
-                    raise RuntimeError(
-                        f"MuJoCo's renderer does not start here ({error}); set MUJOCO_GL to egl or osmesa and "
-                        "install that library, or choose engine='warp' or 'rays'"
-                    ) from error
+                    raise
                 self._engine = "warp" if resolve_backend("auto") == "warp" else "rays"
         if self._engine == "warp":
             from interactive_nav.sensing.warp import WarpColour
 
-            key = (scene, lens, bytes(groups))
-            if key not in self._renderers:
-                shown = [i for i, g in enumerate(groups) if g]
-                self._renderers[key] = WarpColour(visual.model, lens, 1, shown)
-            camera = CameraPose(jnp.asarray(pose.pos_w[None]), jnp.asarray(pose.axes_w[None]))
-            arrays = data.geom_xpos[None], data.geom_xmat.reshape(1, -1, 3, 3)
-            return np.asarray(self._renderers[key].draw(*arrays, camera))[0]
+            key = (scene, lens, groups)
+            if key not in self._painters:
+                self._painters[key] = WarpColour(model.model, lens, 1, list(groups))
+            arrays = model.data.geom_xpos[None], model.data.geom_xmat.reshape(1, -1, 3, 3)
+            return np.asarray(self._painters[key].draw(*arrays, one))[0]
         return None
 
-    def _gl(self, scene: int, visual: VisualModel, data, pose: _Pose, lens: Lens, groups) -> np.ndarray:
-        key = (scene, lens.width, lens.height)
-        if key not in self._renderers:
-            _choose_gl()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                self._renderers[key] = mujoco.Renderer(visual.model, lens.height, lens.width)
-        renderer = self._renderers[key]
-        forward, up = pose.axes_w[:, 0], pose.axes_w[:, 2]
-        camera = mujoco.MjvCamera()
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.lookat[:] = pose.pos_w + forward
-        camera.distance = 1.0
-        camera.elevation = math.degrees(math.asin(np.clip(forward[2], -1.0, 1.0)))
-        flat = forward if abs(forward[2]) < 1 - 1e-9 else up
-        camera.azimuth = math.degrees(math.atan2(flat[1], flat[0]))
-        visual.model.vis.global_.fovy = lens.fov_deg
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = groups
-        renderer.update_scene(data, camera, option)
-        return renderer.render()
+
+class _PictureModel(SceneModel):
+    """A scene's model with the colours that rays give it."""
+
+    def __init__(self, env: Any, scene: int):
+        world = env.world
+        super().__init__(world.robot, world.scenes[scene], world.small_objects, 5 if env.sensors.five_classes else 4)
+        self.colour = np.array([_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
+        """[ngeom, 3] in [0, 1]: of the geom, or its texture's mean."""
 
 
-class _Pose:
-    """A camera on the host: (3,) position and (3, 3) axes forward, right, up as columns."""
-
-    def __init__(self, pos_w: np.ndarray, axes_w: np.ndarray):
-        self.pos_w, self.axes_w = pos_w, axes_w
-
-
-def _groups(robot: bool) -> np.ndarray:
-    out = np.zeros(6, np.uint8)
-    out[VISUAL_GROUP], out[ROBOT_GROUP] = 1, robot
-    return out
-
-
-def _choose_gl() -> None:
-    """Without a display and a choice of its own, MuJoCo would look for a window system."""
-    if not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
+def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    material = model.geom_matid[geom]
+    texture = model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
+    if texture < 0:
+        return (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])[:3]
+    size = model.tex_height[texture] * model.tex_width[texture]
+    first, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+    pixels = model.tex_data[first : first + size * channels].reshape(size, channels)[:, :3]
+    # Atlases are padded with black.
+    used = pixels.max(1) > 8
+    return pixels[used].mean(0) / 255.0 if used.any() else np.full(3, 0.5)
 
 
-def _by_rays(visual: VisualModel, data, pose: _Pose, lens: Lens, groups, streams: set[str]) -> dict[str, np.ndarray]:
-    right, up = np.meshgrid(lens.columns.astype(float), lens.rows.astype(float))
-    ray = np.stack([np.ones_like(right), right, up], -1) @ pose.axes_w.T
-    length = np.linalg.norm(ray, axis=-1)
-    count = length.size
-    geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
-    unit = (ray / length[..., None]).ravel()
-    mujoco.mj_multiRay(
-        visual.model, data, pose.pos_w, unit, groups, 1, -1, geom, distance, normal, count, FAR_M * length.max()
-    )
-    depth = (distance / length.ravel()).reshape(length.shape)
-    met = (geom >= 0).reshape(length.shape) & (depth > 0) & (depth < FAR_M)
-    geom = geom.reshape(length.shape)
+def _by_rays(
+    model: _PictureModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...], streams: set[str]
+) -> dict[str, np.ndarray]:
+    ray, geom, depth, faces = trace(model.model, model.data, pose, lens, groups)
+    met = (geom >= 0) & (depth > 0) & (depth < FAR_M)
     out: dict[str, np.ndarray] = {"depth": np.where(met, depth, 0.0).astype(np.float32)}
-    out["segmentation"] = np.where(met, visual.class_id[geom], 0).astype(np.uint8)
+    out["segmentation"] = np.where(met, model.class_id[geom], 0).astype(np.uint8)
     if streams & {"normals", "rgb"}:
-        faces = normal.reshape(*length.shape, 3)
         # Meshes may be seen from behind: normals are turned to the viewer.
         faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
         forward, right_w, up_w = pose.axes_w.T
         out["normals"] = np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32)
-        base = np.where(met[..., None], visual.colour[geom], PALETTE[BACKGROUND])
+        base = np.where(met[..., None], model.colour[geom], PALETTE[BACKGROUND])
         out["rgb"] = lambert(base, faces, forward, met, np)
     return {name: out[name] for name in streams}

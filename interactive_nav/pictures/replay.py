@@ -16,9 +16,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
+from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
@@ -174,14 +174,14 @@ class Player:
 def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.ndarray], qpos: np.ndarray) -> Replay:
     env = player.env
     scene = int(first.scene_index)
-    bodies, num_robot, pos, quat = world_poses(env, scene, qpos)
+    bodies, num_robot, pos, quat = world_poses(env.world, scene, qpos)
     counts = {name: np.diff(joined[name], prepend=0) > 0 for name in ("interaction_steps", "structure_steps")}
     return Replay(
         robot=env.robot.name,
         scene=str(env.scenes[scene].path),
         scene_digest=env.scenes[scene].digest,
-        control_dt_s=env.config.control_dt_s,
-        num_objects=env.config.num_objects,
+        control_dt_s=env.config.physics.control_dt_s,
+        num_objects=env.config.rules.num_objects,
         policy=player.name,
         episode=episode,
         label=player.label,
@@ -189,17 +189,17 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         num_robot_bodies=num_robot,
         start_xy_w=first.start_xy_w,
         goal_xy_w=first.goal_xy_w,
-        body_pos_w=pos,
-        body_quat_w=quat,
+        body_pos_w=pos.astype(np.float32),
+        body_quat_w=quat.astype(np.float32),
         action=joined["action"],
         reward=joined["reward"],
         force_n=np.diff(joined["force_sum_n"], prepend=0.0).astype(np.float32),
         touches_movable=counts["interaction_steps"],
         touches_structure=counts["structure_steps"],
         metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
-        small_objects=env.config.small_objects,
-        objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
-        segmentation_classes=env.config.segmentation_classes,
+        small_objects=env.config.rules.small_objects,
+        objects=tuple(str(Path(folder).absolute()) for folder in env.config.rules.objects),
+        segmentation_classes=env.config.sensors.segmentation_classes,
         success_distance_m=env.success_distance_m,
     )
 
@@ -230,30 +230,9 @@ def _play_step(env: InteractiveNav, state: Any, action: jax.Array) -> tuple[Any,
     return state, out | {f"metrics/{name}": state.metrics[name][0] for name in EPISODE_METRICS}
 
 
-def world_poses(env: InteractiveNav, scene: int, qpos: np.ndarray) -> tuple[Any, ...]:
-    """World poses of the robot's bodies and of a scene's movable objects.
-
-    Args:
-        env: for its models.
-        scene: index.
-        qpos: [T, nq]; a row that is not finite repeats the one before it.
-
-    Returns:
-        Names (B), how many of them are the robot's, positions [T, B, 3] f32 and orientations [T, B, 4] f32.
-    """
-    world, layout = env.world, env.world.layout
-    model = world.models[scene]
-    data = mujoco.MjData(model)
-    used = [slot for slot, name in enumerate(world.names[scene]) if name]
-    ids = np.concatenate([layout.robot_bodies, layout.slot_body[used]])
-    names = [model.body(int(b)).name for b in layout.robot_bodies] + [world.names[scene][slot] for slot in used]
-    pos, quat = np.zeros((len(qpos), len(ids), 3), np.float32), np.zeros((len(qpos), len(ids), 4), np.float32)
-    for t, row in enumerate(qpos):
-        if np.isfinite(row).all():
-            data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        pos[t], quat[t] = data.xpos[ids], data.xquat[ids]
-    return tuple(names), len(layout.robot_bodies), pos, quat
+def replay_path(run: Path, policy: str, episode: int) -> Path:
+    """Where a run keeps a replay."""
+    return run / "replays" / f"{policy}-episode{episode}.npz"
 
 
 def save(replay: Replay, path: str | Path) -> None:

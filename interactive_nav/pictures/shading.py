@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.sensing.base import CameraPose, Lens
+from interactive_nav.sensing.base import SKY_COLOUR, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate
 from scenes_mjcf.categories import CLASS_COLOURS
 
-FLOOR_COLOUR, BACKGROUND_COLOUR = (0.56, 0.50, 0.43), (0.93, 0.95, 0.97)
-PALETTE = np.array([*CLASS_COLOURS, FLOOR_COLOUR, BACKGROUND_COLOUR], np.float32)
+FLOOR_COLOUR = (0.56, 0.50, 0.43)
+PALETTE = np.array([*CLASS_COLOURS, FLOOR_COLOUR, SKY_COLOUR], np.float32)
 """Colours by class id, then the floor's and the background's."""
 FLOOR, BACKGROUND = len(CLASS_COLOURS), len(CLASS_COLOURS) + 1
 _LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
@@ -39,7 +39,8 @@ def normals(
     centre, axes = box_poses(tables, scene, qpos)
     n, boxes = centre.shape[:2]
     forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
-    ray = forward + right * jnp.asarray(lens.columns)[:, None] + up * jnp.asarray(lens.rows)[:, None, None]
+    columns, rows = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
+    ray = forward + right * columns + up * rows
     point = camera.pos_w[:, None, None] + ray * depth[..., None]
 
     def of_pixel(table):
@@ -87,7 +88,8 @@ def colours(tables: BoxTables, scene: jax.Array, camera: CameraPose, normal_w: j
 
 def lambert(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
     """Colours [..., 3] in [0, 1] lit by a sun and a lamp at the camera; u8; what is not `met` keeps its colour."""
-    sun = xp.maximum((normal_w * xp.asarray(_LIGHT_W)).sum(-1), 0.0)
+    light_w = xp.broadcast_to(xp.asarray(_LIGHT_W), normal_w.shape)
+    sun = xp.maximum((normal_w * light_w).sum(-1), 0.0)
     lamp = xp.maximum(-(normal_w * forward_w).sum(-1), 0.0)
     light = xp.where(met, xp.minimum(0.45 + 0.4 * sun + 0.25 * lamp, 1.0), 1.0)
     return xp.round(255.0 * base * light[..., None]).astype(xp.uint8)

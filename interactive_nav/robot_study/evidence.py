@@ -18,8 +18,9 @@ import mujoco
 import numpy as np
 
 from interactive_nav.config import NavConfig
+from interactive_nav.metrics import GRAVITY
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robot_study.hall import GRAVITY_M_S2, LOADS, box, hall
+from interactive_nav.robot_study.hall import LOADS, box, hall
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec
@@ -83,7 +84,7 @@ def push_limit_n(robot: RobotSpec, world: World) -> float:
         geom = next(g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 3)
         torque += model.jnt_actfrcrange[joint, 1] / model.geom_size[geom, 0]
         grip = max(grip, float(model.geom_friction[geom, 0]))
-    return min(torque, grip * world.robot_mass_kg * GRAVITY_M_S2)
+    return min(torque, grip * world.robot_mass_kg * GRAVITY)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,9 +148,9 @@ def measure_wheeled(name: str, backend: str = "native") -> Evidence:
     """
     robot = get_robot(name, MODE)
     assert robot.twist is not None
-    front = _front_m(build_world(robot, (hall((box(LOADS[0], 50.0, 50.0),)),), NavConfig(num_objects=0)))
+    front = _front_m(build_world(robot, (hall((box(LOADS[0], 50.0, 50.0),)),), NavConfig.of(num_objects=0)))
     boxes = tuple(box(load, front + load.half_m[0] + 0.1, 20.0 * (i + 1)) for i, load in enumerate(LOADS))
-    config = NavConfig(backend=backend, num_objects=0, sleep=False)
+    config = NavConfig.of(backend=backend, num_objects=0, sleep=False)
     world = build_world(robot, (hall(boxes),), config)
     runs = _manoeuvres(robot)
     used, poses, forces = _run(robot, world, config, runs, _STEPS)
@@ -325,7 +326,7 @@ def measure_walking(name: str, backend: str = "native") -> Evidence:
         _Manoeuvre("straight", 0.0, lambda t: (v if start_s <= t < start_s + going_s else 0.0, 0.0)),
         _Manoeuvre("turn", -40.0, lambda t: (0.0, w if start_s <= t < start_s + turning_s else 0.0)),
     )
-    config = NavConfig(backend=backend, num_objects=0, sleep=False)
+    config = NavConfig.of(backend=backend, num_objects=0, sleep=False)
     # One box far away: the layouts of all backends expect something that can be touched.
     world = build_world(robot, (hall((box(LOADS[0], 50.0, 50.0),)),), config)
     used, poses, _ = _run(robot, world, config, runs, steps)

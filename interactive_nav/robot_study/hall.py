@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from interactive_nav.metrics import GRAVITY
 from interactive_nav.scenes.scene import Movable, Scene
 from scenes_mjcf.schema import SceneManifest, SceneMaps
-
-GRAVITY_M_S2 = 9.81
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +24,7 @@ class Load:
     @property
     def force_n(self) -> float:
         """Horizontal force that keeps it sliding: mu m g."""
-        return self.friction * self.mass_kg * GRAVITY_M_S2
+        return self.friction * self.mass_kg * GRAVITY
 
 
 LOADS = (

@@ -1,21 +1,26 @@
 """Robots in, pictures out: one PNG each, and the figure `docs/robots.png` with what was measured of them.
 
-Pictures come from MuJoCo's renderer where OpenGL is found (EGL, no display needed) and are
-otherwise drawn with matplotlib from the same geoms.
+Pictures come from MuJoCo's renderer where OpenGL is found (EGL, no display needed), else from rays against the same
+geoms.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
+from interactive_nav.pictures.gl import GlPainter
+from interactive_nav.pictures.scene_model import trace
+from interactive_nav.pictures.shading import lambert
 from interactive_nav.robot_study.evidence import Evidence
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
+from interactive_nav.sensing.base import CameraPose, Lens, look_along
+from interactive_nav_common.errors import UserError
 
 _SIZE = (480, 480)
 _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG = 145.0, -22.0
@@ -65,95 +70,31 @@ def _span(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float
     return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
-def _with_gl(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+def _camera(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[CameraPose, Lens]:
+    """A camera that holds what is drawn; leaves nothing else in geom group 0."""
     shown = set(_shown(model))
     for g in range(model.ngeom):
         if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE:
             model.geom_group[g] = 0 if g in shown else 5
     centre, half = _span(model, data)
-    camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance = centre, 2.9 * half
-    camera.azimuth, camera.elevation = _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG
-    # mujoco.Renderer asks for a window system unless MUJOCO_GL was set before mujoco's import, and then aborts
-    # the process where there is no display: EGL is used directly.
-    from mujoco.egl import GLContext
-
-    context = GLContext(*_SIZE)
-    context.make_current()
-    scene = mujoco.MjvScene(model, 1000)
-    drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, drawn)
-    option, view = mujoco.MjvOption(), mujoco.MjrRect(0, 0, *_SIZE)
-    mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
-    mujoco.mjr_render(view, scene, drawn)
-    image = np.zeros((_SIZE[1], _SIZE[0], 3), np.uint8)
-    mujoco.mjr_readPixels(image, None, view, drawn)
-    drawn.free()
-    context.free()
-    return image[::-1].copy()
+    azimuth, elevation = math.radians(_VIEW_AZIMUTH_DEG), math.radians(_VIEW_ELEVATION_DEG)
+    level = math.cos(elevation)
+    forward = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
+    return look_along(centre - 2.9 * half * forward, forward), Lens(*_SIZE, model.vis.global_.fovy)
 
 
-def _faces(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """[n, 4, 3] quadrilaterals of a primitive's surface, world frame."""
-    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-    around, along = 12, 6
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-        faces = []
-        for axis in range(3):
-            for sign in (-1.0, 1.0):
-                face = np.insert(corner, axis, sign, axis=1)
-                faces.append(face * size)
-        local = np.asarray(faces)
-    else:
-        if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            profile = np.array([[0, -size[1]], [size[0], -size[1]], [size[0], size[1]], [0, size[1]]])
-        else:
-            angle = np.linspace(-np.pi / 2, np.pi / 2, 2 * along)
-            if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-                shift = np.where(angle < 0, -size[1], size[1])
-                profile = np.stack([size[0] * np.cos(angle), size[0] * np.sin(angle) + shift], -1)
-            else:
-                tall = size[2] if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0]
-                profile = np.stack([size[0] * np.cos(angle), tall * np.sin(angle)], -1)
-        turn = np.linspace(0, 2 * np.pi, around + 1)
-        flat = size[1] / size[0] if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else 1.0
-        ring = np.stack([np.cos(turn), flat * np.sin(turn)], -1)
-        grid = np.concatenate(
-            [profile[:, None, :1] * ring[None], np.broadcast_to(profile[:, None, 1:], (len(profile), around + 1, 1))],
-            -1,
-        )
-        local = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], 2).reshape(-1, 4, 3)
-    return local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+def _with_gl(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    pose, lens = _camera(model, data)
+    one = CameraPose(pose.pos_w[None], pose.axes_w[None])
+    return GlPainter(model, lens.width, lens.height, sky=None).draw(data, one, lens.fov_deg, [0])[0]
 
 
-def _with_matplotlib(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    figure = Figure(figsize=(_SIZE[0] / 100, _SIZE[1] / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    axes: Any = figure.add_subplot(projection="3d")
-    light = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
-    faces, colours = [], []
-    for geom in _shown(model):
-        own = _faces(model, data, geom)
-        normal = np.cross(own[:, 2] - own[:, 0], own[:, 3] - own[:, 1])
-        length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        shade = 0.55 + 0.45 * np.abs(normal / length @ light)
-        faces.append(own)
-        colours.append(np.clip(shade[:, None] * model.geom_rgba[geom, :3], 0, 1))
-    axes.add_collection3d(Poly3DCollection(np.concatenate(faces), facecolors=np.concatenate(colours)))
-    centre, half = _span(model, data)
-    for setter, middle in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, strict=True):
-        setter(middle - 0.7 * half, middle + 0.7 * half)
-    axes.set_box_aspect((1, 1, 1))
-    axes.view_init(elev=-_VIEW_ELEVATION_DEG, azim=_VIEW_AZIMUTH_DEG - 180)
-    axes.set_axis_off()
-    figure.subplots_adjust(0, 0, 1, 1)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+def _with_rays(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    pose, lens = _camera(model, data)
+    _, geom, _, normal = trace(model, data, pose, lens, [0])
+    met = geom >= 0
+    base = np.where(met[..., None], model.geom_rgba[geom, :3], 1.0)
+    return lambert(base, normal * met[..., None], pose.axes_w[:, 0], met, np)
 
 
 def picture(robot: RobotSpec, renderer: str = "auto") -> np.ndarray:
@@ -161,17 +102,16 @@ def picture(robot: RobotSpec, renderer: str = "auto") -> np.ndarray:
 
     Args:
         robot: its spec.
-        renderer: `gl`, `matplotlib`, or `auto`: OpenGL where there is one.
+        renderer: `gl`, `rays`, or `auto`: OpenGL where there is one.
     """
     model, data = stage(robot)
-    if renderer != "matplotlib":
+    if renderer != "rays":
         try:
             return _with_gl(model, data)
-        except Exception:  # OpenGL's loaders raise what they like where there is none
+        except UserError:
             if renderer == "gl":
                 raise
-            model, data = stage(robot)
-    return _with_matplotlib(model, data)
+    return _with_rays(model, data)
 
 
 def save_pictures(names: tuple[str, ...], folder: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, wheel_twist
+from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, check_mode, set_servo, wheel_twist
 
 FOLDER = Path(__file__).parent / "mjcf"
 _OPTIONS = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity")
@@ -151,17 +151,8 @@ def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoc
 
 
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """(3,) half sizes of a primitive's bounding box in its own frame, m."""
-    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return np.full(3, size[0])
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return np.array([size[0], size[0], size[0] + size[1]])
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return np.array([size[0], size[0], size[1]])
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
-    return size
+    """(3,) half sizes of a box about the geom's origin that holds it, in its own frame, m."""
+    return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
 
 
 def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:
@@ -173,7 +164,7 @@ def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:
     return _Limits((low, high) if low < high else None, effort)
 
 
-def _set_servo(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high: tuple[float, float] | None) -> None:
+def _set_mode(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high: tuple[float, float] | None) -> None:
     """Makes an actuator a position servo, velocity servo or motor; the file has its native one."""
     stiff, damp = float(actuator.gainprm[0]), -float(actuator.biasprm[2])
     if joint.side:
@@ -181,18 +172,7 @@ def _set_servo(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high
         kv = damp
     else:
         kv = limits.effort / (_SPEED_ERROR * joint.max_speed)
-    actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
-    affine, none = mujoco.mjtBias.mjBIAS_AFFINE, mujoco.mjtBias.mjBIAS_NONE
-    gain, bias, actuator.biastype = {
-        "position": (stiff, [0.0, -stiff, -damp], affine),
-        "velocity": (kv, [0.0, 0.0, -kv], affine),
-        "torque": (1.0, [0.0, 0.0, 0.0], none),
-    }[mode]
-    actuator.gainprm = [gain] + [0.0] * 9
-    actuator.biasprm = bias + [0.0] * 7
-    actuator.ctrllimited = low_high is not None
-    if low_high is not None:
-        actuator.ctrlrange = list(low_high)
+    set_servo(actuator, {"position": (stiff, damp), "velocity": (0.0, kv), "torque": None}[mode], low_high)
 
 
 def _affine_law(
@@ -208,9 +188,10 @@ def _affine_law(
         if yaw_gain:
             turn = command[..., 1] + yaw_gain * (command[..., 1] - state.qvel[..., 5])
             command = xp.stack([command[..., 0], turn], -1)
-        controls = command @ xp.asarray(matrix).T + xp.asarray(offset)
+        controls = command @ xp.asarray(matrix).T
+        controls = controls + xp.broadcast_to(xp.asarray(offset), controls.shape)
         if moved:
-            controls = controls + xp.asarray(relative) * state.qpos[..., address]
+            controls = controls + xp.broadcast_to(xp.asarray(relative), controls.shape) * state.qpos[..., address]
         return controls
 
     return law
@@ -317,7 +298,7 @@ class _Mode:
         for i, joint in enumerate(self.base.joints):
             if i not in bounds and not joint.side and self.limits[i].range and self.kind[i] == "position":
                 bounds[i] = self.limits[i].range  # type: ignore[assignment]
-            _set_servo(child.actuator(joint.name), self.kind[i], joint, self.limits[i], bounds.get(i))
+            _set_mode(child.actuator(joint.name), self.kind[i], joint, self.limits[i], bounds.get(i))
 
 
 def _load(base: WheeledBase, prepare: Callable[[mujoco.MjSpec], None] | None) -> mujoco.MjSpec:
@@ -364,8 +345,7 @@ def wheeled_robot(
     Raises:
         ValueError: unknown mode, or a file that does not fit.
     """
-    if control_mode not in base.modes:
-        raise ValueError(f"robot '{base.name}' has no control mode '{control_mode}'; it has {', '.join(base.modes)}")
+    check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"
     child = _load(base, prepare)
     mode = _mode(base, child, control_mode)

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 
-from interactive_nav.robots.spec import ControlLaw, RobotSpec, RobotState, TwistMap
-
-GRAVITY_M_S2 = 9.81
+from interactive_nav.robots.spec import ControlLaw, RobotSpec, RobotState, TwistMap, check_mode, set_servo
+from interactive_nav_common.rotations import yaw_from_quat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,12 +28,6 @@ class Servo:
     """Position mode, N m s/rad."""
     velocity_gain: float
     """Velocity mode, N m s/rad."""
-
-
-def check_mode(robot: str, mode: str, known: tuple[str, ...]) -> None:
-    """Raises ValueError for a control mode that the robot does not have."""
-    if mode not in known:
-        raise ValueError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
 
 
 class BaseMotion(NamedTuple):
@@ -54,9 +47,10 @@ class BaseMotion(NamedTuple):
 
 def base_motion(state: RobotState, xp: Any) -> BaseMotion:
     """The base's lean and velocity in its heading frame."""
-    w, x, y, z = (state.qpos[..., 3 + k] for k in range(4))
+    quat = state.qpos[..., 3:7]
+    w, x, y, z = (quat[..., k] for k in range(4))
     up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    heading = xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    heading = yaw_from_quat(quat)
     cos, sin = xp.cos(heading), xp.sin(heading)
     vx, vy = state.qvel[..., 0], state.qvel[..., 1]
     return BaseMotion(
@@ -105,9 +99,10 @@ def gait_law(legs: Legged) -> ControlLaw:
 
     def law(command, state, xp):
         phase = 2.0 * math.pi * legs.frequency_hz * state.time_s
-        low, high = xp.asarray(legs.ranges).T
-        wanted = xp.asarray(legs.home) + legs.reference(phase, command, base_motion(state, xp), xp)
-        return xp.clip(wanted, low, high)
+        offsets = legs.reference(phase, command, base_motion(state, xp), xp)
+        of_joints = (legs.home, *zip(*legs.ranges, strict=True))
+        home, low, high = (xp.broadcast_to(xp.asarray(x), offsets.shape) for x in of_joints)
+        return xp.clip(home + offsets, low, high)
 
     return law
 
@@ -138,22 +133,9 @@ def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
     world.worldbody.add_frame().attach_body(robot.worldbody.first_body(), f"{legs.name}_", "")
     servo = legs.servo
     for joint, torque, limits in zip(legs.joints, legs.torque_nm, legs.ranges, strict=True):
-        gain, bias, control = servo.stiffness, (0.0, -servo.stiffness, -servo.damping), limits
-        if mode == "velocity":
-            gain, bias, control = servo.velocity_gain, (0.0, 0.0, -servo.velocity_gain), (-100.0, 100.0)
-        elif mode == "torque":
-            gain, bias, control = 1.0, (0.0, 0.0, 0.0), (-torque, torque)
-        world.add_actuator(
-            name=joint,
-            target=joint,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE if any(bias) else mujoco.mjtBias.mjBIAS_NONE,
-            gainprm=[gain] + [0.0] * 9,
-            biasprm=[*bias] + [0.0] * 7,
-            ctrllimited=True,
-            ctrlrange=list(control),
-        )
+        gains = {"velocity": (0.0, servo.velocity_gain), "torque": None}.get(mode, (servo.stiffness, servo.damping))
+        actuator = world.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        set_servo(actuator, gains, {"velocity": (-100.0, 100.0), "torque": (-torque, torque)}.get(mode, limits))
 
 
 def legged_robot(legs: Legged, control_mode: str, **figures: Any) -> RobotSpec:

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.robots.build import Joint, WheeledBase
+from interactive_nav.robots.spec import set_servo
 
 _GEOM = mujoco.mjtGeom
 _STIFFNESS_PER_EFFORT = 10.0
@@ -209,5 +210,4 @@ def _add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
     if own.armature < least:
         own.armature = least
     actuator = child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    actuator.gainprm = [stiff or damp] + [0.0] * 9
-    actuator.biasprm = [0.0, -stiff, -damp] + [0.0] * 7
+    set_servo(actuator, (stiff, damp), None)

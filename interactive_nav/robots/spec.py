@@ -53,6 +53,32 @@ def wheel_twist(wheel_radius_m: float, track_m: float, sides: tuple[int, ...]) -
     return tuple((1.0 / wheel_radius_m, side * track_m / (2.0 * wheel_radius_m)) for side in sides)
 
 
+def check_mode(robot: str, mode: str, known: tuple[str, ...]) -> None:
+    """Raises ValueError for a control mode that the robot does not have."""
+    if mode not in known:
+        raise ValueError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
+
+
+def set_servo(
+    actuator: mujoco.MjsActuator, gains: tuple[float, float] | None, control_range: tuple[float, float] | None
+) -> None:
+    """Makes an actuator a servo of its joint, or a motor.
+
+    Args:
+        actuator: of a joint.
+        gains: stiffness and damping; without stiffness the control is a velocity, else a position; None: a force.
+        control_range: least and largest control; None: any.
+    """
+    stiffness, damping = gains or (0.0, 0.0)
+    actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+    actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE if gains else mujoco.mjtBias.mjBIAS_NONE
+    actuator.gainprm = [(stiffness or damping) if gains else 1.0] + [0.0] * 9
+    actuator.biasprm = [0.0, -stiffness, -damping] + [0.0] * 7
+    actuator.ctrllimited = control_range is not None
+    if control_range is not None:
+        actuator.ctrlrange = list(control_range)
+
+
 @dataclasses.dataclass(frozen=True)
 class RobotSpec:
     """A robot under one control mode: its MJCF and the figures that the task needs. Frame: x forward, y left, z up."""
@@ -120,13 +146,17 @@ class RobotSpec:
 
     def command(self, action, xp=np):
         """Maps actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
-        low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
+        low, high = self._command_range(action, xp)
         return low + 0.5 * (xp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
 
     def action(self, command, xp=np):
         """The inverse of `command`: actions [..., A], clipped to [-1, 1]."""
-        low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
+        low, high = self._command_range(command, xp)
         return xp.clip(2.0 * (xp.asarray(command) - low) / (high - low) - 1.0, -1.0, 1.0)
+
+    def _command_range(self, values, xp):
+        """`action_low` and `action_high`, each in the shape of actions or commands [..., A]."""
+        return (xp.broadcast_to(xp.asarray(end), xp.shape(values)) for end in (self.action_low, self.action_high))
 
     def controls(self, command, state: RobotState, xp=np):
         """Actuator controls [..., nu] for commands [..., A]."""

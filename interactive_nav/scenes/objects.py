@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -291,6 +292,33 @@ _GEOM = {
 }
 _HALF = math.sqrt(0.5)
 _TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (_HALF, 0.0, _HALF, 0.0), "y": (_HALF, -_HALF, 0.0, 0.0)}
+
+
+def body_names(objects: Sequence[SmallObject]) -> tuple[str, ...]:
+    """Names of the bodies of small objects, wherever these stand in a model."""
+    return tuple(f"{o.category}_small_{i}" for i, o in enumerate(objects))
+
+
+def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
+    """Adds an object's boxes to a body: they collide, and share its mass by volume.
+
+    Args:
+        body: the object's body, origin on the floor.
+        obj: the model.
+        name: prefix of the geoms' names.
+    """
+    volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
+    for i, box in enumerate(obj.boxes):
+        body.add_geom(
+            name=f"{name}_box_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.centre_m,
+            quat=box.quat,
+            size=box.half_m,
+            density=obj.mass_kg / volume,
+            friction=[obj.friction, 0.005, 0.0001],
+            group=3,
+        )
 
 
 def add_shapes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:

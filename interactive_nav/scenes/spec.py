@@ -8,12 +8,12 @@ import math
 import mujoco
 import numpy as np
 
-from interactive_nav.config import NavConfig
+from interactive_nav.config import NavConfig, PhysicsConfig, TaskRules
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors
 from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import ConvertedObject
-from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.objects import SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Movable, Scene
 
 PARKING_W = (200.0, 200.0)
@@ -193,17 +193,7 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, coll
         return
     body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
     body.add_freejoint(name=f"{name}_joint")
-    volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
-    for i, box in enumerate(obj.boxes):
-        body.add_geom(
-            name=f"{name}_box_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=box.centre_m,
-            size=box.half_m,
-            density=obj.mass_kg / volume,
-            friction=[obj.friction, 0.005, 0.0001],
-            group=3,
-        )
+    add_boxes(body, obj, name)
     _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
 
 
@@ -213,14 +203,14 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
     spec.modelname = "interactive_nav"
     spec.compiler.degree = False
     option = spec.option
-    option.timestep = config.sim_dt_s
+    option.timestep = config.physics.sim_dt_s
     option.gravity = [0, 0, -9.81]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[
-        config.cone
+        config.physics.cone
     ]
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.iterations = config.solver_iterations
+    option.iterations = config.physics.solver_iterations
     option.ls_iterations = 20
     spec.worldbody.add_geom(
         name="floor",
@@ -231,7 +221,7 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
         conaffinity=_FLOOR,
     )
     robot.add_to(spec)
-    if config.symmetric_actions:
+    if config.rules.symmetric_actions:
         for actuator in spec.actuators:
             low, high = actuator.ctrlrange
             if actuator.ctrllimited and low < 0 < high:
@@ -261,8 +251,8 @@ def build_empty_spec(
     for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
         _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
     _add_structure(spec, np.zeros((0, 10)), n_walls)
-    _add_sensors(spec, robot, named, config)
-    _soften(spec, robot, config)
+    _add_sensors(spec, robot, named, config.rules)
+    _soften(spec, robot, config.physics)
     model = spec.compile()
     return spec, model, find_layout(model, robot, named)
 
@@ -277,9 +267,8 @@ def build_spec(
     """The padded spec of one scene, and the movable slots as (body name, kind)."""
     spec = _empty_spec(robot, config)
     slots: list[tuple[str, str]] = []
-    for i, obj in enumerate(small):
-        name = f"{obj.category}_small_{i}"
-        _add_small(spec, name, obj, len(slots), config.collision)
+    for name, obj in zip(body_names(small), small, strict=True):
+        _add_small(spec, name, obj, len(slots), config.physics.collision)
         slots.append((name, "small"))
     lists = [sorted_movables(s) for s in scenes]
     for kind, per_scene in (("free", [a for a, _ in lists]), ("hinge", [b for _, b in lists])):
@@ -287,17 +276,19 @@ def build_spec(
             column = _slot(per_scene, i)
             n_boxes = max(len(m.boxes) for m in column if m is not None)
             name = f"{kind}_{i}"
-            _add_movable(spec, name, column[scene_index], n_boxes, kind, len(slots), config.collision, None in column)
+            _add_movable(
+                spec, name, column[scene_index], n_boxes, kind, len(slots), config.physics.collision, None in column
+            )
             slots.append((name, kind))
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
-    _add_sensors(spec, robot, slots, config)
-    _soften(spec, robot, config)
+    _add_sensors(spec, robot, slots, config.rules)
+    _soften(spec, robot, config.physics)
     return spec, slots
 
 
-def _soften(spec: mujoco.MjSpec, robot: RobotSpec, config: NavConfig) -> None:
+def _soften(spec: mujoco.MjSpec, robot: RobotSpec, physics: PhysicsConfig) -> None:
     for geom in spec.geoms:
-        geom.solref = [config.contact_time_constant_s, 1.0]
+        geom.solref = [physics.contact_time_constant_s, 1.0]
     if robot.contact_time_constant_s is not None:
         for geom in spec.body(robot.base_body).find_all("geom"):
             geom.solref = [robot.contact_time_constant_s, 1.0]
@@ -311,14 +302,14 @@ def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
         _add_box(structure, row, f"wall_{i}", 0.5)
 
 
-def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], config: NavConfig) -> None:
+def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], rules: TaskRules) -> None:
     for i, (name, kind) in enumerate(slots):
         _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
         if kind == "hinge":
             # A door leaf hangs in its frame: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
     _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
-    if config.needs_contacts:
+    if rules.needs_contacts:
         add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
 
 

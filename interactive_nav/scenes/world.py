@@ -45,8 +45,6 @@ class World:
     """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
     names: tuple[tuple[str, ...], ...]
     """[S][M] body names, '' for an empty slot."""
-    settle_m: np.ndarray
-    """[S, M] how far each piece of furniture moved while settling."""
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
@@ -100,33 +98,28 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     """
     if not scenes:
         raise ValueError("scenes is empty, expected at least one scene folder")
-    if config.collision == "hulls" and len(scenes) > 1:
+    if config.physics.collision == "hulls" and len(scenes) > 1:
         raise ValueError(
             f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
             "use collision='boxes'"
         )
-    small = small_objects(config.num_objects, config.small_objects, config.objects)
+    small = small_objects(config.rules.num_objects, config.rules.small_objects, config.rules.objects)
     specs, models, slots = [], [], []
     for i in range(len(scenes)):
         spec, slots = build_spec(robot, i, scenes, small, config)
         specs.append(spec)
         models.append(spec.compile())
     layout = find_layout(models[0], robot, slots)
-    occupied, mass, names, rest, moved = [], [], [], [], []
+    occupied, mass, names, rest = [], [], [], []
     for scene, model in zip(scenes, models, strict=True):
         own, label = _taken_slots(scene, slots)
         qpos = _settle(model, layout, robot)
         if not np.isfinite(qpos).all():
             raise SceneError(f"{scene.path}: its furniture does not settle (non-finite); convert the scene again")
-        shift = [
-            np.linalg.norm(qpos[q : q + 3] - model.qpos0[q : q + 3]) if kind == "free" else 0.0
-            for q, kind in zip(layout.slot_qpos, layout.slot_kind, strict=True)
-        ]
         occupied.append(own)
         names.append(label)
         mass.append(np.where(own, model.body_mass[layout.slot_body], 0.0))
         rest.append(qpos)
-        moved.append(np.where(own, np.asarray(shift, float), 0.0))
     return World(
         robot=robot,
         scenes=scenes,
@@ -139,5 +132,4 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         mass_kg=np.asarray(mass),
         occupied=np.asarray(occupied),
         names=tuple(names),
-        settle_m=np.asarray(moved),
     )

@@ -17,6 +17,18 @@ from interactive_nav.batching import one_of_batch
 NEAR_M = 0.01
 FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
+SKY_COLOUR = (0.93, 0.95, 0.97)
+"""RGB in [0, 1] of pictures where nothing is met."""
+
+
+@flax.struct.dataclass
+class CameraPose:
+    """Where a camera is, world frame."""
+
+    pos_w: Any
+    """[..., 3], m: f32 of JAX, or NumPy's on the host."""
+    axes_w: Any
+    """[..., 3, 3], columns: forward, right, up."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,15 +60,10 @@ class Lens:
         """[height] f32: upward offset at depth 1, top to bottom."""
         return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
 
-
-@flax.struct.dataclass
-class CameraPose:
-    """Where a camera is, world frame."""
-
-    pos_w: jax.Array
-    """[..., 3] f32, m."""
-    axes_w: jax.Array
-    """[..., 3, 3] f32, columns: forward, right, up."""
+    def rays(self, pose: CameraPose) -> np.ndarray:
+        """[height, width, 3] of the pixels of one camera, world frame; along its axis their length is 1."""
+        right, up = np.meshgrid(self.columns.astype(float), self.rows.astype(float))
+        return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
 
 
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
@@ -72,10 +79,10 @@ def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
     forward = forward_w / xp.linalg.norm(forward_w, axis=-1, keepdims=True)
     flat = xp.stack([forward[..., 1], -forward[..., 0], xp.zeros_like(forward[..., 0])], -1)
     length = xp.linalg.norm(flat, axis=-1, keepdims=True)
-    aside = xp.asarray([0.0, -1.0, 0.0], forward.dtype)
+    aside = xp.broadcast_to(xp.asarray([0.0, -1.0, 0.0], forward.dtype), flat.shape)
     right = xp.where(length > 1e-6, flat / xp.where(length > 1e-6, length, 1.0), aside)
     up = xp.cross(right, forward)
-    return CameraPose(pos_w, xp.stack([forward, right, up], -1))  # type: ignore[arg-type]
+    return CameraPose(pos_w, xp.stack([forward, right, up], -1))
 
 
 class Renderer(abc.ABC):

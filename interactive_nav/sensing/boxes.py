@@ -6,17 +6,15 @@ invisible to itself.
 
 from __future__ import annotations
 
-from typing import Any
-
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.scenes.scene import Movable
+from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import sorted_movables
 from interactive_nav.scenes.world import World
-from interactive_nav_common.rotations import matrix_from_quat
+from interactive_nav_common.rotations import Array, matrix_from_quat
 from scenes_mjcf.categories import TABLE, class_id
 
 NUM_CLASSES = max(number for category in TABLE for number in category.segmentation_ids) + 1
@@ -56,6 +54,20 @@ class BoxTables:
         return len(self.body)
 
 
+def _boxes_of_slots(world: World, scene: Scene, five_categories: bool) -> list[tuple[np.ndarray, int]]:
+    """Boxes [n, 10] and class id of what is in each slot of a scene, then of its walls."""
+    free, hinged = sorted_movables(scene)
+    own, out = {"free": iter(free), "hinge": iter(hinged)}, []
+    for i, kind in enumerate(world.layout.slot_kind):
+        if kind == "small":
+            out.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id))
+            continue
+        movable = next(own[kind], None)
+        boxes = np.zeros((0, 10)) if movable is None else movable.boxes
+        out.append((boxes, 0 if movable is None else class_id(movable.category, five_categories)))
+    return [*out, (scene.walls, 0)]
+
+
 def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
@@ -65,46 +77,31 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
-    columns: list[list[tuple[np.ndarray, int, Movable | None]]] = []
-    for scene in scenes:
-        free, hinged = sorted_movables(scene)
-        own = {"free": iter(free), "hinge": iter(hinged)}
-        column: list[tuple[np.ndarray, int, Movable | None]] = []
-        for i, kind in enumerate(layout.slot_kind):
-            if kind == "small":
-                column.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id, None))
-                continue
-            movable = next(own[kind], None)
-            boxes = np.zeros((0, 10)) if movable is None else movable.boxes
-            column.append((boxes, 0 if movable is None else class_id(movable.category, five_categories), movable))
-        column.append((scene.walls, 0, None))
-        columns.append(column)
+    columns = [_boxes_of_slots(world, scene, five_categories) for scene in scenes]
     counts = [max(len(column[m][0]) for column in columns) for m in range(slots + 1)]
     body = np.repeat(np.arange(slots + 1), counts)
     first = np.concatenate([[0], np.cumsum(counts)])
     shape = (len(scenes), len(body))
     pos, half, ids = np.zeros((*shape, 3)), np.full((*shape, 3), -1.0), np.zeros(shape, np.uint8)
     axes = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
+    is_hinge = np.asarray([kind == "hinge" for kind in layout.slot_kind], bool)
     hinge_pos, hinge_axis, anchor = np.zeros((3, len(scenes), slots, 3))
     hinge_axes = np.broadcast_to(np.eye(3), (len(scenes), slots, 3, 3)).copy()
-    for s, column in enumerate(columns):
-        for m, (boxes, number, movable) in enumerate(column):
-            for i, row in enumerate(boxes):
-                at = first[m] + i
-                pos[s, at], axes[s, at], half[s, at], ids[s, at] = (
-                    row[:3],
-                    matrix_from_quat(row[3:7]),
-                    row[7:10],
-                    number,
-                )
-            if movable is not None and movable.hinge is not None:
-                hinge_pos[s, m], hinge_axes[s, m] = movable.pos_w, matrix_from_quat(movable.quat_w)
-                hinge_axis[s, m], anchor[s, m] = movable.hinge.axis, movable.hinge.anchor_m
+    for s, (column, model) in enumerate(zip(columns, world.models, strict=True)):
+        for m, (boxes, number) in enumerate(column):
+            at = slice(first[m], first[m] + len(boxes))
+            pos[s, at], half[s, at], ids[s, at] = boxes[:, :3], boxes[:, 7:10], number
+            axes[s, at] = matrix_from_quat(boxes[:, 3:7])
+        for m in np.flatnonzero(is_hinge):
+            leaf = layout.slot_body[m]
+            joint = model.body_jntadr[leaf]
+            hinge_pos[s, m], hinge_axes[s, m] = model.body_pos[leaf], matrix_from_quat(model.body_quat[leaf])
+            hinge_axis[s, m], anchor[s, m] = model.jnt_axis[joint], model.jnt_pos[joint]
     f32 = jnp.float32
     return BoxTables(
         body=body,
         slot_qpos=np.asarray(layout.slot_qpos),
-        hinged=np.asarray([kind == "hinge" for kind in layout.slot_kind], bool),
+        hinged=is_hinge,
         pos_b=jnp.asarray(pos, f32),
         axes_b=jnp.asarray(axes, f32),
         half_m=jnp.asarray(half, f32),
@@ -126,6 +123,19 @@ def compose(first: jax.Array, second: jax.Array) -> jax.Array:
     return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
 
 
+def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A hinged body's frame in its frame at rest: place [..., 3], m, and axes as columns [..., 3, 3].
+
+    Args:
+        axis: [..., 3] unit vector, in the body's frame.
+        anchor_m: [..., 3] in the body's frame.
+        angle_rad: [...].
+    """
+    half = 0.5 * angle_rad[..., None]
+    turned = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
+    return anchor_m - rotate(turned, anchor_m), turned
+
+
 def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     """World frames of the bodies; leading batch axes as the caller has them.
 
@@ -140,21 +150,18 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     lead, slots = qpos.shape[:-1], len(tables.slot_qpos)
     pos = jnp.zeros((*lead, slots + 1, 3), qpos.dtype)
     axes = jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (*lead, slots + 1, 3, 3))
-    free, swing = np.flatnonzero(~tables.hinged), np.flatnonzero(tables.hinged)
+    free, hinged = np.flatnonzero(~tables.hinged), np.flatnonzero(tables.hinged)
     if len(free):
         pose = qpos[..., tables.slot_qpos[free][:, None] + np.arange(7)]
         pos = pos.at[..., free, :].set(pose[..., :3])
         axes = axes.at[..., free, :, :].set(matrix_from_quat(pose[..., 3:]))
-    if len(swing):
-        half = 0.5 * qpos[..., tables.slot_qpos[swing]]
-        axis, anchor = tables.hinge_axis_b[scene][..., swing, :], tables.hinge_anchor_b[scene][..., swing, :]
-        quat = jnp.concatenate([jnp.cos(half)[..., None], jnp.sin(half)[..., None] * axis], -1)
-        turned = matrix_from_quat(quat)
-        arm = anchor - rotate(turned, anchor)
-        rest = tables.hinge_axes_w[scene][..., swing, :, :]
-        origin = tables.hinge_pos_w[scene][..., swing, :]
-        pos = pos.at[..., swing, :].set(origin + rotate(rest, arm))
-        axes = axes.at[..., swing, :, :].set(compose(rest, turned))
+    if len(hinged):
+        axis, anchor = tables.hinge_axis_b[scene][..., hinged, :], tables.hinge_anchor_b[scene][..., hinged, :]
+        arm, turned = swing(axis, anchor, qpos[..., tables.slot_qpos[hinged]])
+        rest = tables.hinge_axes_w[scene][..., hinged, :, :]
+        origin = tables.hinge_pos_w[scene][..., hinged, :]
+        pos = pos.at[..., hinged, :].set(origin + rotate(rest, arm))
+        axes = axes.at[..., hinged, :, :].set(compose(rest, turned))
     return pos, axes
 
 
@@ -163,28 +170,3 @@ def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax
     pos, axes = body_poses(tables, scene, qpos)
     pos, axes = pos[..., tables.body, :], axes[..., tables.body, :, :]
     return pos + rotate(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
-
-
-def with_robot(tables: BoxTables, world: World) -> BoxTables:
-    """The same boxes and one about the robot, for views from outside."""
-    slots, scenes = len(tables.slot_qpos), tables.half_m.shape[0]
-    radius, half_height = world.robot.footprint_radius_m, world.robot.height_m / 2
-
-    def add(array: jax.Array, row: Any, at: int) -> jax.Array:
-        new = jnp.broadcast_to(jnp.asarray(row, array.dtype), (scenes, 1, *array.shape[2:]))
-        return jnp.concatenate([array[:, :at], new, array[:, at:]], 1)
-
-    eye = np.eye(3).tolist()
-    return tables.replace(
-        body=np.append(np.where(tables.body == slots, slots + 1, tables.body), slots),
-        slot_qpos=np.append(tables.slot_qpos, world.layout.robot_qpos),
-        hinged=np.append(tables.hinged, False),
-        pos_b=add(tables.pos_b, [0.0, 0.0, half_height], tables.num_boxes),
-        axes_b=add(tables.axes_b, eye, tables.num_boxes),
-        half_m=add(tables.half_m, [0.8 * radius, 0.8 * radius, half_height], tables.num_boxes),
-        class_id=add(tables.class_id, class_id("robot"), tables.num_boxes),
-        hinge_pos_w=add(tables.hinge_pos_w, [0.0] * 3, slots),
-        hinge_axes_w=add(tables.hinge_axes_w, eye, slots),
-        hinge_axis_b=add(tables.hinge_axis_b, [0.0] * 3, slots),
-        hinge_anchor_b=add(tables.hinge_anchor_b, [0.0] * 3, slots),
-    )

@@ -13,7 +13,7 @@ import numpy as np
 
 from interactive_nav.robots.spec import Camera
 from interactive_nav.sensing.base import CameraPose, look_along
-from interactive_nav.sensing.boxes import compose, rotate
+from interactive_nav.sensing.boxes import compose, rotate, swing
 from interactive_nav_common.rotations import matrix_from_quat
 
 
@@ -43,22 +43,24 @@ class Mount:
             qpos: [..., nq].
         """
         at = self.base_qpos
+
+        def constant(value: np.ndarray) -> jax.Array:
+            return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
+
         pos, axes = qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7])
         for link in self.links:
-            pos = pos + rotate(axes, jnp.asarray(link.pos, qpos.dtype))
-            axes = compose(axes, jnp.asarray(link.axes, qpos.dtype))
+            pos = pos + rotate(axes, constant(link.pos))
+            axes = compose(axes, constant(link.axes))
             for slides, address, zero, axis, anchor in link.joints:
-                value, axis = qpos[..., address] - zero, jnp.asarray(axis, qpos.dtype)
+                value, axis = qpos[..., address] - zero, constant(axis)
                 if slides:
                     pos = pos + rotate(axes, axis) * value[..., None]
                     continue
-                half = 0.5 * value[..., None]
-                turn = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
-                anchor = jnp.asarray(anchor, qpos.dtype)
-                pos = pos + rotate(axes, anchor - rotate(turn, anchor))
+                arm, turn = swing(axis, constant(anchor), value)
+                pos = pos + rotate(axes, arm)
                 axes = compose(axes, turn)
-        where = pos + rotate(axes, jnp.asarray(self.pos_b, qpos.dtype))
-        return look_along(where, rotate(axes, jnp.asarray(self.forward_b, qpos.dtype)))
+        where = pos + rotate(axes, constant(self.pos_b))
+        return look_along(where, rotate(axes, constant(self.forward_b)))
 
 
 def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 def waypoints_in_body(waypoints_w: jax.Array, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
     """World waypoints (W, 2), lifted to the robot's own height, in the robot's frame (W, 2)."""
-    offset = jnp.concatenate([waypoints_w - pos_w[:2], jnp.zeros((waypoints_w.shape[0], 1))], -1)
+    offset = jnp.concatenate([waypoints_w - pos_w[None, :2], jnp.zeros((waypoints_w.shape[0], 1))], -1)
     return (offset @ rotation)[:, :2]
 
 

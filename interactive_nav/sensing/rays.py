@@ -125,7 +125,7 @@ def _floor_key(height, down, mask: int) -> jax.Array:
 
 
 def _scan(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: int) -> jax.Array:
-    right, up = jnp.asarray(lens.columns), jnp.asarray(lens.rows)[:, None]
+    right, up = jnp.asarray(lens.columns)[None, None], jnp.asarray(lens.rows)[None, :, None]
 
     def direction(axes):
         """Component of the pixels' rays along one axis: axes [N, 3] -> [N, H, W]."""
@@ -164,7 +164,7 @@ def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Arr
     """
     ahead, aside = boxes["axes"][..., 0], boxes["axes"][..., axis]
     # The box's centre in the camera's frame is minus the eye's position in the box's.
-    normal = aside[..., None, :] - ahead[..., None, :] * jnp.asarray(edges)[:, None]
+    normal = aside[..., None, :] - ahead[..., None, :] * jnp.asarray(edges)[None, None, :, None]
     centre = -(boxes["eye"][..., None, :] * normal).sum(-1)
     reach = (boxes["half"][..., None, :] * jnp.abs(normal)).sum(-1)
     slack = 1e-4
@@ -268,11 +268,11 @@ def cast_fan(
     """
     centre, axes = box_poses(tables, scene, qpos)
     inverse = jnp.swapaxes(axes, -1, -2)
-    eye, half = rotate(inverse, origin_w - centre), tables.half_m[scene]
+    eye, half = rotate(inverse, origin_w[None] - centre), tables.half_m[scene]
 
     def body(nearest, box):
         inverse, eye, half = box
-        directions = [(directions_w * inverse[i]).sum(-1) for i in range(3)]
+        directions = [(directions_w * inverse[i][None]).sum(-1) for i in range(3)]
         entry, leave = enter_and_leave(eye, half, directions)
         # From inside a box its far side is met: an object under the scanner does not blind it.
         distance = jnp.where(entry > 0, entry, leave)

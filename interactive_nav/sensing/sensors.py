@@ -52,14 +52,15 @@ class Sensors:
 
     renderer: Renderer | None
 
-    def __init__(self, world: World, config: NavConfig, backend: str):
+    def __init__(self, world: World, settings: NavConfig, backend: str):
         """Builds tables, and the renderer if images are asked for.
 
         Args:
             world: of the environment.
-            config: its settings.
+            settings: the environment's.
             backend: of the physics: warp, jax or native.
         """
+        rules, config = settings.rules, settings.sensors
         self._layout, self._config = world.layout, config
         model = world.models[0]
         self._joints = _own_joints(model, world)
@@ -73,7 +74,7 @@ class Sensors:
         beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
         self._beams_b = np.stack(beams, -1).astype(np.float32)
         sizes = {
-            "waypoints": 2 * config.num_waypoints,
+            "waypoints": 2 * rules.num_waypoints,
             "goal": 3,
             "velocity": 6,
             "localisation": 3,
@@ -162,7 +163,7 @@ class Sensors:
     def _scan(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array, rng: jax.Array) -> jax.Array:
         config = self._config
         origin = nav.robot_pos_w + rotate(rotation, jnp.asarray(config.lidar_pos_m, jnp.float32))
-        beams = rotate(rotation, jnp.asarray(self._beams_b))
+        beams = rotate(rotation[None], jnp.asarray(self._beams_b))
         distance = cast_fan(self.boxes, nav.scene_index, physics.qpos, origin, beams)
         scan = jnp.clip(distance / config.lidar_range_m, LIDAR_NEAR_M / config.lidar_range_m, 1.0)
         key = stream(rng, "lidar", nav.step_count)

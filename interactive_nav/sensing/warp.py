@@ -17,7 +17,7 @@ from mujoco import mjx
 
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import keep_collector_out
-from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
+from interactive_nav.sensing.base import FAR_M, NEAR_M, SKY_COLOUR, CameraPose, Lens, Renderer
 from interactive_nav.sensing.boxes import BoxTables, box_poses
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
@@ -73,14 +73,10 @@ class WarpRenderer(Renderer):
         axes = jnp.take_along_axis(axes, order[..., None, None], 1)
         floor = jnp.zeros((n, 1, 3))
         upright = jnp.broadcast_to(jnp.eye(3), (n, 1, 3, 3))
-        # MuJoCo's cameras look along -z with x to the right.
-        forward, right, up = (camera.axes_w[..., i] for i in range(3))
         fields = {
             "geom_xpos": jnp.concatenate([centre, floor], 1),
             "geom_xmat": jnp.concatenate([axes, upright], 1),
-            "cam_xpos": camera.pos_w[:, None],
-            "cam_xmat": jnp.stack([right, up, -forward], -1)[:, None],
-            "qpos": jnp.zeros((n, self._host.nq)),
+            **_seen_from(camera, self._host),
         }
         size = jnp.concatenate([half, jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.1]), (n, 1, 3))], 1)
         template = mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
@@ -149,7 +145,7 @@ class WarpColour:
             render_seg=False,
             enabled_geom_groups=groups,
             enable_backface_culling=False,
-            background_color=(0.93, 0.95, 0.97, 1.0),
+            background_color=(*SKY_COLOUR, 1.0),
         )
         self.draw = jax.jit(self._draw)
 
@@ -157,13 +153,10 @@ class WarpColour:
         """Geoms' poses [N, ngeom, 3] and [N, ngeom, 3, 3], cameras [N, ...] to [N, H, W, 3] u8."""
         n = geom_xpos.shape[0]
         context, template = self._context.pytree(), mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
-        forward, right, up = (jnp.asarray(camera.axes_w, jnp.float32)[..., i] for i in range(3))
         fields = {
             "geom_xpos": jnp.asarray(geom_xpos, jnp.float32),
             "geom_xmat": jnp.asarray(geom_xmat, jnp.float32),
-            "cam_xpos": jnp.asarray(camera.pos_w, jnp.float32)[:, None],
-            "cam_xmat": jnp.stack([right, up, -forward], -1)[:, None],
-            "qpos": jnp.zeros((n, self._host.nq)),
+            **_seen_from(camera, self._host),
         }
 
         def one(fields):
@@ -172,6 +165,18 @@ class WarpColour:
 
         packed = jax.vmap(one)(fields).reshape(n, self._lens.height, self._lens.width)
         return jnp.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], -1).astype(jnp.uint8)
+
+
+def _seen_from(camera: CameraPose, model: mujoco.MjModel) -> dict[str, jax.Array]:
+    """Fields of MJX's data, leading axis [N]: the model's only camera, and a `qpos` that nobody reads."""
+    pos_w, axes_w = jnp.asarray(camera.pos_w, jnp.float32), jnp.asarray(camera.axes_w, jnp.float32)
+    # MuJoCo's cameras look along -z with x to the right.
+    forward, right, up = (axes_w[..., i] for i in range(3))
+    return {
+        "cam_xpos": pos_w[:, None],
+        "cam_xmat": jnp.stack([right, up, -forward], -1)[:, None],
+        "qpos": jnp.zeros((len(pos_w), model.nq)),
+    }
 
 
 def _box_model(num_boxes: int, lens: Lens) -> mujoco.MjModel:

@@ -23,6 +23,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import parking_spot
 from interactive_nav.scenes.world import build_world
+from interactive_nav.sensing.boxes import body_poses, rotate
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.episode_scores import episode_scores, score_mass_kg
@@ -66,14 +67,14 @@ class InteractiveNav(Env):
             ValueError: settings that do not fit each other or the backend.
             SceneError: a scene with no room.
         """
-        robot = robot.symmetric() if config.symmetric_actions else robot
+        robot = robot.symmetric() if config.rules.symmetric_actions else robot
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
-        self.tables = build_tables(self.world, config)
+        self.tables = build_tables(self.world, config.rules)
         self.physics = make_physics(self.world, config)
         self.sensors = Sensors(self.world, config, self.physics.name)
-        self.success_distance_m = config.success_distance_m or robot.body_width_m
-        self.score_mass_kg = score_mass_kg(self.world, config)
+        self.success_distance_m = config.rules.success_distance_m or robot.body_width_m
+        self.score_mass_kg = score_mass_kg(self.world, config.rules)
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
         self._num_small = len(self.world.small_objects)
         self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
@@ -96,7 +97,7 @@ class InteractiveNav(Env):
     @property
     def dt(self) -> float:
         """Control period, s."""
-        return self.config.control_dt_s
+        return self.config.physics.control_dt_s
 
     def furniture_map(self, scene: int) -> np.ndarray:
         """[rows, columns] bool on a scene's map: where furniture stands at rest, below the robot's height."""
@@ -131,11 +132,11 @@ class InteractiveNav(Env):
             self.tables,
             self._small_radius_m,
             self.robot.footprint_radius_m,
-            self.config.min_goal_distance_m,
-            self.config.max_goal_distance_m,
+            self.config.rules.min_goal_distance_m,
+            self.config.rules.max_goal_distance_m,
             scene,
-            self.config.goal_clear,
-            self.config.random_object_yaw,
+            self.config.rules.goal_clear,
+            self.config.rules.random_object_yaw,
         )
 
     def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
@@ -213,7 +214,7 @@ class InteractiveNav(Env):
         command = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
         before: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         physics, signals = self.physics.step(
-            nav.scene_index, before, command, nav.step_count * self.config.control_dt_s
+            nav.scene_index, before, command, nav.step_count * self.config.physics.control_dt_s
         )
         broken = signals.nonfinite > 0
         nav = self._advance(nav, physics, signals, broken, state.info["rng"])
@@ -222,10 +223,10 @@ class InteractiveNav(Env):
         lost = ~broken & (signals.overflow > 0)
 
         away = jnp.concatenate([nav.goal_xy_w, jnp.zeros(1)]) - nav.robot_pos_w
-        away = away if self.config.success_in_3d else away[:2]
+        away = away if self.config.rules.success_in_3d else away[:2]
         success = ~broken & ~lost & (jnp.linalg.norm(away) < self.success_distance_m)
-        lifted = ~broken & ~lost & ~success & (nav.lifted_steps > 0) & self.config.fail_when_lifted
-        if self.config.interaction_with == "anything":
+        lifted = ~broken & ~lost & ~success & (nav.lifted_steps > 0) & self.config.rules.fail_when_lifted
+        if self.config.rules.interaction_with == "anything":
             interacts = signals.body_force_n > TOUCH_FORCE_N
         else:
             interacts = self._touches(nav.scene_index, signals)
@@ -234,15 +235,15 @@ class InteractiveNav(Env):
             state.info["nav"].geodesic_m,
             nav.geodesic_m,
             interacts.astype(jnp.float32),
-            self.config.k_int,
-            self.config.success_reward,
+            self.config.rules.k_int,
+            self.config.rules.success_reward,
         )
-        timed_out = ~success & ~broken & ~lost & ~lifted & (nav.step_count >= self.config.episode_steps)
+        timed_out = ~success & ~broken & ~lost & ~lifted & (nav.step_count >= self.config.rules.episode_steps)
         done = (success | timed_out | lifted | broken | lost).astype(jnp.float32)
-        values = episode_scores(nav, self.config, self.tables, self.score_mass_kg, success, broken)
+        values = episode_scores(nav, self.config.rules, self.tables, self.score_mass_kg, success, broken)
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
-        truncated = timed_out | lost if self.config.bootstrap_at_time_limit else lost
+        truncated = timed_out | lost if self.config.rules.bootstrap_at_time_limit else lost
         return state.replace(
             pipeline_state=physics,
             reward=reward,
@@ -277,24 +278,8 @@ class InteractiveNav(Env):
 
     def _object_positions(self, scene: jax.Array, physics: PhysicsState) -> jax.Array:
         """(M, 3) centres of mass in the world frame."""
-        layout, tables = self.world.layout, self.tables
-        com = tables.com_m[scene]
-        out = jnp.zeros((layout.num_slots, 3))
-        hinged = np.asarray([kind == "hinge" for kind in layout.slot_kind], bool)
-        free = np.flatnonzero(~hinged)
-        if len(free):
-            pose = physics.qpos[layout.slot_qpos[free][:, None] + np.arange(7)]
-            rotated = jnp.einsum("mij,mj->mi", matrix_from_quat(pose[:, 3:]), com[free])
-            out = out.at[free].set(pose[:, :3] + rotated)
-        swing = np.flatnonzero(hinged)
-        if len(swing):
-            angle = physics.qpos[layout.slot_qpos[swing]]
-            axis, anchor = tables.hinge_axis[scene, swing], tables.hinge_anchor_m[scene, swing]
-            quat = jnp.concatenate([jnp.cos(angle / 2)[:, None], jnp.sin(angle / 2)[:, None] * axis], -1)
-            arm = jnp.einsum("mij,mj->mi", matrix_from_quat(quat), com[swing] - anchor) + anchor
-            rest = matrix_from_quat(tables.hinge_quat_w[scene, swing])
-            out = out.at[swing].set(tables.hinge_pos_w[scene, swing] + jnp.einsum("mij,mj->mi", rest, arm))
-        return out
+        pos_w, axes_w = body_poses(self.sensors.boxes, scene, physics.qpos)
+        return pos_w[:-1] + rotate(axes_w[:-1], self.tables.com_m[scene])
 
     def _touches(self, scene: jax.Array, signals: StepSignals) -> jax.Array:
         occupied = self.tables.mass_kg[scene, 1:] > 0
@@ -303,14 +288,14 @@ class InteractiveNav(Env):
     def _geodesic(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array) -> jax.Array:
         """[] m: the distance that the potential is made of."""
         xy = pos_w[:2]
-        if self.config.potential == "quantised":
+        if self.config.rules.potential == "quantised":
             xy = cell_centre(self.tables, scene, xy)
         return geodesic_at(self.tables, scene, goal, xy)
 
     def _waypoints(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
-        config = self.config
-        points_at = grid_waypoints_at if config.waypoint_style == "grid" else waypoints_at
-        world = points_at(self.tables, scene, goal, pos_w[:2], config.num_waypoints, config.waypoint_spacing_m)
+        rules = self.config.rules
+        points_at = grid_waypoints_at if rules.waypoint_style == "grid" else waypoints_at
+        world = points_at(self.tables, scene, goal, pos_w[:2], rules.num_waypoints, rules.waypoint_spacing_m)
         return waypoints_in_body(world, pos_w, rotation)
 
     def _advance(
@@ -326,7 +311,7 @@ class InteractiveNav(Env):
         pushed = jnp.where(self.tables.mass_kg[scene, 1:] > 0, _moved(objects - nav.object_pos_w), 0.0)
         touched = nav.touched | (~broken & (signals.slot_force_n > TOUCH_FORCE_N))
         settled = nav.step_count >= SETTLE_STEPS
-        counts = touched if self.config.kinematic_sum == "touched" else touched | settled
+        counts = touched if self.config.rules.kinematic_sum == "touched" else touched | settled
         pushed = jnp.where(counts, pushed, 0.0)
         ok = (~broken).astype(jnp.int32)
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M

@@ -17,14 +17,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
+from brax.envs.base import Env, State, Wrapper
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 AXIS = "i"
 """Name of the mesh's axis; Brax's own."""
 
 
-class ShardedEnv(Env):
+class ShardedEnv(Wrapper):
     """Steps equal shares of a batch on each device."""
 
     def __init__(self, env: Env, devices: Sequence[Any] | None = None):
@@ -34,7 +34,7 @@ class ShardedEnv(Env):
             env: natively batched, such as `AutoResetEnv`; its `reset` takes keys and the environments' numbers.
             devices: default: all devices of all processes.
         """
-        self.env = env
+        super().__init__(env)
         self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
         self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
         spec = PartitionSpec(AXIS)
@@ -45,26 +45,6 @@ class ShardedEnv(Env):
     def num_devices(self) -> int:
         """Devices that share the batch."""
         return self.mesh.size
-
-    @property
-    def observation_size(self):
-        """As the wrapped environment's."""
-        return self.env.observation_size
-
-    @property
-    def action_size(self) -> int:
-        """Number of actions."""
-        return self.env.action_size
-
-    @property
-    def backend(self) -> str:
-        """Physics backend in use."""
-        return self.env.backend
-
-    @property
-    def unwrapped(self) -> Env:
-        """The single environment."""
-        return self.env.unwrapped
 
     def reset(self, rng: jax.Array) -> State:
         """[N, 2] keys to N states.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+from brax.envs.base import State, Wrapper
 
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
 
@@ -18,10 +18,49 @@ DRAW_SHARE = 16
 
 def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
     """[...] scenes that environments with these numbers in their batch keep; None where each episode draws one."""
-    return slot % len(env.scenes) if env.config.scene_choice == "slot" else None
+    return slot % len(env.scenes) if env.config.rules.scene_choice == "slot" else None
 
 
-class AutoResetEnv(Env):
+def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
+    """[N, 2] keys to N new episodes, each in the scene that its environment keeps, if it keeps one.
+
+    Args:
+        env: of one episode.
+        keys: consumed.
+        slot: [N] i32 numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
+    """
+    scene = scene_of_slot(env, jnp.arange(keys.shape[0]) if slot is None else slot)
+    return jax.vmap(env.reset)(keys) if scene is None else jax.vmap(env.reset)(keys, scene)
+
+
+def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
+    """New episodes where `over`, drawn for a part of the batch at a time: few end in one step.
+
+    Args:
+        env: of one episode.
+        current: physics, `nav` and `rng` of N environments; where an episode is over, its `rng` is consumed.
+        over: [N] bool.
+
+    Returns:
+        As `current`; an environment that keeps its scene stays in it.
+    """
+    n = over.shape[0]
+    share = max(1, n // DRAW_SHARE)
+
+    def some(carry):
+        current, pending = carry
+        index = jnp.nonzero(pending, size=share, fill_value=n)[0]
+        nav, rng = (jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], x) for x in current[-2:])
+        kept = (nav.scene_index,) if env.config.rules.scene_choice == "slot" else ()
+        fresh = jax.vmap(env.draw)(rng, *kept)
+        new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
+        current = jax.tree.map(lambda old, x: old.at[index].set(x, mode="drop"), current, new)
+        return current, pending.at[index].set(False, mode="drop")
+
+    return jax.lax.while_loop(lambda carry: carry[1].any(), some, (current, over))[0]
+
+
+class AutoResetEnv(Wrapper):
     """N environments as one natively batched Brax environment (`wrap_env=False` for Brax's learners).
 
     `reward`, `done`, `info["truncation"]`, `info["time_out"]` and `metrics` belong to the step just made;
@@ -30,28 +69,7 @@ class AutoResetEnv(Env):
     [N], the scores of the last finished episode, with `length` and `sum_reward`.
     """
 
-    def __init__(self, env: InteractiveNav):
-        self.env = env
-
-    @property
-    def observation_size(self) -> int | dict[str, tuple[int, ...]]:  # type: ignore[override]
-        """Length of the observation; with images, the shape under each key."""
-        return self.env.observation_size
-
-    @property
-    def action_size(self) -> int:
-        """Number of actions."""
-        return self.env.action_size
-
-    @property
-    def backend(self) -> str:
-        """Physics backend in use."""
-        return self.env.backend
-
-    @property
-    def unwrapped(self) -> InteractiveNav:  # type: ignore[override]
-        """The single environment."""
-        return self.env
+    env: InteractiveNav
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
         """[N, 2] keys to N states.
@@ -60,9 +78,7 @@ class AutoResetEnv(Env):
             rng: the keys.
             slot: [N] i32 numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
         """
-        slot = jnp.arange(rng.shape[0]) if slot is None else slot
-        scene = scene_of_slot(self.env, slot)
-        state = jax.vmap(self.env.reset)(rng) if scene is None else jax.vmap(self.env.reset)(rng, scene)
+        state = reset_all(self.env, rng, slot)
         zero = jnp.zeros(rng.shape[0])
         info = {
             **state.info,
@@ -85,7 +101,7 @@ class AutoResetEnv(Env):
         episode_metrics = {name: jnp.where(done, finished[name], last[name]) for name in last}
 
         moving = (stepped.pipeline_state, stepped.info["nav"], stepped.info["rng"])
-        physics, nav, rng = self._with_new_episodes(moving, done)
+        physics, nav, rng = draw_where(self.env, moving, done)
         info = {
             **stepped.info,
             "nav": nav,
@@ -97,22 +113,3 @@ class AutoResetEnv(Env):
         }
         # Observed once, after new episodes have begun: images cost as much as physics.
         return jax.vmap(self.env.observe)(stepped.replace(pipeline_state=physics, info=info))
-
-    def _with_new_episodes(self, current, done: jax.Array):
-        """Draws new episodes where `done`, a part of the batch at a time: few end in one step."""
-        n = done.shape[0]
-        share = max(1, n // DRAW_SHARE)
-
-        def some(carry):
-            current, pending = carry
-            index = jnp.nonzero(pending, size=share, fill_value=n)[0]
-            nav, rng = (jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], x) for x in current[-2:])
-            if self.env.config.scene_choice == "slot":
-                fresh = jax.vmap(self.env.draw)(rng, nav.scene_index)
-            else:
-                fresh = jax.vmap(self.env.draw)(rng)
-            new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
-            current = jax.tree.map(lambda old, x: old.at[index].set(x, mode="drop"), current, new)
-            return current, pending.at[index].set(False, mode="drop")
-
-        return jax.lax.while_loop(lambda carry: carry[1].any(), some, (current, done))[0]

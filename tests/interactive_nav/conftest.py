@@ -14,7 +14,7 @@ N = 6
 
 @pytest.fixture(scope="package")
 def world(room, two_rooms):
-    return build_world(get_robot("turtlebot"), (load_scene(room), load_scene(two_rooms)), NavConfig(num_objects=4))
+    return build_world(get_robot("turtlebot"), (load_scene(room), load_scene(two_rooms)), NavConfig.of(num_objects=4))
 
 
 @pytest.fixture(scope="package")

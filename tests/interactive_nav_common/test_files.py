@@ -11,7 +11,15 @@ from pathlib import Path
 import pytest
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import part_folder, publish, remove_stale, whole_file, whole_folder, write_text
+from interactive_nav_common.files import (
+    part_folder,
+    publish,
+    remove_partial,
+    remove_stale,
+    whole_file,
+    whole_folder,
+    write_text,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -162,3 +170,18 @@ def test_what_a_killed_writer_left_goes_and_what_runs_stays(tmp_path):
     (tmp_path / ".made.old-7").mkdir()
     remove_stale(target)  # killed between two renames: the older one is put back
     assert [p.name for p in tmp_path.iterdir()] == ["made"]
+
+
+def test_files_of_killed_writers_go_and_those_of_running_ones_stay(tmp_path):
+    path = tmp_path / "rows.txt"
+    with whole_file(path) as running:
+        running.write_text("half")
+        left = tmp_path / ".partial-01234567-rows.txt"
+        for half in (running, left):
+            half.touch()
+            os.utime(half, (0, 0))
+        remove_partial(tmp_path)
+        assert running.read_text() == "half" and not left.exists()
+    remove_partial(tmp_path)
+    assert path.read_text() == "half" and list(tmp_path.iterdir()) == [path]
+    remove_partial(tmp_path / "nowhere")

@@ -7,6 +7,7 @@ import pytest
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.locks import alone_in, release, take_lock
 from topological_nav.__main__ import main
+from topological_nav.drives.dataset import draw_drives
 from topological_nav.learn.runs import claimed
 
 
@@ -17,6 +18,20 @@ def test_a_folder_in_use_is_refused_and_named(tmp_path):
         pass
     with claimed(out, {"seed": 1}):  # free again
         pass
+
+
+def test_drives_that_another_process_draws(painted, tmp_path):
+    held = take_lock(tmp_path / ".lock")
+    with pytest.raises(FileError, match=f"process {os.getpid()} on .* works there"):
+        draw_drives([painted], tmp_path)
+    release(held)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(FileError, match="no folder can be made there .*; choose another one"), alone_in(out):
+            pass
 
 
 def test_a_dataset_that_another_process_makes(painted, tmp_path, capsys):

@@ -29,7 +29,6 @@ def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
     # A node's own images lead back to it, or to one that saw the same.
     found, gap = nearest_node(read.embeddings[:, 5], read.embeddings)
     assert (found == np.arange(len(read.xy_w))).mean() > 0.8 and gap.max() < 1e-3
-    assert (read.localise(read.embeddings[:, 5]) == found).all()
     assert set(read.about) >= {"localiser", "detector", "settings", "data"}
 
 

@@ -20,7 +20,7 @@ BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
 
 def test_round_trip_of_every_kind_of_value():
     config = TrainConfig(
-        env=EnvConfig(scenes=("a", "b c"), k_int=1.0, success_distance_m=0.4),
+        env=EnvConfig.of(scenes=("a", "b c"), k_int=1.0, success_distance_m=0.4),
         ppo=PPOConfig(learning_rate=1e-7, num_envs=8, policy_hidden_layer_sizes=(3,)),
         run=RunConfig(name="x", tensorboard=False, num_timesteps=10**12),
     )
@@ -77,13 +77,13 @@ def test_two_words_that_only_fit_together():
         ("ppo.learning_rate=fast", "ppo.learning_rate: got 'fast' (str), expected a number"),
         ("ppo.learning_rate=nan", "ppo.learning_rate: got 'nan' (str), expected a number"),
         ("ppo.learning_rate=0", "ppo.learning_rate is 0.0, expected a positive number"),
-        ("ppo.discounting=1.5", "ppo.discounting is 1.5, expected between 0.0 and 1.0"),
+        ("ppo.discounting=1.5", "ppo.discounting is 1.5, expected between 0 and 1"),
         ("ppo.policy_hidden_layer_sizes=[64, x]", "ppo.policy_hidden_layer_sizes: got 'x' (str)"),
         ("run.tensorboard=1", "run.tensorboard: got 1 (int), expected true or false"),
         ("run.name=a/b", "run.name is 'a/b', expected one folder name"),
         ("env.k_int=-1", "env.k_int is -1.0, expected 0 or more"),
         ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
-        ("algorithm=pop", "got 'pop' (str), expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
+        ("algorithm=pop", "algorithm is 'pop', expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
         ("ppo=3", "ppo: got 3 (int), expected a mapping"),
         ("ppo.num_envs", "expected key=value"),
         (
@@ -155,3 +155,10 @@ def test_the_preset_of_the_original_code_holds_all_its_values():
     config = config_io.load("turtlebot_ppo_code")
     assert {key: getattr(config.env, key) for key in ORIGINAL_CODE} == ORIGINAL_CODE
     assert config.ppo.discounting == 0.98
+
+
+def test_a_set_of_scenes_stands_for_its_folders():
+    assert config_io.load("turtlebot_ppo", ["env.scenes=sparse/test"]).env.scenes == (
+        "scenes_mjcf/rowan",
+        "scenes_mjcf/willow",
+    )

@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.task.env import EPISODE_METRICS
+from interactive_nav_common.config import replace
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.rows import write_parquet
 from tests.train.toy_run import build_toy, toy_config
@@ -97,7 +98,7 @@ def second(run, tmp_path_factory):
     """Another run of the same kind: other numbers, another k_int and seed."""
     config = toy_config(tmp_path_factory.mktemp("runs"), updates=2, seed=5)
     run_config = dataclasses.replace(config.run, name="other")
-    config = dataclasses.replace(config, env=dataclasses.replace(config.env, k_int=1.0), run=run_config)
+    config = dataclasses.replace(config, env=replace(config.env, k_int=1.0), run=run_config)
     _, folder, _ = train_run(config, Console(file=io.StringIO()), build_env=build_toy)
     return folder
 

@@ -101,6 +101,13 @@ def test_trajectories_side_by_side_are_of_the_same_episodes(results, monkeypatch
     assert [path.stem[-8:] for path in chosen.values()] == ["0123abcd"] * 2 and sorted(chosen) == [0.0, 1.0]
 
 
+def test_what_is_unfinished_is_passed_over(results):
+    half = results / "rows" / "_paths" / ".partial-01234567-x.npz"
+    half.touch()
+    assert half not in cli.Results(results).records
+    half.unlink()
+
+
 def test_ins_over_alpha_shows_means_and_intervals_of_seeds():
     """SAC on TurtleBot at k_int = 0.1: P_eff 0.83, E_eff 0.699, seeds 0.01 apart: half width 4.3027 x 0.01 / sqrt 3."""
     figure = scores.ins_over_alpha(paper_like(), "turtlebot", "test")
@@ -221,15 +228,14 @@ def test_unseen_scenes_are_shown_where_there_are_any():
 
 
 def test_looks_keep_apart():
-    among = ["ppo", "td3", "a2c"]
-    assert len({style.look(style.ALGORITHMS, name, among) for name in among}) == 3
-    assert [style.fill_of(k, [0.0, 0.1, 1.0]) for k in (0.0, 0.1, 1.0)] == ["none", "left", "full"]
-    assert len({str(style.line_of(k, [0.0, 0.1, 1.0])) for k in (0.0, 0.1, 1.0)}) == 3
+    names, k_ints = ("ppo", "td3", "a2c"), (0.0, 0.1, 1.0)
+    looks = style.Looks({("fetch", name, k_int): [1] for name in names for k_int in k_ints})
+    assert len({tuple(looks.algorithm(name).values()) for name in names}) == 3 and looks.seeds == "1 seed"
+    assert [looks.fill(k_int) for k_int in k_ints] == ["none", "left", "full"]
+    assert [looks.line(k_int) for k_int in k_ints] == [":", "--", "-"]
+    alone = style.Looks({("fetch", "ppo", 0.5): []})
+    assert (alone.fill(0.5), alone.line(0.5)) == ("full", "-")
     assert style.in_order({"zeta", "ddpg", "ppo", "sac"}) == ["ppo", "sac", "ddpg", "zeta"]
-
-
-def test_markdown_tables_by_hand():
-    assert tables.markdown(("a", "b"), [(1, "x")]) == "| a | b |\n| --- | --- |\n| 1 | x |\n"
 
 
 def episodes_of(policy: str, success: list[float], **more: object) -> pa.Table:

@@ -31,7 +31,7 @@ def train_again(root, name):
     """Two updates in a room, 16 environments for 32 steps with a limit of 12: its config, result and folder."""
     toy = toy_config(root / "runs", updates=2)
     room = root / "room" if (root / "room").is_dir() else write_room(root / "room")
-    env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=12, num_objects=2)
+    env = EnvConfig.of(scenes=(str(room),), backend="native", episode_steps=12, num_objects=2)
     config = TrainConfig(env=env, ppo=toy.ppo, run=dataclasses.replace(toy.run, name=name))
     return config, *train_run(config, Console(file=io.StringIO()))[:2]
 
@@ -83,7 +83,7 @@ def test_train_resume_and_evaluate(trained, tmp_path, capsys):
 
     # An episode played once more starts as the row that was scored.
     assert replay_program.main([str(folder.path), "--episodes", "3", "env.episode_steps=30"]) == 0
-    again = replay.load(replay_program.replay_path(folder.path, "learned", 3))
+    again = replay.load(replay.replay_path(folder.path, "learned", 3))
     assert again.label == f"toy, {best_steps(folder)} steps"
     assert again.metrics["shortest_path_m"] == pytest.approx(rows["shortest_path_m"][3])
     assert again.metrics["robot_path_m"] == pytest.approx(rows["robot_path_m"][3], rel=0.05)
@@ -102,7 +102,7 @@ def test_train_resume_and_evaluate(trained, tmp_path, capsys):
 def test_a_policy_that_sees_trains_and_is_scored(tmp_path, capsys):
     room = write_room(tmp_path / "room")
     toy = toy_config(tmp_path / "runs", updates=1)
-    env = EnvConfig(
+    env = EnvConfig.of(
         scenes=(str(room),),
         backend="native",
         episode_steps=6,

@@ -22,7 +22,7 @@ from train.runs.run_folder import RunFolder
 def run(tmp_path_factory, room):
     """A run that has not trained yet: yardsticks need no checkpoint."""
     config = toy_config(tmp_path_factory.mktemp("runs"))
-    env = EnvConfig(scenes=(str(room),), backend="native", episode_steps=15, num_objects=1)
+    env = EnvConfig.of(scenes=(str(room),), backend="native", episode_steps=15, num_objects=1)
     folder = RunFolder(tmp_path_factory.mktemp("run"))
     folder.open(resolve(dataclasses.replace(config, env=env), "native"))
     return folder.path
@@ -39,7 +39,7 @@ def test_one_command_makes_a_video_of_a_run(run, tmp_path, capsys):
     assert record.main([*asked, *pictures]) == 0
     size = out.stat().st_size
     assert size > 1000
-    kept = replay.load(program.replay_path(run, "random", 2))
+    kept = replay.load(replay.replay_path(run, "random", 2))
     assert (kept.policy, kept.episode, kept.num_steps) == ("random", 2, 15)
     printed = "".join(capsys.readouterr().out.split())  # the console breaks lines where it is narrow
     assert f"{out}:4framesofrandom,episode2" in printed
@@ -89,13 +89,13 @@ def test_a_run_of_a_gpu_is_played_without_one(run, tmp_path, monkeypatch, capsys
     else:
         assert ended == 0
         assert f"{copy.path}: trained with backend warp, which is not here; played with native" in said.out
-        assert replay.load(program.replay_path(copy.path, "random", 0)).num_steps == 15
+        assert replay.load(replay.replay_path(copy.path, "random", 0)).num_steps == 15
 
 
 def test_an_episode_starts_as_its_number_says_whoever_plays_it(run):
     assert program.main([str(run), "--episodes", "1,3", "--policies", "random,follower"]) == 0
     first, other, third = (
-        replay.load(program.replay_path(run, *which)) for which in (("random", 1), ("follower", 1), ("random", 3))
+        replay.load(replay.replay_path(run, *which)) for which in (("random", 1), ("follower", 1), ("random", 3))
     )
     np.testing.assert_array_equal(first.body_pos_w[0], other.body_pos_w[0])
     np.testing.assert_array_equal(first.goal_xy_w, other.goal_xy_w)

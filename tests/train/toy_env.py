@@ -6,7 +6,7 @@ so effort_efficiency is 1 and INS_0.5 = 0.5 P_eff + 0.5.
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs import Env, State
 
+from interactive_nav.config import NavConfig
 from interactive_nav.robots import get_robot
 from interactive_nav.task.env import EPISODE_METRICS
 from interactive_nav.task.wrappers import AutoResetEnv
@@ -24,18 +25,8 @@ from scenes_mjcf.schema import SceneMaps
 WHEEL_RADIUS_M, TRACK_M, DT_S = 0.0352, 0.23, 0.1
 SUCCESS_M = 0.333
 
-
-@dataclasses.dataclass(frozen=True)
-class ToyConfig:
-    """The settings that rows of results name."""
-
-    k_int: float = 0.1
-    episode_steps: int = 60
-    num_objects: int = 1
-    observations: tuple[str, ...] = ("goal", "velocity", "waypoints")
-    num_waypoints: int = 10
-    waypoint_spacing_m: float = 0.2
-    scene_choice: str = "episode"
+ToyConfig = functools.partial(NavConfig.of, episode_steps=60, num_objects=1)
+"""Settings of the toy: those that rows of results name."""
 
 
 @flax.struct.dataclass
@@ -57,7 +48,7 @@ class ToyNav:
 class ToyEnv(Env):
     """One environment: reset(key), step(state, action); no auto-reset."""
 
-    def __init__(self, config: ToyConfig | None = None, nan_at_step: int | None = None, **_: Any):
+    def __init__(self, config: NavConfig | None = None, nan_at_step: int | None = None, **_: Any):
         self.config = config or ToyConfig()
         self.robot = get_robot("turtlebot")
         maps = SceneMaps(np.ones((80, 80), bool), 0.1, (-4.0, -4.0), 0.0)
@@ -84,7 +75,7 @@ class ToyEnv(Env):
         goal_b = jnp.stack([cos * offset[0] + sin * offset[1], -sin * offset[0] + cos * offset[1]])
         distance = jnp.linalg.norm(goal_b)
         along = jnp.minimum(0.2 * jnp.arange(1, 11), distance)
-        waypoints_b = along[:, None] * goal_b / jnp.maximum(distance, 1e-6)
+        waypoints_b = along[:, None] * goal_b[None] / jnp.maximum(distance, 1e-6)
         zero = jnp.zeros(1)
         velocity = jnp.concatenate([nav.velocity[:1], zero, zero, zero, zero, nav.velocity[1:]])
         return jnp.concatenate([waypoints_b.ravel(), goal_b, zero, velocity])
@@ -147,7 +138,7 @@ class ToyEnv(Env):
         after = jnp.linalg.norm(nav.goal_xy_w - pos[:2])
         success = (after < SUCCESS_M).astype(jnp.float32)
         steps = nav.step_count + 1
-        truncation = (steps >= self.config.episode_steps).astype(jnp.float32) * (1.0 - success)
+        truncation = (steps >= self.config.rules.episode_steps).astype(jnp.float32) * (1.0 - success)
         done = jnp.maximum(success, truncation)
         reward = before - after + 10.0 * success
         if self.nan_at_step is not None:

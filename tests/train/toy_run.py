@@ -19,7 +19,7 @@ UPDATE_STEPS = 16 * 2 * 8
 def toy_config(out_dir: Any, updates: int = 4, **run: Any) -> TrainConfig:
     """Updates of 256 steps each, logged one by one, a checkpoint every two."""
     return TrainConfig(
-        env=EnvConfig(scenes=("toy",), backend="native", episode_steps=60),
+        env=EnvConfig.of(scenes=("toy",), backend="native", episode_steps=60),
         ppo=PPOConfig(
             num_envs=16,
             unroll_length=8,
@@ -42,7 +42,7 @@ def toy_config(out_dir: Any, updates: int = 4, **run: Any) -> TrainConfig:
 
 def build_toy(config: EnvConfig) -> Any:
     """The toy for a config."""
-    return ToyEnv(ToyConfig(episode_steps=config.episode_steps, k_int=config.k_int))
+    return ToyEnv(ToyConfig(episode_steps=config.rules.episode_steps, k_int=config.rules.k_int))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from interactive_nav_common.config import to_dict
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import RoomImages, load_rooms, read_header
 from topological_nav.data.domains import as_seen, preset
-from topological_nav.errors import RunError
+from topological_nav.errors import Asked, RunError, go_on
 from topological_nav.learn.learning import compiled_epoch, initial
 from topological_nav.learn.networks import Network, joined, normalised
 from topological_nav.learn.runs import claimed, run_epochs, write_results
@@ -34,7 +34,6 @@ from topological_nav.learn.training import Trained, load_trained, localisation, 
 ROOMS_STREAM, PASSAGES_STREAM = 1, 2
 """Of chance in target images."""
 Tell = Callable[[str], None]
-Asked = Callable[[], bool]
 
 
 class Critic(nn.Module):
@@ -154,8 +153,8 @@ def adapt_features(
     out: Path,
     config: AdaptConfig,
     tell: Tell = lambda _: None,
-    should_stop: Asked = lambda: False,
-) -> dict[str, Any] | None:
+    should_stop: Asked = go_on,
+) -> dict[str, Any]:
     """Adapts a run's embedding to another domain, or goes on with it.
 
     Args:
@@ -168,11 +167,11 @@ def adapt_features(
         should_stop: asked after every epoch.
 
     Returns:
-        The content of results.json: localisation before, with the target's statistics alone, and after; None where it
-        was stopped before the end.
+        The content of results.json: localisation before, with the target's statistics alone, and after.
 
     Raises:
         DatasetError, RunError: something cannot be used.
+        Stopped: it was asked for before the end.
     """
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)
@@ -188,8 +187,6 @@ def adapt_features(
             out, "features", state, lambda learner, _, key: epoch(learner, *on_device, key), config.epochs,
             epoch_keys(config), tell, should_stop, "checkpoint-features.msgpack",
         )  # fmt: skip
-        if state is None:
-            return None
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         adapted = save_trained(out, Trained(trained.network, variables, adapted_about(trained, config)))
         fitted = target_statistics(trained, unlabelled, config.batch)

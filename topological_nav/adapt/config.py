@@ -6,8 +6,7 @@ import dataclasses
 from typing import Annotated
 
 from interactive_nav_common.config import Count, Seed, Settings, Share
-from interactive_nav_common.errors import ConfigError
-from topological_nav.data.domains import PRESETS
+from topological_nav.data.domains import preset
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,5 +44,4 @@ class AdaptConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.domain not in PRESETS:
-            raise ConfigError(f"domain is '{self.domain}', expected one of {', '.join(PRESETS)}")
+        preset(self.domain)  # refused where there is none

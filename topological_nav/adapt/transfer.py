@@ -20,11 +20,10 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import to_dict
 from topological_nav.adapt.adaptation import (
     PASSAGES_STREAM,
-    Asked,
     Tell,
     adapted_about,
     digest_of,
@@ -33,16 +32,16 @@ from topological_nav.adapt.adaptation import (
 )
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES, DataConfig
-from topological_nav.data.dataset import headings, load_passages, read_header
+from topological_nav.data.dataset import load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
-from topological_nav.errors import DatasetError, MapError
+from topological_nav.errors import Asked, DatasetError, MapError, go_on
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
-from topological_nav.learn.localise import localisation_scores
+from topological_nav.learn.localise import in_words, localisation_scores, nearest_turn
 from topological_nav.learn.pairs import need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, length_scores, load_trained, save_trained
-from topological_nav.maps.build import Built
+from topological_nav.maps.build import Built, edge_scores
 from topological_nav.maps.graph import assemble, lengths, near_pairs
 from topological_nav.scenes.space import free_space
 
@@ -64,8 +63,8 @@ def passage_configurations(
     out: Path,
     config: AdaptConfig,
     tell: Tell = lambda _: None,
-    should_stop: Asked = lambda: False,
-) -> dict[str, Any] | None:
+    should_stop: Asked = go_on,
+) -> dict[str, Any]:
     """Scores a passage detector in another domain, learned from the source or not, fine-tuned or not.
 
     Args:
@@ -77,10 +76,11 @@ def passage_configurations(
         should_stop: asked after every epoch.
 
     Returns:
-        The content of results.json; None where it was stopped before the end.
+        The content of results.json.
 
     Raises:
         DatasetError, RunError: something cannot be used.
+        Stopped: it was asked for before the end.
     """
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
@@ -102,8 +102,6 @@ def passage_configurations(
                     out, name, learner, lambda state, _, key: epoch(state, images, labels, key),
                     config.fine_tune_epochs, epoch_keys(config), tell, should_stop, f"checkpoint-{name}.msgpack",
                 )  # fmt: skip
-                if learner is None:
-                    return None
             variables = {"params": learner.params, "batch_stats": learner.batch_stats}
             tuned = Trained(network, variables, trained.about)
             results[name] = _scores(tuned, tested)
@@ -134,22 +132,17 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     need_task(detector.about, "passages", "the detector")
     scene = load_scene(scene_folder)
     header, data = read_header(target)
-    index = next((i for i, s in enumerate(header["scenes"]) if s["digest"] == scene.digest), None)
-    if index is None:
-        names = ", ".join(s["name"] for s in header["scenes"])
-        raise DatasetError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
     rooms = target_rooms(target, config)
-    mine = rooms.scene == index
+    mine = rooms.scene == _index_of(scene, header, target)
     nodes, held = mine & ~rooms.test, mine & rooms.test
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
     room = label - rooms.label[mine].min()
-    around = headings(data)
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
         if not len(edges):
             return np.zeros(0)
-        turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
+        turn = nearest_turn(angle, data.headings)
         return detector.passage(shown[edges[:, 0], turn], lengths(xy, edges))
 
     if not len(near_pairs(xy, config.edge_m)):
@@ -170,26 +163,21 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     free = space.segment_free(
         xy[made.edges[:, 0]], xy[made.edges[:, 1]], judged.passage_points, judged.passage_margin_m
     )
-    return Built(made, space, free, _map_scores(localiser, made, free, level[held][:, ::3], rooms, held, label, config))
+    scores = edge_scores(made, free, config.passable)
+    if held.any():
+        asked = localiser.embed(level[held][:, ::3])
+        found = localisation_scores(asked, rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label)
+        scores["held-out images localised"] = in_words(found)
+    return Built(made, space, free, scores)
 
 
-def _map_scores(localiser, made, free, asked, rooms, held, label, config: AdaptConfig) -> dict[str, Any]:
-    open_ = made.p >= config.passable
-    parts = made.open_parts(config.passable)
-    scores: dict[str, Any] = {
-        "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
-        "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
-        "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
-    }
-    if len(asked):
-        found = localisation_scores(
-            localiser.embed(asked), rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label
-        )
-        scores["held-out images localised"] = (
-            f"nearest node {found['node']:.3f}, right room {found['room']:.3f}, "
-            f"median error {found['error_m']:.2f} m (least possible {found['least_error_m']:.2f} m)"
-        )
-    return scores
+def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
+    """Which scene of a dataset it is."""
+    digests = [there["digest"] for there in header["scenes"]]
+    if scene.digest not in digests:
+        names = ", ".join(there["name"] for there in header["scenes"])
+        raise DatasetError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
+    return digests.index(scene.digest)
 
 
 def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[_Labelled, _Labelled]:

@@ -3,41 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.signals import stop_signals
 from topological_nav.adapt.config import AdaptConfig
-from topological_nav.commands.progress import Stopped, say
-from topological_nav.config import PITCHES
+from topological_nav.commands.progress import asked_by, say, tell_line
+from topological_nav.config import DATASET, PITCHES, RUNS
+from topological_nav.errors import Asked
 
-Asked = Callable[[], bool]
-
-
-def add_to(command: Callable[[str, str, object], argparse.ArgumentParser], dataset: Path, runs: Path) -> None:
-    """Adds the command to a command line.
-
-    Args:
-        command: makes the parser of a command from its name, what it does, and its settings.
-        dataset: where a dataset lies by default.
-        runs: where runs lie.
-    """
-    adapt = command("adapt", "Takes networks and maps to another domain.", AdaptConfig())
-    adapt.add_argument(
-        "what",
-        choices=list(_RUNS),
-        help="features: the embedding, adversarially; passages: the detector in configurations A to D; map: of images "
-        "collected in the target domain",
-    )
-    adapt.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
-    adapt.add_argument("--data", type=Path, metavar="DIR", help=f"source (default {dataset})")
-    adapt.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
-    adapt.add_argument("--localiser", type=Path, metavar="RUN", help=f"embeds images (default {runs}, or packaged)")
-    adapt.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
-    adapt.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {runs}/adapted/WHAT, a map SCENE.npz")
-    adapt.set_defaults(adapted=runs / "adapted", dataset=dataset)
+ADAPTED = RUNS / "adapted"
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -45,13 +21,13 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises:
         Stopped: a signal asked for it.
-        TopologicalError, SceneError: something cannot be used.
+        UserError: something cannot be used.
     """
     config = overridden(AdaptConfig(), arguments.settings)
     if (arguments.what == "map") != bool(arguments.scene):
         raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
     _refuse_unused(arguments)
-    arguments.data = arguments.data or arguments.dataset
+    arguments.data = arguments.data or DATASET
     arguments.target = arguments.target or arguments.data
     from topological_nav.weights.packaged import choose
 
@@ -61,8 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
     if chosen.said:
         say(chosen.said)
     with stop_signals() as stops:
-        if not _RUNS[arguments.what](arguments, config, lambda: bool(stops)):
-            raise Stopped(stops[0])
+        WHAT[arguments.what](arguments, config, asked_by(stops))
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:
@@ -82,32 +57,26 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
         refuse_unused(arguments, "--data", f"{why} with --target")
 
 
-def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
+def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     from interactive_nav_common.metrics_file import read_metrics
     from topological_nav.adapt.adaptation import adapt_features, target_rooms
     from topological_nav.data.dataset import load_rooms
     from topological_nav.figures.maps import save
     from topological_nav.figures.transfer_figures import features_figure
+    from topological_nav.learn.localise import in_words
 
-    out = arguments.out or arguments.adapted / "features"
-    results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, _tell, should_stop)
-    if results is None:
-        return False
+    out = arguments.out or ADAPTED / "features"
+    results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, tell_line, should_stop)
     rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
     level = PITCHES.index("level")
     figure = features_figure(rendered[:, level, 0], seen[:, level, 0], read_metrics(out / "metrics.jsonl"), results)
     save(figure, out / "adaptation.png")
     for name in ("source", "before", "statistics", "after"):
-        mean = results[name]["mean"]
-        print(
-            f"{name:<11}nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
-            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
-        )
+        print(f"{name:<11}{in_words(results[name]['mean'])}")
     print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
-    return True
 
 
-def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
+def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     from interactive_nav_common.metrics_file import read_metrics
     from topological_nav.adapt.transfer import CONFIGURATIONS, passage_configurations
     from topological_nav.data.dataset import load_passages
@@ -115,10 +84,8 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
     from topological_nav.figures.maps import save
     from topological_nav.figures.transfer_figures import passages_figure
 
-    out = arguments.out or arguments.adapted / "passages"
-    results = passage_configurations(arguments.detector, arguments.target, out, config, _tell, should_stop)
-    if results is None:
-        return False
+    out = arguments.out or ADAPTED / "passages"
+    results = passage_configurations(arguments.detector, arguments.target, out, config, tell_line, should_stop)
     images = load_passages(arguments.target).images
     seen = as_seen(images, preset(config.domain))
     save(passages_figure(images, seen, read_metrics(out / "metrics.jsonl"), results), out / "configurations.png")
@@ -127,29 +94,23 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
         how = f"{start}{', fine-tuned' if tunes else ''}"
         print(f"{name}  {how:<33}accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
     print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
-    return True
 
 
-def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> bool:
+def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     del should_stop
     from topological_nav.adapt.transfer import collected_map
     from topological_nav.figures.maps import map_figure, save
     from topological_nav.maps.graph import save_map
 
     scene = Path(arguments.scene)
-    out = arguments.out or arguments.adapted / f"{scene.resolve().name}.npz"
+    out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"
     built = collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config)
     save_map(built.map, out)
     save(map_figure(built), out.with_suffix(".png"))
     for name, value in built.scores.items():
         print(f"{name}: {value}")
     print(f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges; drawn in {out.with_suffix('.png')}")
-    return True
-
-
-def _tell(line: str) -> None:
-    print(line, flush=True)
 
 
 _NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}
-_RUNS = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}
+WHAT = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}

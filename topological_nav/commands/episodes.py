@@ -14,6 +14,7 @@ from rich.console import Console
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.signals import stop_signals
+from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
 from topological_nav.commands.progress import bar, say, stopping
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
@@ -27,7 +28,7 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     from topological_nav.evaluate.contest import Contest
 
     contest = Contest(
-        scenes=tuple(Path(scene) for scene in scenes),
+        scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
         contenders=tuple(contenders),
         out=out,
         config=overridden(EvaluationConfig(), arguments.settings),
@@ -81,7 +82,7 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
         refuse_unused(arguments, "thinned", who)
     if arguments.truth:
         refuse_unused(arguments, "--maps --localiser --detector match supersample", "with --truth")
-    if not contest.config.glance:
+    if not contest.config.navigator.glance:
         refuse_unused(arguments, "watch_s", "with glance=false")
 
 
@@ -98,7 +99,7 @@ def navigate(arguments: argparse.Namespace) -> None:
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     with stop_signals() as stops, bar() as tell:
         told = stopping(tell, stops)
-        limit_s = int(contest.config.limit_s)
+        limit_s = int(contest.config.navigator.limit_s)
         driven = drive_episode(
             contest,
             arguments.episode,
@@ -137,7 +138,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
             made = venue.map_of(name) if name in ("dense", "sparse") else None
             panels[name] = (made, tracks_of(contest, venue, name), {row["episode"]: row for row in mine})
         save(
-            journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable),
+            journeys_figure(venue.scene.name, venue.space, panels, contest.config.navigator.passable),
             contest.out / f"{venue.scene.name}.png",
         )
     lines, compared = summary(rows), differences(rows)

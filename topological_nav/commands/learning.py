@@ -7,7 +7,8 @@ from pathlib import Path
 
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.signals import stop_signals
-from topological_nav.commands.progress import Stopped, bar, stopping
+from scenes_mjcf.sets import scene_folders
+from topological_nav.commands.progress import asked_by, bar, stopping, tell_line
 from topological_nav.config import (
     DATASET,
     DRIVES,
@@ -28,11 +29,12 @@ def data(arguments: argparse.Namespace) -> None:
         return _drives(arguments)
     config = overridden(DataConfig(), arguments.settings)
     out = arguments.out or DATASET
-    from topological_nav.data.dataset import dataset_bytes, make_dataset
+    from topological_nav.data.dataset import make_dataset
+    from topological_nav.data.folders import folder_bytes
     from topological_nav.figures.maps import dataset_figure, save
 
     with stop_signals() as stops, bar() as tell:
-        header = make_dataset([Path(s) for s in arguments.scenes], out, config, stopping(tell, stops))
+        header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, stopping(tell, stops))
     save(dataset_figure(out), out / "preview.png")
     images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
     for s in header["scenes"]:
@@ -41,14 +43,15 @@ def data(arguments: argparse.Namespace) -> None:
             f"{s['name']}: {s['rooms']} rooms ({s['rooms_chosen_by']}{rand}), {s['positions']} positions "
             f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
         )
-    size = dataset_bytes(out)
+    size = folder_bytes(out)
     print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
 
 
 def _drives(arguments: argparse.Namespace) -> None:
     config = overridden(DriveConfig(), arguments.settings)
-    out, scenes = arguments.out or DRIVES, [Path(s) for s in arguments.scenes]
-    from topological_nav.drives.dataset import draw_drives, drives_bytes, simulate_drives, summary
+    out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
+    from topological_nav.data.folders import folder_bytes
+    from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
     from topological_nav.figures.drive_figures import drives_figure
     from topological_nav.figures.maps import save
 
@@ -65,7 +68,7 @@ def _drives(arguments: argparse.Namespace) -> None:
         f"{row['m_s']:.2f} m/s, turning in {row['turning']:.2f} of the steps"
     )
     images = int(drives.steps[drives.kept].sum())
-    size = drives_bytes(out)
+    size = folder_bytes(out)
     print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
 
 
@@ -82,29 +85,19 @@ def train(arguments: argparse.Namespace) -> None:
     out = arguments.out or RUNS / arguments.task
     from interactive_nav_common.metrics_file import read_metrics
     from topological_nav.figures.maps import curves_figure, save
+    from topological_nav.learn.localise import in_words
     from topological_nav.learn.training import train as train_network
 
     with stop_signals() as stops:
-        results = train_network(
-            arguments.task,
-            arguments.data or DATASET,
-            out,
-            config,
-            lambda line: print(line, flush=True),
-            lambda: bool(stops),
-        )
-        if results is None:
-            raise Stopped(stops[0])
+        data = arguments.data or DATASET
+        results = train_network(arguments.task, data, out, config, tell_line, asked_by(stops))
     save(curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     for name, row in results.get("groups", {}).items():
         print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
     if rows := results.get("lengths"):
         print("ahead:  " + ",  ".join(f"{row['ahead_m']:g} m {row['accuracy']:.3f}" for row in rows) + "  right")
     if mean := results["localisation"].get("mean"):
-        print(
-            f"localisation: nearest node {mean['node']:.3f}, right room {mean['room']:.3f}, "
-            f"median error {mean['error_m']:.2f} m (least possible {mean['least_error_m']:.2f} m)"
-        )
+        print(f"localisation: {in_words(mean)}")
     print(f"{out}: {results['parameters']:,} parameters")
 
 
@@ -119,17 +112,11 @@ def _policy(arguments: argparse.Namespace) -> None:
     from topological_nav.figures.drive_figures import policy_figure
     from topological_nav.figures.maps import save
 
-    def tell(line: str) -> None:
-        print(line, flush=True)
-
     with stop_signals() as stops:
-        halt = lambda: bool(stops)  # noqa: E731
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
-        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell, halt)
+        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell_line, asked_by(stops))
         learn = train_grid if arguments.grid else train_policy
-        results = None if frames is None else learn(frames, out, config, tell, halt)
-        if results is None:
-            raise Stopped(stops[0])
+        results = learn(frames, out, config, tell_line, asked_by(stops))
     if isinstance(results, list):
         for row in results:
             folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import settings_help
+from topological_nav.adapt.config import AdaptConfig
 from topological_nav.commands import adapt
 from topological_nav.commands.learning import TASKS
 from topological_nav.config import (
@@ -62,7 +63,7 @@ def _data(command: Command) -> None:
         DataConfig(),
         drives=DriveConfig(),
     )
-    data.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
+    data.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders or sets of them")
     data.add_argument("--drives", action="store_true", help="drive through the scenes, and render what the robot sees")
     data.add_argument("-o", "--out", type=Path, metavar="DIR", help=f"dataset (default {DATASET}; drives: {DRIVES})")
 
@@ -102,7 +103,7 @@ def _episodes(command: Command) -> None:
     one.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"picture (default {RUNS}/navigate/SCENE-N.png)")
     one.add_argument("--video", type=Path, metavar="PATH", help="film it as well (.mp4), ten times as fast")
     several = command("evaluate", "Plays fixed episodes of scenes and scores them.", EvaluationConfig())
-    several.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders")
+    several.add_argument("scenes", nargs="+", metavar="SCENE", help="scene folders or sets of them")
     several.add_argument(
         "--contenders",
         metavar="NAMES",
@@ -155,4 +156,15 @@ def _export(command: Command) -> None:
 
 
 def _adapt(command: Command) -> None:
-    adapt.add_to(command, DATASET, RUNS)
+    sub = command("adapt", "Takes networks and maps to another domain.", AdaptConfig())
+    sub.add_argument(
+        "what",
+        choices=list(adapt.WHAT),
+        help="features: the embedding, adversarially; passages: the detector in configurations A to D; map: of images "
+        "collected in the target domain",
+    )
+    sub.add_argument("scene", nargs="?", metavar="SCENE", help="map: scene folder")
+    sub.add_argument("--data", type=Path, metavar="DIR", help=f"source (default {DATASET})")
+    sub.add_argument("--target", type=Path, metavar="DIR", help="dataset of the target (default: the source's)")
+    sub.add_argument("-o", "--out", type=Path, metavar="PATH", help=f"default {adapt.ADAPTED}/WHAT, a map SCENE.npz")
+    _networks(sub)

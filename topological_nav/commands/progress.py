@@ -10,12 +10,10 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from topological_nav.errors import Asked, Stopped
+
 Tell = Callable[[str, int, int], None]
 """Told what is done, how much of it, and of how much."""
-
-
-class Stopped(Exception):
-    """A signal asked to stop; carries its number."""
 
 
 def stopping(tell: Tell, stops: list[int]) -> Tell:
@@ -29,9 +27,19 @@ def stopping(tell: Tell, stops: list[int]) -> Tell:
     return told
 
 
+def asked_by(stops: list[int]) -> Asked:
+    """Asks a list of signals that came (see `signals.stop_signals`)."""
+    return lambda: stops[0] if stops else 0
+
+
 def say(line: str) -> None:
     """A line to stderr, at once."""
     print(line, file=sys.stderr, flush=True)
+
+
+def tell_line(line: str) -> None:
+    """A line to stdout, at once."""
+    print(line, flush=True)
 
 
 @contextmanager

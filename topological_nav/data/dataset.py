@@ -11,35 +11,34 @@ What is decided depends on scene and settings only. Drawing goes file by file an
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import functools
-import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
-from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav.sensing.base import CameraPose, Lens
-from interactive_nav_common.config import overlay, to_dict
-from interactive_nav_common.files import whole_file, write_text
-from interactive_nav_common.locks import alone_in
-from topological_nav.config import CameraConfig, DataConfig
+from interactive_nav.scenes.scene import Scene
+from interactive_nav_common.files import write_arrays
+from topological_nav.config import DataConfig
+from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
 from topological_nav.data.passages import Passages, draw_passages, held_out
-from topological_nav.data.shards import ShardWriter, read_shards
+from topological_nav.data.shards import read_shards
 from topological_nav.errors import DatasetError, SpaceError, readable
-from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
-from topological_nav.scenes.rooms import Rooms, agreement, find_rooms, recorded_rooms
+from topological_nav.scenes.rendering import camera_pose
+from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space, spread
 
-FORMAT = 2
-"""Of the folder; raised whenever older datasets would be read wrongly."""
-Progress = Callable[[str, int, int], None]
-"""Called with what is drawn, images done and images in all."""
+DATASET = Folder(
+    file="dataset.json",
+    version=2,
+    base=DataConfig(),
+    none="is no dataset (no dataset.json); make one: python -m topological_nav data ...",
+    again="make the dataset again",
+)
+read_header = DATASET.read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,11 +96,6 @@ def headings(config: DataConfig) -> np.ndarray:
     return 2 * np.pi * np.arange(config.headings) / config.headings
 
 
-def lens_of(config: CameraConfig, robot: RobotSpec) -> Lens:
-    """The lens of stored images."""
-    return Lens(config.width, config.height, config.fov_deg or robot.camera.fov_deg)
-
-
 def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
     """Decides where a scene's images are taken.
 
@@ -111,8 +105,7 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
         SpaceError: too little free space.
     """
     rng = np.random.default_rng([config.seed, 2, int(scene.digest[:8], 16)])
-    known = recorded_rooms(scene.digest)
-    rooms = find_rooms(space, config.room_method, config.num_rooms, known, config.seed, config.clearance_m)
+    rooms = scene_rooms(scene, space, config)
     try:
         drawn = space.sample(rng, config.positions, config.clearance_m)
     except SpaceError as error:
@@ -148,53 +141,20 @@ def make_dataset(
         SceneError, SpaceError: a scene cannot be used.
         UserError: the engine is not installed.
     """
-    scenes = [load_scene(folder) for folder in scene_folders]
-    need_engine(config.engine)
-    names = [scene.name for scene in scenes]
-    if len(set(names)) != len(names) or not names:
-        raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
+    scenes = load_scenes(scene_folders, config.engine)
     robot = get_robot(config.robot)
-    spaces = [free_space(scene, robot.height_m) for scene in scenes]
-    plans = [plan_scene(scene, space, config) for scene, space in zip(scenes, spaces, strict=True)]
-    header = {
-        "format": FORMAT,
-        "settings": to_dict(config),
-        "fov_deg": lens_of(config, robot).fov_deg,
-        "camera_m": list(robot.camera.pos_m),
-        "scenes": [_about(scene, plan) for scene, plan in zip(scenes, plans, strict=True)],
-    }
-    with _claimed(out, header):
+    plans = [plan_scene(scene, free_space(scene, robot.height_m), config) for scene in scenes]
+    header = DATASET.describe(config, [_about(scene, plan) for scene, plan in zip(scenes, plans, strict=True)])
+    with DATASET.claimed(out, header):
+        drawn = []
         for scene, plan in zip(scenes, plans, strict=True):
             (out / scene.name).mkdir(exist_ok=True)
-            with whole_file(out / scene.name / "plan.npz") as partial, open(partial, "wb") as file:
-                np.savez_compressed(file, **_plan_arrays(plan))  # type: ignore[arg-type]
+            write_arrays(out / scene.name / "plan.npz", **_plan_arrays(plan))
+            files = _shards(out / scene.name, plan, robot, config)
+            drawn.append((scene.name, lambda scene=scene: scene, files))
         total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
-        done = 0
-        with ShardWriter(config.quality) as writer:
-            for scene, plan in zip(scenes, plans, strict=True):
-                renderer: SceneRenderer | None = None
-                for path, poses in _shards(out / scene.name, plan, robot, config):
-                    done += sum(len(pose.pos_w) for pose in poses)
-                    told = functools.partial(progress, scene.name, done, total)
-                    if path.is_file():
-                        writer.skip(told)
-                        continue
-                    renderer = renderer or SceneRenderer(
-                        scene, lens_of(config, robot), config.supersample, config.engine
-                    )
-                    writer.put(path, draw_sheets(renderer, poses), told)
+        draw_missing(drawn, total, config, progress)
         return header
-
-
-def draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
-    """Images [n_i, H, W, 3] of groups of cameras, drawn together: full batches."""
-    joined: Any = [np.concatenate(column) for column in zip(*map(_leaves, poses), strict=True)]
-    images = renderer.draw(CameraPose(*joined))
-    return np.split(images, np.cumsum([len(pose.pos_w) for pose in poses])[:-1])
-
-
-def _leaves(pose: CameraPose) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(pose.pos_w), np.asarray(pose.axes_w)
 
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
@@ -214,45 +174,6 @@ def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig)
             at = rows[begin : begin + each]
             poses.append(camera_pose(robot, plan.passages.xy_w[at], plan.passages.heading_rad[at], np.zeros(len(at))))
         yield folder / f"passages-{i:03d}.npz", poses
-
-
-def dataset_bytes(folder: Path) -> int:
-    """Bytes of a dataset's plans and images."""
-    return sum(path.stat().st_size for path in Path(folder).glob("*/*.npz"))
-
-
-def read_versioned(path: Path, version: int, none: str, again: str) -> dict[str, Any]:
-    """A folder's description, of this format.
-
-    Args:
-        path: its JSON file.
-        version: of the format.
-        none: what to say where there is no file.
-        again: what to do about one that cannot be used.
-
-    Raises:
-        DatasetError: missing, not readable, or of another format.
-    """
-    if not path.is_file():
-        raise DatasetError(none)
-    with readable(path, DatasetError, f"delete the folder and {again}"):
-        header = json.loads(path.read_text(encoding="utf-8"))
-        found = header["format"]
-    if found != version:
-        raise DatasetError(f"{path}: format {found}, expected {version}; {again}")
-    return header
-
-
-def read_header(folder: Path) -> tuple[dict[str, Any], DataConfig]:
-    """dataset.json and the settings in it.
-
-    Raises:
-        DatasetError: the folder is no dataset, or of another format.
-    """
-    path = Path(folder) / "dataset.json"
-    none = f"{folder}: is no dataset (no dataset.json); make one: python -m topological_nav data ..."
-    header = read_versioned(path, FORMAT, none, "make the dataset again")
-    return header, overlay(DataConfig(), header["settings"], str(path))
 
 
 def load_rooms(folder: Path) -> RoomImages:
@@ -330,29 +251,6 @@ def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
         "passages": len(plan.passages),
         "test_passages": int(plan.passages.test.sum()),
     }
-
-
-@contextlib.contextmanager
-def _claimed(out: Path, header: dict[str, Any]) -> Iterator[None]:
-    """Writes dataset.json of a new dataset, or checks that the one there is the same; nobody else works there."""
-    with alone_in(out):
-        path = out / "dataset.json"
-        if path.is_file():
-            there, _ = read_header(out)
-            for name, value in header["settings"].items():
-                if name in there["settings"] and there["settings"][name] != value:
-                    raise DatasetError(
-                        f"{out}: the dataset there has {name} = {there['settings'][name]!r}, this one {value!r}; "
-                        "choose another folder or delete it"
-                    )
-            if there["scenes"] != header["scenes"]:
-                raise DatasetError(
-                    f"{out}: the dataset there is of {', '.join(s['name'] for s in there['scenes'])} as they were; "
-                    "the scenes differ: choose another folder or delete it"
-                )
-        else:
-            write_text(path, json.dumps(header, indent=1) + "\n")
-        yield
 
 
 def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.ndarray:

@@ -12,39 +12,41 @@ drawn. What is decided depends on scenes and settings only. Simulating and drawi
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.config import overlay, to_dict
-from interactive_nav_common.files import whole_file, write_text
+from interactive_nav.sensing.base import CameraPose
+from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
-from topological_nav.data.dataset import draw_sheets, lens_of, read_versioned
-from topological_nav.data.shards import ShardWriter, read_shards
+from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
+from topological_nav.data.shards import read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
 from topological_nav.errors import DatasetError, SpaceError, readable
 from topological_nav.maps.nodes import place_nodes
-from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
-from topological_nav.scenes.rooms import find_rooms, recorded_rooms
+from topological_nav.scenes.rendering import camera_pose
+from topological_nav.scenes.rooms import scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
 
-FORMAT = 1
-"""Of the folder; raised whenever older ones would be read wrongly."""
+DRIVES = Folder(
+    file="drives.json",
+    version=1,
+    base=DriveConfig(),
+    none="holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE...",
+    again="drive again",
+)
+read_drives_header = DRIVES.read
 LIMIT_M = 8.0
 """Fields of the way left reach so far; beyond they rise with the distance."""
-Progress = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +128,7 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
     fields_before = 0
     for index, scene in enumerate(scenes):
         space = free_space(scene, robot.height_m)
-        rooms = find_rooms(space, "gmm", None, recorded_rooms(scene.digest), config.seed, DataConfig().clearance_m)
+        rooms = scene_rooms(scene, space, DataConfig(seed=config.seed))
         xy, _ = place_nodes(space, rooms, MapConfig(edge_m=config.edge_m), robot.body_width_m / 2, 50)
         field = way_field(space, xy, config, LIMIT_M)
         joined = drivable(space, xy, field, config)
@@ -189,29 +191,16 @@ def simulate_drives(
         SceneError, SpaceError: a scene cannot be used.
         UserError: the engine that will draw them is not installed.
     """
-    scenes = [load_scene(folder) for folder in scene_folders]
-    need_engine(config.engine)
-    names = [scene.name for scene in scenes]
-    if len(set(names)) != len(names) or not names:
-        raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
-    robot = get_robot(config.robot)
-    header = {
-        "format": FORMAT,
-        "settings": to_dict(config),
-        "fov_deg": lens_of(config, robot).fov_deg,
-        "camera_m": list(robot.camera.pos_m),
-        "scenes": [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes],
-    }
-    with _claimed(out, header):
+    scenes = load_scenes(scene_folders, config.engine)
+    header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
+    with DRIVES.claimed(out, header):
         total = len(scenes) * config.drives
         files = [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
         if all(path.is_file() for path in (*files, out / "plan.npz")):
             progress("drives", total, total)
             return load_drives(out)
         plan = plan_drives(scenes, config)
-        with whole_file(out / "plan.npz") as partial, open(partial, "wb") as file:
-            last = plan.tasks.goals_w[:, -1]
-            np.savez_compressed(file, scene=plan.tasks.scene, test=plan.test, goal_w=last)
+        write_arrays(out / "plan.npz", scene=plan.tasks.scene, test=plan.test, goal_w=plan.tasks.goals_w[:, -1])
         fleet: Fleet | None = None
         for i, path in enumerate(files):
             mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
@@ -241,27 +230,27 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
     Raises:
         DatasetError: the folder cannot be used, or a scene has changed since.
     """
-    header, config = read_drives_header(out)
-    drives, robot = load_drives(out), get_robot(config.robot)
-    total, done = int(drives.steps[drives.kept].sum()), 0
-    with ShardWriter(config.quality) as writer:
-        for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
-            (out / about["name"]).mkdir(exist_ok=True)
-            renderer: SceneRenderer | None = None
-            for path, rows in _image_files(out, about["name"], index, drives, config):
-                done += int(drives.steps[rows].sum())
-                told = functools.partial(progress, about["name"], done, total)
-                if path.is_file():
-                    writer.skip(told)
-                    continue
-                if renderer is None:
-                    scene = load_scene(scene_folder)
-                    if scene.digest != about["digest"]:
-                        raise DatasetError(f"{scene_folder}: is not the scene that was driven in; drive again")
-                    renderer = SceneRenderer(scene, lens_of(config, robot), config.supersample, config.engine)
+    with alone_in(out):
+        header, config = read_drives_header(out)
+        drives, robot = load_drives(out), get_robot(config.robot)
+
+        def scene(folder: Path, digest: str) -> Scene:
+            there = load_scene(folder)
+            if there.digest != digest:
+                raise DatasetError(f"{folder}: is not the scene that was driven in; drive again")
+            return there
+
+        def files(index: int, name: str) -> Iterator[tuple[Path, list[CameraPose]]]:
+            (out / name).mkdir(exist_ok=True)
+            for path, rows in _image_files(out, name, index, drives, config):
                 poses = [drives.pose_w[drives.rows(k)] for k in rows]
-                cameras = [camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p))) for p in poses]
-                writer.put(path, draw_sheets(renderer, cameras), told)
+                yield path, [camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p))) for p in poses]
+
+        drawn = [
+            (about["name"], functools.partial(scene, folder, about["digest"]), files(index, about["name"]))
+            for index, (about, folder) in enumerate(zip(header["scenes"], scene_folders, strict=True))
+        ]
+        draw_missing(drawn, int(drives.steps[drives.kept].sum()), config, progress)
 
 
 def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig):
@@ -292,18 +281,6 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         if images.shape != shape:
             raise DatasetError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
         yield rows, images
-
-
-def read_drives_header(folder: Path) -> tuple[dict[str, Any], DriveConfig]:
-    """drives.json and the settings in it.
-
-    Raises:
-        DatasetError: the folder holds no drives, or of another format.
-    """
-    path = Path(folder) / "drives.json"
-    none = f"{folder}: holds no drives (no drives.json); make some: python -m topological_nav data --drives SCENE..."
-    header = read_versioned(path, FORMAT, none, "drive again")
-    return header, overlay(DriveConfig(), header["settings"], str(path))
 
 
 def load_drives(folder: Path) -> Drives:
@@ -338,8 +315,7 @@ def _write_batch(path: Path, driven: Driven, count: int) -> None:
     on = np.arange(driven.pose_w.shape[1]) < driven.steps[:count, None]
     arrays = {name: getattr(driven, name)[:count][on] for name in ("pose_w", "command", "touching", "gap_m")}
     arrays |= {name: getattr(driven, name)[:count] for name in ("steps", "reached", "broken")}
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    write_arrays(path, **arrays)
 
 
 def summary(drives: Drives) -> dict[str, float]:
@@ -361,33 +337,3 @@ def summary(drives: Drives) -> dict[str, float]:
         "m_s": float(drives.command[going, 0].mean()) if going.any() else 0.0,
         "turning": float((np.abs(drives.command[going, 1]) >= 0.125).mean()) if going.any() else 0.0,
     }
-
-
-def drives_bytes(folder: Path) -> int:
-    """Bytes of a folder's drives and images."""
-    return sum(path.stat().st_size for path in Path(folder).rglob("*.npz"))
-
-
-@contextlib.contextmanager
-def _claimed(out: Path, header: dict[str, Any]) -> Iterator[None]:
-    """Writes drives.json of a new folder, or checks that the one there is the same; nobody else works there."""
-    with alone_in(out):
-        path = out / "drives.json"
-        if path.is_file():
-            there, _ = read_drives_header(out)
-            for name, value in header["settings"].items():
-                if there["settings"].get(name) != value:
-                    raise DatasetError(
-                        f"{out}: the drives there have {name} = {there['settings'].get(name)!r}, these {value!r}; "
-                        "choose another folder or delete it"
-                    )
-            if [(s["name"], s["digest"]) for s in there["scenes"]] != [
-                (s["name"], s["digest"]) for s in header["scenes"]
-            ]:
-                raise DatasetError(
-                    f"{out}: the drives there are in {', '.join(s['name'] for s in there['scenes'])} as they were; "
-                    "the scenes differ: choose another folder or delete it"
-                )
-        else:
-            write_text(path, json.dumps(header, indent=1) + "\n")
-        yield

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
 from topological_nav.drives.imitation import fresh_params
-from topological_nav.drives.policy import Forward, Policy
+from topological_nav.drives.policy import Forward, Policy, standardised
 from topological_nav.errors import RunError
 from topological_nav.learn.pairs import load_pair, need_task
 from topological_nav.learn.runs import read_description, read_weights
 from topological_nav.learn.training import Trained
+from topological_nav.maps.sight import PassagePolicy, Sight
 
 
 class LocalPolicy(Protocol):
@@ -65,8 +67,7 @@ class TrainedPolicy:
             network.network.apply(variables, images, method="embed")
             for network, variables in zip(self._networks, weights["embedders"], strict=True)
         ]
-        scale = weights["policy"]["scale"]
-        x = (jnp.concatenate(parts, -1) - scale["mean"]) / scale["deviation"]  # type: ignore[arg-type]
+        x = standardised(jnp.concatenate(parts, -1), weights["policy"]["scale"])  # type: ignore[arg-type]
         state, logits = self._policy.apply({"params": weights["policy"]["params"]}, state, x)  # type: ignore[misc]
         return state, tuple(one.argmax(-1) for one in logits)
 
@@ -104,19 +105,19 @@ def load_policy(
     return TrainedPolicy(policy, read_weights(run, template, about), about, networks)
 
 
-def load_policy_beside(
-    run_folder: Path | str, localiser: tuple[Path, Trained], detector: tuple[Path, Trained]
-) -> TrainedPolicy:
-    """The policy of a finished run, which sees through a navigator's networks where these are adapted ones.
+def local_policy(name: str, sight: Sight, config: NavigatorConfig, *seeing: tuple[Path, Trained]) -> LocalPolicy:
+    """What drives along edges.
 
     Args:
-        run_folder: of `train policy`.
-        localiser: the navigator's run folder and network.
-        detector: the same.
+        name: `PASSAGE_POLICY`, or the run folder of `train policy`.
+        sight: judges passages for the former.
+        config: of the navigator.
+        seeing: the navigator's localiser and detector with their run folders; a trained policy sees through those of
+            them that are adapted.
 
     Raises:
         RunError: see `load_policy`.
     """
-    return load_policy(
-        run_folder, *(run if "adapted_from" in network.about else None for run, network in (localiser, detector))
-    )
+    if name == PASSAGE_POLICY:
+        return PassagePolicy(sight, config.passable, config.clear_m)
+    return load_policy(name, *(run if "adapted_from" in network.about else None for run, network in seeing))

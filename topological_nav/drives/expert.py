@@ -113,8 +113,8 @@ def _lattice(free: np.ndarray, cost: np.ndarray, step_m: float) -> scipy.sparse.
 def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: jax.Array) -> jax.Array:
     """[...] bilinear values of a grid [rows, columns] of cell centres at points [..., 2]; outside, of its rim."""
     rows, columns = grid.shape
-    u = (xy_w - origin_w) / resolution_m - 0.5
-    u = jnp.clip(u, 0.0, jnp.asarray([columns - 1.001, rows - 1.001]))
+    origin, last = (jnp.broadcast_to(x, xy_w.shape) for x in (origin_w, jnp.asarray([columns - 1.001, rows - 1.001])))
+    u = jnp.clip((xy_w - origin) / resolution_m - 0.5, 0.0, last)
     low = jnp.floor(u).astype(jnp.int32)
     f, c, r = u - low, low[..., 0], low[..., 1]
     below = grid[r, c] * (1 - f[..., 0]) + grid[r, c + 1] * f[..., 0]
@@ -146,8 +146,8 @@ def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Ar
 
 def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array:
     """[C, K, 3] poses x, y (m) and yaw in the frame where constant velocities [C] begin, after times [K]."""
-    turn = angular[:, None] * times_s
-    length = linear[:, None] * times_s
+    turn = angular[:, None] * times_s[None]
+    length = linear[:, None] * times_s[None]
     small = jnp.abs(turn) < 1e-4
     safe = jnp.where(small, 1.0, turn)
     along = jnp.where(small, 1.0, jnp.sin(safe) / safe)
@@ -164,9 +164,10 @@ def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.
         half_m: [2] half its length and width.
     """
     cos, sin = jnp.cos(poses_b[..., 2])[..., None], jnp.sin(poses_b[..., 2])[..., None]
+    points_b = jnp.expand_dims(points_b, range(poses_b.ndim - 1))
     met = jnp.isfinite(points_b).all(-1)
-    dx = jnp.where(met, points_b[:, 0], 0.0) - poses_b[..., :1]
-    dy = jnp.where(met, points_b[:, 1], 0.0) - poses_b[..., 1:2]
+    dx = jnp.where(met, points_b[..., 0], 0.0) - poses_b[..., :1]
+    dy = jnp.where(met, points_b[..., 1], 0.0) - poses_b[..., 1:2]
     x = jnp.maximum(jnp.abs(cos * dx + sin * dy) - half_m[0], 0.0)
     y = jnp.maximum(jnp.abs(cos * dy - sin * dx) - half_m[1], 0.0)
     return jnp.sqrt(jnp.where(met, x * x + y * y, jnp.inf).min(-1))
@@ -175,7 +176,7 @@ def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.
 def outline(half_m: jax.Array) -> jax.Array:
     """[8, 2] corners and middles of the sides of a rectangle about the origin."""
     signs = jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y], jnp.float32)
-    return signs * half_m
+    return signs * half_m[None]
 
 
 def moved(pose: jax.Array, by: jax.Array) -> jax.Array:
@@ -216,10 +217,10 @@ def command(
     ways_w = moved(pose_w, ways_b)
     origin, resolution = terrain.origin_w[scene], terrain.resolution_m[scene]
     seen = scan_gap(ways_b, points_b, half_m)
-    rim = outline(half_m)
+    rim = outline(half_m)[None, None]
     cos, sin = jnp.cos(ways_w[..., 2])[..., None], jnp.sin(ways_w[..., 2])[..., None]
-    x = ways_w[..., :1] + cos * rim[:, 0] - sin * rim[:, 1]
-    y = ways_w[..., 1:2] + sin * rim[:, 0] + cos * rim[:, 1]
+    x = ways_w[..., :1] + cos * rim[..., 0] - sin * rim[..., 1]
+    y = ways_w[..., 1:2] + sin * rim[..., 0] + cos * rim[..., 1]
     known = sample(terrain.clearance_m[scene], origin, resolution, jnp.stack([x, y], -1)).min(-1)
     gap = jnp.minimum(seen, known).min(-1)
     left, end = _left(terrain.to_go_m[goal], origin, resolution, ways_w, linear, config)
@@ -260,7 +261,7 @@ def _left(
 def _fall(field: jax.Array, origin: jax.Array, resolution: jax.Array, xy: jax.Array) -> jax.Array:
     """Headings [C] in which a field falls at points [C, 2]."""
     offsets = _SLOPE_M * jnp.asarray([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    values = sample(field, origin, resolution, xy[:, None] + offsets)
+    values = sample(field, origin, resolution, xy[:, None] + offsets[None])
     return jnp.arctan2(values[:, 3] - values[:, 2], values[:, 1] - values[:, 0])
 
 
@@ -274,5 +275,5 @@ def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[flo
     """
     step = config.lidar_fov_deg / config.lidar_rays
     angle = jnp.radians(-0.5 * config.lidar_fov_deg + jnp.arange(config.lidar_rays) * step)
-    ends = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1) * ranges_m[:, None] + jnp.asarray(lidar_xy_b)
+    ends = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1) * ranges_m[:, None] + jnp.asarray(lidar_xy_b)[None]
     return jnp.where((ranges_m < 0.999 * config.lidar_range_m)[:, None], ends, jnp.inf)

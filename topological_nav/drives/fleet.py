@@ -13,11 +13,11 @@ import numpy as np
 
 import interactive_nav
 from interactive_nav.task.env import InteractiveNav
-from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from topological_nav.config import DriveConfig
 from topological_nav.drives.expert import CONTROL_S, Terrain, command, scan_points
 from topological_nav.scenes.rendering import need_engine
+from topological_nav.scenes.simulation import episode_starts
 
 SEGMENT = 25
 """Control steps a program; between two of them the host looks whether any drive still goes on."""
@@ -139,16 +139,7 @@ class Fleet:
 
     def _begun(self, tasks: dict[str, Any]) -> dict[str, Any]:
         count = len(tasks["scene"])
-        none = jnp.zeros((count, 0))
-        start = EpisodeStart(
-            scene_index=tasks["scene"],
-            start_xy_w=tasks["start_xy_w"].astype(jnp.float32),
-            start_yaw_rad=tasks["start_yaw_rad"].astype(jnp.float32),
-            goal_xy_w=tasks["goals_w"][:, 0].astype(jnp.float32),
-            small_xy_w=jnp.zeros((count, 0, 2)),
-            small_yaw_rad=none,
-            small_placed=none.astype(bool),
-        )
+        start = episode_starts(tasks["start_xy_w"], tasks["start_yaw_rad"], tasks["goals_w"][:, 0], 0, tasks["scene"])
         state = jax.vmap(self._env.reset_to)(start, jnp.zeros((count, 2), jnp.uint32))
         no = jnp.zeros(count, bool)
         zero = jnp.zeros(count, jnp.int32)

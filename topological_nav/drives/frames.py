@@ -14,7 +14,7 @@ import numpy as np
 
 from topological_nav.config import DriveConfig
 from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
-from topological_nav.errors import RunError
+from topological_nav.errors import Asked, RunError, Stopped, go_on
 from topological_nav.learn.learning import in_batches
 from topological_nav.learn.pairs import SAME, load_pair, seen_by
 from topological_nav.learn.training import Trained
@@ -48,8 +48,8 @@ def embed_drives(
     detector_run: Path,
     mirror: bool,
     tell: Callable[[str], None] = lambda _: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> Frames | None:
+    should_stop: Asked = go_on,
+) -> Frames:
     """Embeds the images of all kept drives.
 
     Args:
@@ -60,11 +60,9 @@ def embed_drives(
         tell: told now and then how far it is.
         should_stop: asked after every file of images.
 
-    Returns:
-        None where it was stopped.
-
     Raises:
         DatasetError, RunError: drives or networks cannot be used, or do not fit each other.
+        Stopped: it was asked for.
     """
     header, config = read_drives_header(folder)
     drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
@@ -87,8 +85,8 @@ def embed_drives(
         done += len(images)
         if i % _TOLD_EVERY == 0 or done == total:
             tell(f"embedded {done:,} of {total:,} images")
-        if should_stop():
-            return None
+        if stop := should_stop():
+            raise Stopped(stop)
     if features is None:
         raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
     return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))

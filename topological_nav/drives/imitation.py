@@ -29,7 +29,7 @@ from interactive_nav_common.files import write_text
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
 from topological_nav.drives.frames import Frames
-from topological_nav.drives.policy import Forward, Policy, policy_loss, unrolled
+from topological_nav.drives.policy import Forward, Policy, policy_loss, standardised, unrolled
 from topological_nav.drives.sequences import (
     Sequences,
     class_values,
@@ -39,7 +39,7 @@ from topological_nav.drives.sequences import (
     thinned,
     turning_share,
 )
-from topological_nav.errors import RunError
+from topological_nav.errors import Asked, RunError, go_on
 from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, initial
 from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
 
@@ -54,8 +54,8 @@ def train_policy(
     out: Path,
     config: PolicyConfig,
     tell: Callable[[str], None] = lambda _: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> dict[str, Any] | None:
+    should_stop: Asked = go_on,
+) -> dict[str, Any]:
     """Trains a policy, or goes on with it.
 
     Args:
@@ -66,10 +66,11 @@ def train_policy(
         should_stop: asked after every epoch.
 
     Returns:
-        The content of results.json; None where it was stopped before the end.
+        The content of results.json.
 
     Raises:
         RunError: `out` holds another run, or there is no sequence to learn from.
+        Stopped: it was asked for before the end.
     """
     if config.mirror and not frames.mirrored:
         raise RunError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
@@ -92,7 +93,7 @@ def train_policy(
 
         key = jax.random.PRNGKey(config.seed)
         learner = run_epochs(out, "policy", learner, one, config.epochs, key, tell, should_stop)
-        return learner and _finish(frames, out, config, values, learner, policy, forward, split)
+        return _finish(frames, out, config, values, learner, policy, forward, split)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +150,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
     tx, most = optax.adam(learning_rate), batch
 
     def loss_of(params, scale, u, batch, weights):
-        x = (u - scale["mean"]) / scale["deviation"]
+        x = standardised(u, scale)
         logits = unrolled(policy, params["policy"], x[:, :-1])
         truth = (batch["linear"], batch["angular"])
         sizes = (policy.linear_classes, policy.angular_classes)
@@ -233,7 +234,7 @@ def _judge(policy: Policy, forward: Forward) -> Callable[..., tuple[jax.Array, .
 
     @jax.jit
     def judged(params, scale, u, linear, angular):
-        x = (u - scale["mean"]) / scale["deviation"]
+        x = standardised(u, scale)
         logits = unrolled(policy, params["policy"], x[:, :-1])
         action = jnp.concatenate(
             [jax.nn.one_hot(linear, policy.linear_classes), jax.nn.one_hot(angular, policy.angular_classes)], -1
@@ -291,21 +292,18 @@ def train_grid(
     out: Path,
     config: PolicyConfig,
     tell: Callable[[str], None] = lambda _: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> list[dict[str, Any]] | None:
+    should_stop: Asked = go_on,
+) -> list[dict[str, Any]]:
     """A policy for every alpha and lambda of the report, each in a folder of its own under `out`.
 
     Returns:
-        The results, also written to grid.json and, as a table, to grid.md; None where it was stopped.
+        The results, also written to grid.json and, as a table, to grid.md.
     """
     rows = []
     for alpha, lam in GRID:
         one = dataclasses.replace(config, alpha=alpha, lam=lam)
         tell(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
-        results = train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, tell, should_stop)
-        if results is None:
-            return None
-        rows.append(results)
+        rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, tell, should_stop))
     write_text(out / "grid.json", json.dumps(rows, indent=1) + "\n")
     write_text(out / "grid.md", grid_table(rows))
     return rows

@@ -85,7 +85,13 @@ class Forward(nn.Module):
         y = jnp.concatenate([x, action], -1)
         for _ in range(2):
             y = nn.relu(nn.Dense(self.hidden)(y))
-        return u + deviation * nn.Dense(u.shape[-1])(y)
+        return u + jnp.broadcast_to(deviation, u.shape) * nn.Dense(u.shape[-1])(y)
+
+
+def standardised(u: jax.Array, scale: dict[str, jax.Array]) -> jax.Array:
+    """Embeddings [..., D] about their `mean` [D], in units of their `deviation` [D]."""
+    mean, deviation = (jnp.broadcast_to(scale[name], u.shape) for name in ("mean", "deviation"))
+    return (u - mean) / deviation
 
 
 def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:

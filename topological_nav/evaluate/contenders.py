@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from topological_nav.config import EvaluationConfig
+from topological_nav.config import EvaluationConfig, NavigatorConfig
 from topological_nav.evaluate.episodes import Episodes
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import Events, State
@@ -32,22 +31,9 @@ class Contender(Protocol):
         """Only these episodes go on."""
         ...
 
-    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Events]:
         """The state after one control step, and what the contender says of the step before it."""
         ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Marks:
-    """[B] bool each."""
-
-    run_started: np.ndarray
-    run_ended: np.ndarray
-    arrived: np.ndarray
-    timed_out: np.ndarray
-    localised: np.ndarray
-    blocked: np.ndarray
-    lost: np.ndarray
 
 
 class NavigatorPlayer:
@@ -58,7 +44,6 @@ class NavigatorPlayer:
         navigator: Navigator,
         simulator: Simulator,
         camera: Camera,
-        config: EvaluationConfig,
         watch: Callable[[float, Seen, State, Events], None] = lambda *_: None,
     ):
         """Takes its parts.
@@ -67,16 +52,15 @@ class NavigatorPlayer:
             navigator: of the scene.
             simulator: of the scene.
             camera: what the navigator's sight understands.
-            config: of the evaluation.
             watch: told time, poses, new state and events of every step.
         """
-        self._navigator, self._simulator, self._camera, self._config = navigator, simulator, camera, config
+        self._navigator, self._simulator, self._camera = navigator, simulator, camera
         self._watch = watch
         self.state: State | None = None
 
     def begin(self, episodes: Episodes) -> None:
         """Takes the goals' images, along as many headings as a localisation's."""
-        count = self._config.images
+        count = self._navigator.config.images
         around = 2 * np.pi * np.arange(count) / count
         n = len(episodes)
         images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n))
@@ -89,7 +73,7 @@ class NavigatorPlayer:
         assert self.state is not None
         self.state, self._images = self.state.take(rows), self._images[rows]
 
-    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Events]:
         """See `Contender`."""
         assert self.state is not None
         seen = self._simulator.seen(state)
@@ -99,16 +83,7 @@ class NavigatorPlayer:
             self._images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
         self.state, linear, angular, events = self._navigator.step(mind, self._images, seen.yaw_rad, time_s)
         self._watch(time_s, seen, self.state, events)
-        marks = Marks(
-            events.run_started,
-            events.run_ended,
-            events.arrived,
-            events.timed_out,
-            events.localised,
-            events.blocked,
-            events.lost,
-        )
-        return self._simulator.drive(state, linear, angular), marks
+        return self._simulator.drive(state, linear, angular), events
 
 
 Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
@@ -118,13 +93,13 @@ Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
 class ActionPlayer:
     """Whoever acts on the environment's own state: its runs follow each other without a break."""
 
-    def __init__(self, simulator: Simulator, make_act: Callable[[], Act], config: EvaluationConfig):
+    def __init__(self, simulator: Simulator, make_act: Callable[[], Act], config: NavigatorConfig):
         """Takes what acts.
 
         Args:
             simulator: of the environment.
             make_act: called for every batch of episodes.
-            config: of the evaluation.
+            config: of the navigator: runs and time of episodes are everybody's.
         """
         self._simulator, self._make_act, self._config = simulator, make_act, config
 
@@ -136,19 +111,23 @@ class ActionPlayer:
         """See `Contender`."""
         self._episode = self._episode[rows]
 
-    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Marks]:
+    def step(self, state: Any, time_s: float, over: np.ndarray) -> tuple[Any, Events]:
         """See `Contender`."""
         step = round(time_s / self._simulator.dt_s)
         every = max(1, round(self._config.run_s / self._simulator.dt_s))
         edge = np.full(len(over), step % every == 0)
         none = np.zeros(len(over), bool)
-        late = ~over & (time_s >= self._config.limit_s - 1e-3)
-        marks = Marks(edge & ~over, edge & ~over & (step > 0), none, late, none, none, none)
+        events = Events(
+            **dict.fromkeys(("localised", "glanced", "lost", "blocked", "arrived"), none),
+            run_started=edge & ~over,
+            run_ended=edge & ~over & (step > 0),
+            timed_out=~over & (time_s >= self._config.limit_s - 1e-3),
+        )
         action = self._act(state, self._episode, ~over, step)
-        return self._simulator.act(state, action), marks
+        return self._simulator.act(state, action), events
 
 
-def expert(simulator: Simulator, config: EvaluationConfig) -> ActionPlayer:
+def expert(simulator: Simulator, config: NavigatorConfig) -> ActionPlayer:
     """The planner of `train.scoring.planners` that has the map and all poses: it goes round everything where it can.
 
     Where its grid leaves no way between an object and a wall, it takes the one through the least of objects: episodes
@@ -168,4 +147,4 @@ def learned(simulator: Simulator, policy: Any, config: EvaluationConfig) -> Acti
     def act(state: Any, episode: np.ndarray, _: np.ndarray, step: int) -> Any:
         return chosen(state.obs, jnp.asarray(episode), jnp.asarray(step))
 
-    return ActionPlayer(simulator, lambda: act, config)
+    return ActionPlayer(simulator, lambda: act, config.navigator)

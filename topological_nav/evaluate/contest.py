@@ -17,19 +17,19 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
-from topological_nav.data.dataset import lens_of
 from topological_nav.data.domains import as_seen_from, preset
+from topological_nav.data.folders import lens_of
+from topological_nav.drives import driving
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.errors import RunError
 from topological_nav.evaluate.contenders import Contender, NavigatorPlayer, expert, learned
 from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import Trained, load_trained
+from topological_nav.learn.pairs import Networks, load_networks
 from topological_nav.maps.build import drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
-from topological_nav.maps.sight import NetworkSight, PassagePolicy, Sight, TrueSight
+from topological_nav.maps.sight import NetworkSight, Sight, TrueSight
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.scenes.rooms import find_rooms, recorded_rooms
+from topological_nav.scenes.rooms import scene_rooms
 from topological_nav.scenes.simulation import Camera, Simulator, make_env, pose_camera, scene_camera
 from topological_nav.scenes.space import FreeSpace, free_space
 from train.runs import checkpoint
@@ -78,25 +78,6 @@ class Contest:
             raise ConfigError(f"scenes are {', '.join(names)}, expected different names")
 
 
-@dataclasses.dataclass(frozen=True)
-class Networks:
-    """What the navigator sees by."""
-
-    localiser: Trained
-    detector: Trained
-    camera: DataConfig
-
-
-def load_networks(localiser: Path, detector: Path) -> Networks:
-    """The networks of two finished runs.
-
-    Raises:
-        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
-    """
-    pair = load_trained(localiser), load_trained(detector)
-    return Networks(*pair, camera_of(*pair))
-
-
 class ContestScene:
     """One scene of a contest; what is costly is made when it is first asked for."""
 
@@ -113,8 +94,7 @@ class ContestScene:
     @functools.cached_property
     def rooms(self):
         """By the default way of clustering, so that episodes do not depend on networks."""
-        data, known = DataConfig(), recorded_rooms(self.scene.digest)
-        return find_rooms(self.space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
+        return scene_rooms(self.scene, self.space, DataConfig())
 
     @functools.cached_property
     def episodes(self) -> Episodes:
@@ -169,24 +149,24 @@ class ContestScene:
         """Networks, or the truth."""
         if self.networks is None:
             return TrueSight(made, self.space)
-        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.match)
+        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.navigator.match)
 
     def navigator(self, contender: str) -> Navigator:
         """Of the dense or the sparse map."""
         made = self.map_of(contender)
         sight = self.sight(made)
-        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
+        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config.navigator)
 
     def contender(self, name: str) -> tuple[Contender, Simulator]:
         """Who plays, and in what."""
         config = self.contest.config
         if name == "expert":
-            return expert(self.expert_simulator, config), self.expert_simulator
+            return expert(self.expert_simulator, config.navigator), self.expert_simulator
         if name == "ppo":
             assert self.contest.ppo is not None
             simulator, policy = _learned(self.contest.ppo, self.scene, config)
             return learned(simulator, policy, config), simulator
-        return NavigatorPlayer(self.navigator(name), self.simulator, self.camera, config), self.simulator
+        return NavigatorPlayer(self.navigator(name), self.simulator, self.camera), self.simulator
 
     def asked(self, contender: str) -> dict[str, Any]:
         """Everything that decides the rows of a contender."""
@@ -223,15 +203,10 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
         RunError: no such run.
         ConfigError: a trained policy cannot look at poses.
     """
-    if contest.policy == PASSAGE_POLICY:
-        return PassagePolicy(sight, contest.config.passable, contest.config.clear_m)
-    if contest.truth:
+    if contest.truth and contest.policy != PASSAGE_POLICY:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
-    from topological_nav.drives import driving
-
-    assert networks is not None
-    seeing = (contest.localiser, networks.localiser), (contest.detector, networks.detector)
-    return driving.load_policy_beside(contest.policy, *seeing)
+    seeing = [(contest.localiser, networks.localiser), (contest.detector, networks.detector)] if networks else []
+    return driving.local_policy(contest.policy, sight, contest.config.navigator, *seeing)
 
 
 def _digest_of(policy: str) -> str:

@@ -16,8 +16,9 @@ import numpy as np
 
 from interactive_nav.metrics import path_efficiency
 from topological_nav.config import EvaluationConfig
-from topological_nav.evaluate.contenders import Contender, Marks
+from topological_nav.evaluate.contenders import Contender
 from topological_nav.evaluate.episodes import Episodes
+from topological_nav.navigate.state import Events
 from topological_nav.scenes.simulation import Seen, Simulator
 
 TRACK_S = 0.5
@@ -76,8 +77,8 @@ def play(
     step, seen = 0, simulator.seen(state)
     while not tally.over.all():
         before, time = seen, step * simulator.dt_s
-        state, marks = contender.step(state, time, tally.over)
-        tally.before(before, marks, step)
+        state, events = contender.step(state, time, tally.over)
+        tally.before(before, events, step)
         step, seen = step + 1, simulator.seen(state)
         tally.after(seen)
         left = np.flatnonzero(~tally.over)
@@ -105,21 +106,21 @@ class _Tally:
         self.over = np.zeros(n, bool)
         self._in_run, self._touched = np.zeros(n, bool), np.zeros(n, bool)
 
-    def before(self, seen: Seen, marks: Marks, step: int) -> None:
+    def before(self, seen: Seen, events: Events, step: int) -> None:
         """Counts the moment before a step, which is what the contender speaks of."""
         at, going = self._at, ~self.over
         goal_m = np.linalg.norm(seen.xy_w - self._episodes.goal_xy_w[at], axis=-1)
         if step % max(1, round(TRACK_S / self._dt_s)) == 0:
             self._track(np.flatnonzero(going), seen)
-        ended = marks.run_ended & going
+        ended = events.run_ended & going
         self._count_runs(at[ended], at[ended & self._touched])
-        self._in_run = (self._in_run & ~ended) | marks.run_started
-        self._touched = self._touched & ~ended & ~marks.run_started
-        for name, flag in (("localisations", marks.localised), ("blocked", marks.blocked), ("lost", marks.lost)):
+        self._in_run = (self._in_run & ~ended) | events.run_started
+        self._touched = self._touched & ~ended & ~events.run_started
+        for name, flag in (("localisations", events.localised), ("blocked", events.blocked), ("lost", events.lost)):
             self._counts[name][at[flag & going]] += 1
         near = ended & (goal_m < self._config.success_m)
-        arrived, broken = marks.arrived & going, seen.broken & going
-        ends = near | arrived | broken | (marks.timed_out & going)
+        arrived, broken = events.arrived & going, seen.broken & going
+        ends = near | arrived | broken | (events.timed_out & going)
         rows = np.flatnonzero(ends)
         for name, value in (("success", (near | arrived) & ~broken), ("arrived", arrived & ~near), ("broken", broken)):
             self._whole[name][at[rows]] = value[rows]
@@ -127,7 +128,7 @@ class _Tally:
             self._numbers[name][at[rows]] = value[rows]
         self._numbers["duration_s"][at[rows]] = step * self._dt_s
         # A run that the end of its episode cuts short counts, as the whole run that it is scored as.
-        cut = rows[self._in_run[rows] & ~ended[rows] & ~marks.run_started[rows]]
+        cut = rows[self._in_run[rows] & ~ended[rows] & ~events.run_started[rows]]
         self._count_runs(at[cut], at[cut[self._touched[cut]]])
         self._track(rows, seen)
         self.over |= ends
@@ -167,7 +168,7 @@ def columns(episodes: Episodes, played: Played, config: EvaluationConfig) -> dic
         "within": (played.goal_m < config.success_m).astype(np.float64),
         "arrived": played.arrived,
         "contact": contact.astype(np.float64),
-        "aadc_s": played.contact_runs * config.run_s,
+        "aadc_s": played.contact_runs * config.navigator.run_s,
         "contact_s": played.contact_s,
         "wall_s": played.wall_s,
         "duration_s": played.duration_s,

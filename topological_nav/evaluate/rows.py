@@ -16,13 +16,12 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_arrays
 from interactive_nav_common.rows import read_rows, write_parquet
 from interactive_nav_common.versions import versions
 from topological_nav.evaluate.contenders import Contender
@@ -87,9 +86,13 @@ def _missing(out: Path, stem: str, count: int) -> np.ndarray:
 
 
 def _rows(out: Path, stem: str, count: int) -> pa.Table:
-    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for."""
-    rows = read_rows(_files(out, stem)).sort_by("episode")
-    return rows.filter(pa.array(rows["episode"].to_numpy() < count))
+    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for.
+
+    An episode that two commands played at the same time counts as the first of the files has it.
+    """
+    rows = read_rows(_files(out, stem))
+    number, first = np.unique(rows["episode"].to_numpy(), return_index=True)
+    return rows.take(first[number < count])
 
 
 def _play(
@@ -125,10 +128,8 @@ def _play(
     table = {key: [value] * len(rows) for key, value in constants.items()}
     table |= {"episode": episodes.number, **columns(episodes, played, config)}
     file = f"{stem}-{rows[0]:04d}"
-    tracks = out / "tracks" / f"{file}.npz"
-    with whole_file(tracks) as partial, open(partial, "wb") as handle:
-        named: dict[str, Any] = {str(n): np.asarray(t, np.float32) for n, t in zip(rows, played.track_w, strict=True)}
-        np.savez_compressed(handle, **named)
+    tracks = {str(n): np.asarray(t, np.float32) for n, t in zip(rows, played.track_w, strict=True)}
+    write_arrays(out / "tracks" / f"{file}.npz", **tracks)
     # Rows last: an episode counts as played once its row is there.
     notes = {"asked": json.dumps(scene.asked(name)), "versions": json.dumps(here["packages"])}
     write_parquet(pa.table(table), out / "rows" / f"{file}.parquet", notes)
@@ -139,5 +140,5 @@ def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int
     found: dict[int, np.ndarray] = {}
     for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
         with np.load(path) as stored:
-            found |= {int(number): stored[number] for number in stored.files}
+            found = {int(number): stored[number] for number in stored.files} | found
     return found

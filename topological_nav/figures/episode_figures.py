@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import textwrap
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from interactive_nav_common.files import whole_file
 from topological_nav.figures.maps import floor_plan, room_points
@@ -91,50 +90,6 @@ def journeys_figure(
     return figure
 
 
-def episode_figure(
-    space: FreeSpace,
-    made: TopologicalMap,
-    track_w: np.ndarray,
-    phase: np.ndarray,
-    phases: Sequence[str],
-    start_w: np.ndarray,
-    goal_w: np.ndarray,
-    goal_node: int,
-    title: str,
-    passable: float,
-) -> Figure:
-    """One episode over plan and map.
-
-    Args:
-        space: the plan.
-        made: the map.
-        track_w: [t, 2] m, a point every control step.
-        phase: [t] number of the navigator's phase there.
-        phases: their names.
-        start_w: (2,) m.
-        goal_w: (2,) m.
-        goal_node: where the navigator wants to go.
-        title: above.
-        passable: edges with at least this probability are drawn.
-    """
-    extent = np.ptp(space.centres(0.0), axis=0) + 0.8
-    figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
-    floor_plan(axis, space)
-    map_lines(axis, made, passable)
-    axis.plot(*track_w.T, color="tab:blue", linewidth=1.2, zorder=3)
-    colours = {"localise": "tab:orange", "swing": "tab:purple", "lean": "tab:red"}
-    for name, colour in colours.items():
-        here = track_w[phase == phases.index(name)]
-        if len(here):
-            axis.scatter(*here.T, s=22, color=colour, zorder=4, label=name, linewidths=0)
-    axis.plot(*start_w, "o", color="k", markersize=7, zorder=5, label="start")
-    axis.plot(*goal_w, "*", color="tab:green", markersize=14, zorder=5, label="goal")
-    axis.plot(*made.xy_w[goal_node], "s", mfc="none", mec="tab:green", markersize=11, zorder=5, label="goal's node")
-    axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    axis.set_title(textwrap.fill(title, 90), fontsize=9)
-    return figure
-
-
 def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height: int) -> tuple[np.ndarray, Any]:
     """[height, W, 3] u8 picture of plan and map, W even, and a function from world points [..., 2] to its pixels."""
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
@@ -155,46 +110,6 @@ def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height
         return (np.asarray(xy_w) - [x0, y1]) * scale
 
     return picture, pixels
-
-
-def video_frame(
-    plan: np.ndarray,
-    pixels: Any,
-    track_w: np.ndarray,
-    yaw_rad: float,
-    goal_w: np.ndarray,
-    view: np.ndarray | None,
-    said: str,
-) -> np.ndarray:
-    """[H, W, 3] u8: the plan with the path so far; beside it what the camera saw last.
-
-    Args:
-        plan: of `plan_picture`.
-        pixels: of `plan_picture`.
-        track_w: [t, 2] m, the last of it where the robot is.
-        yaw_rad: its heading.
-        goal_w: (2,) m.
-        view: [h, w, 3] u8; None: no camera.
-        said: below the picture's upper edge.
-    """
-    image = Image.fromarray(plan)
-    draw = ImageDraw.Draw(image)
-    if len(track_w) > 1:
-        draw.line([tuple(p) for p in pixels(track_w)], fill=(31, 119, 180), width=2)
-    x, y = pixels(goal_w)
-    draw.ellipse((x - 7, y - 7, x + 7, y + 7), outline=(44, 160, 44), width=3)
-    here = track_w[-1]
-    nose = here + 0.5 * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
-    x, y = pixels(here)
-    draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=(214, 39, 40))
-    draw.line([(x, y), tuple(pixels(nose))], fill=(214, 39, 40), width=3)
-    draw.text((6, 4), said, fill=(0, 0, 0))
-    out = np.asarray(image)
-    if view is None:
-        return out
-    width = int(round(len(plan) * view.shape[1] / view.shape[0] / 2)) * 2
-    seen = np.asarray(Image.fromarray(view).resize((width, len(plan)), Image.Resampling.NEAREST))
-    return np.concatenate([out, seen], 1)
 
 
 def write_video(frames: Iterable[np.ndarray], path: Path, rate: float) -> int:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
 
 from interactive_nav_common.errors import ConfigError
 from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, contest_scenes
 from topological_nav.evaluate.episodes import Episodes
 from topological_nav.evaluate.evaluation import Played, play
-from topological_nav.figures.episode_figures import episode_figure, plan_picture, video_frame, write_video
+from topological_nav.figures.episode_figures import map_lines, plan_picture, plt, write_video
+from topological_nav.figures.maps import floor_plan
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
 from topological_nav.scenes.simulation import Seen
@@ -24,6 +28,8 @@ FILM_EVERY_S = 0.5
 FILM_RATE = 20.0
 """Frames a second of film: ten times as fast as it was."""
 FILM_HEIGHT = 480
+BLUE, GREEN, RED = (31, 119, 180), (44, 160, 44), (214, 39, 40)
+"""Of path, goal and robot in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,18 +70,50 @@ class Driven:
 
     def figure(self) -> Figure:
         """Path over plan and map."""
-        return episode_figure(
-            self.space,
-            self.map,
-            self.xy_w,
-            self.phase,
-            PHASES,
-            self.journey.start_xy_w[0],
-            self.journey.goal_xy_w[0],
-            self.goal_node,
-            f"{self.scene}, episode {self.number}: {self.outcome}",
-            self.passable,
-        )
+        extent = np.ptp(self.space.centres(0.0), axis=0) + 0.8
+        figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
+        floor_plan(axis, self.space)
+        map_lines(axis, self.map, self.passable)
+        axis.plot(*self.xy_w.T, color="tab:blue", linewidth=1.2, zorder=3)
+        for name, colour in (("localise", "tab:orange"), ("swing", "tab:purple"), ("lean", "tab:red")):
+            here = self.xy_w[self.phase == PHASES.index(name)]
+            if len(here):
+                axis.scatter(*here.T, s=22, color=colour, zorder=4, label=name, linewidths=0)
+        axis.plot(*self.journey.start_xy_w[0], "o", color="k", markersize=7, zorder=5, label="start")
+        axis.plot(*self.journey.goal_xy_w[0], "*", color="tab:green", markersize=14, zorder=5, label="goal")
+        style: Any = {"mfc": "none", "mec": "tab:green", "markersize": 11, "zorder": 5}
+        axis.plot(*self.map.xy_w[self.goal_node], "s", label="goal's node", **style)
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        axis.set_title(textwrap.fill(f"{self.scene}, episode {self.number}: {self.outcome}", 90), fontsize=9)
+        return figure
+
+    def frame(self, step: int, plan: np.ndarray, pixels: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """[H, W, 3] u8: the plan with the path so far; beside it what the camera saw, if it did.
+
+        Args:
+            step: number of the control step.
+            plan: of `plan_picture`.
+            pixels: of `plan_picture`.
+        """
+        image = Image.fromarray(plan)
+        draw = ImageDraw.Draw(image)
+        if step:
+            draw.line([tuple(p) for p in pixels(self.xy_w[: step + 1])], fill=BLUE, width=2)
+        x, y = pixels(self.journey.goal_xy_w[0])
+        draw.ellipse((x - 7, y - 7, x + 7, y + 7), outline=GREEN, width=3)
+        here, yaw = self.xy_w[step], self.yaw_rad[step]
+        nose = here + 0.5 * np.array([np.cos(yaw), np.sin(yaw)])
+        x, y = pixels(here)
+        draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=RED)
+        draw.line([(x, y), tuple(pixels(nose))], fill=RED, width=3)
+        said = f"{self.scene}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}"
+        draw.text((6, 4), said, fill=(0, 0, 0))
+        view = self.views.get(step)
+        if view is None:
+            return np.asarray(image)
+        width = int(round(len(plan) * view.shape[1] / view.shape[0] / 2)) * 2
+        seen = Image.fromarray(view).resize((width, len(plan)), Image.Resampling.NEAREST)
+        return np.concatenate([np.asarray(image), np.asarray(seen)], 1)
 
 
 def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callable[[float], None]) -> Driven:
@@ -109,7 +147,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         seen_at.append((time_s, seen.xy_w[0], seen.yaw_rad[0], int(state.phase[0])))
         told.extend(f"{time_s:7.1f} s  {said}" for said in _said(made, state, events))
 
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, contest.config, watch)
+    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, watch)
     played = play(player, venue.simulator, journey, contest.config, lambda _, time_s: progress(time_s))
     assert player.state is not None
     time_s, xy, yaw, phase = zip(*seen_at, strict=True)
@@ -121,7 +159,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         journey,
         played,
         int(player.state.goal[0]),
-        contest.config.passable,
+        contest.config.navigator.passable,
         np.array(time_s),
         np.array(xy),
         np.array(yaw),
@@ -160,17 +198,5 @@ def film(driven: Driven, path: Path) -> int:
         max(1, round(FILM_EVERY_S / max(driven.time_s[1] - driven.time_s[0], 1e-3))) if len(driven.time_s) > 1 else 1
     )
 
-    def frames() -> Iterator[np.ndarray]:
-        for step in range(0, len(driven.time_s), every):
-            said = f"{driven.scene}  {driven.time_s[step]:.0f} s  {PHASES[driven.phase[step]]}"
-            yield video_frame(
-                plan,
-                pixels,
-                driven.xy_w[: step + 1],
-                float(driven.yaw_rad[step]),
-                driven.journey.goal_xy_w[0],
-                driven.views.get(step),
-                said,
-            )
-
-    return write_video(frames(), path, FILM_RATE)
+    steps = range(0, len(driven.time_s), every)
+    return write_video((driven.frame(step, plan, pixels) for step in steps), path, FILM_RATE)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 
@@ -21,6 +23,19 @@ def nearest_node(queries: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np
     best = squares.argmin(1)
     gap = np.linalg.norm(queries - flat[best], axis=-1)
     return (best // nodes.shape[1]).astype(np.int32), gap.astype(np.float32)
+
+
+def in_words(scores: Mapping[str, float]) -> str:
+    """Scores of `localisation_scores`, or means of them."""
+    return (
+        f"nearest node {scores['node']:.3f}, right room {scores['room']:.3f}, "
+        f"median error {scores['error_m']:.2f} m (least possible {scores['least_error_m']:.2f} m)"
+    )
+
+
+def nearest_turn(angle_rad: np.ndarray, count: int) -> np.ndarray:
+    """[...] int: which of so many headings, evenly from the world's x axis on, is nearest to each angle."""
+    return np.rint(angle_rad / (2 * np.pi) * count).astype(int) % count
 
 
 def localisation_scores(

@@ -143,7 +143,7 @@ def vicreg_loss(a: jax.Array, b: jax.Array) -> jax.Array:
     invariance = jnp.square(a - b).mean()
     spread, shared = jnp.float32(0.0), jnp.float32(0.0)
     for z in (a, b):
-        z = z - z.mean(0)
+        z = z - z.mean(0, keepdims=True)
         spread += nn.relu(1.0 - jnp.sqrt(z.var(0, ddof=1) + 1e-4)).mean() / 2
         covariance = z.T @ z / (n - 1)
         shared += (jnp.square(covariance).sum() - jnp.square(jnp.diag(covariance)).sum()) / d
@@ -170,7 +170,8 @@ def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:
     )
     dy, dx = max(height // 16, 1), max(width // 16, 1)
     padded = jnp.pad(x, ((0, 0), (dy, dy), (dx, dx), (0, 0)), mode="edge")
-    at = jax.random.randint(key_shift, (n, 2), 0, jnp.asarray([2 * dy + 1, 2 * dx + 1]))
+    places = jnp.broadcast_to(jnp.asarray([2 * dy + 1, 2 * dx + 1]), (n, 2))
+    at = jax.random.randint(key_shift, (n, 2), 0, places)
     x = jax.vmap(lambda p, a: jax.lax.dynamic_slice(p, (a[0], a[1], 0), (height, width, 3)))(padded, at)
     if flip:
         x = jnp.where(jax.random.bernoulli(key_flip, 0.5, (n, 1, 1, 1)), x[:, :, ::-1], x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,30 @@ def load_pair(localiser_run: Path, detector_run: Path, same: Sequence[str] = SAM
         need_task(network.about, task, f"{run}:")
     _need_one_camera(*networks, same)
     return networks
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """What a navigator sees by."""
+
+    localiser: Trained
+    detector: Trained
+    camera: DataConfig
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Of the weights, as a map names those that made it."""
+        return {"localiser": self.localiser.about["digest"], "detector": self.detector.about["digest"]}
+
+
+def load_networks(localiser: Path, detector: Path) -> Networks:
+    """The networks of two finished runs; the first may be of either task, as any embedding localises.
+
+    Raises:
+        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
+    """
+    pair = load_trained(localiser), load_trained(detector)
+    return Networks(*pair, camera_of(*pair))
 
 
 def camera_of(localiser: Trained, detector: Trained) -> DataConfig:

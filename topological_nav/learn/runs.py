@@ -21,7 +21,7 @@ from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.metrics_file import read_metrics
 from interactive_nav_common.versions import versions
-from topological_nav.errors import RunError, readable
+from topological_nav.errors import Asked, RunError, Stopped, readable
 
 CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
 WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
@@ -70,9 +70,9 @@ def run_epochs(
     epochs: int,
     key: jax.Array,
     tell: Callable[[str], None],
-    should_stop: Callable[[], bool],
+    should_stop: Asked,
     checkpoint: str = CHECKPOINT,
-) -> State | None:
+) -> State:
     """Epochs of one phase of a run; those that the checkpoint holds are not run again.
 
     Args:
@@ -87,10 +87,11 @@ def run_epochs(
         checkpoint: its file; one that holds another phase is written over.
 
     Returns:
-        The learner; None where a stop was asked for.
+        The learner.
 
     Raises:
         RunError: a damaged checkpoint, or a loss that is not finite.
+        Stopped: it was asked for; the epoch before it is kept.
     """
     saved, first = read_checkpoint(out / checkpoint), 0
     if saved and saved.get("phase", phase) == phase:
@@ -116,7 +117,7 @@ def run_epochs(
                 partial.write_bytes(flax.serialization.msgpack_serialize(jax.device_get(state)))
             saved_at = now
         if stop:
-            return None
+            raise Stopped(stop)
     return learner
 
 

@@ -27,7 +27,7 @@ from interactive_nav_common.config import to_dict
 from topological_nav.config import PITCHES, TrainConfig
 from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
-from topological_nav.errors import RunError, readable
+from topological_nav.errors import Asked, RunError, go_on, readable
 from topological_nav.learn.learning import (
     Learner,
     in_batches,
@@ -136,8 +136,8 @@ def train(
     out: Path,
     config: TrainConfig,
     tell: Callable[[str], None] = lambda _: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> dict[str, Any] | None:
+    should_stop: Asked = go_on,
+) -> dict[str, Any]:
     """Trains a network, or goes on with it.
 
     Args:
@@ -149,11 +149,12 @@ def train(
         should_stop: asked after every epoch.
 
     Returns:
-        The content of results.json; None where it was stopped before the end.
+        The content of results.json.
 
     Raises:
         DatasetError: the dataset cannot be used.
         RunError: `out` holds another run, or the backbone to start from does not fit.
+        Stopped: it was asked for before the end.
     """
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
@@ -166,16 +167,12 @@ def train(
             learner = _learned_without_labels(learner, work.places, out, config, tell, should_stop)
         elif config.init != "scratch":
             learner = _started_from(learner, Path(config.init))
-        if learner is None:
-            return None
         epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
         shown, truth, key = jnp.asarray(work.images), jnp.asarray(work.labels), _key(config, 2)
         learner = run_epochs(
             out, "labels", learner, lambda state, _, key: epoch(state, shown, truth, key), config.epochs, key, tell,
             should_stop,
         )  # fmt: skip
-        if learner is None:
-            return None
         variables = {"params": learner.params, "batch_stats": learner.batch_stats}
         trained = save_trained(out, Trained(network, variables, _about(header, work, config, learner)))
         return write_results(out, _scores(trained, work))
@@ -191,9 +188,9 @@ def _learned_without_labels(
     out: Path,
     config: TrainConfig,
     tell: Callable[[str], None],
-    should_stop: Callable[[], bool],
-) -> Learner | None:
-    """The learner with a backbone that learned from pairs of images; None where it was stopped."""
+    should_stop: Asked,
+) -> Learner:
+    """The learner with a backbone that learned from pairs of images."""
     saved = read_checkpoint(out / CHECKPOINT)
     if saved and saved["phase"] != "pairs":
         return learner  # a checkpoint of the later phase holds this one's outcome
@@ -204,7 +201,7 @@ def _learned_without_labels(
         out, "pairs", make_learner(contrast, places.shape[2:4], tx, config.seed),
         lambda state, _, key: epoch(state, shown, none, key), config.selfsup_epochs, _key(config, 1), tell, should_stop,
     )  # fmt: skip
-    return paired and with_backbone(learner, {"params": paired.params, "batch_stats": paired.batch_stats})
+    return with_backbone(learner, {"params": paired.params, "batch_stats": paired.batch_stats})
 
 
 def _about(header: dict[str, Any], work: _Work, config: TrainConfig, learner: Learner) -> dict[str, Any]:

@@ -19,15 +19,16 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
-from topological_nav.data.dataset import headings, lens_of
+from topological_nav.data.dataset import headings
+from topological_nav.data.folders import lens_of
 from topological_nav.errors import SpaceError
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import load_trained
+from topological_nav.learn.localise import nearest_turn
+from topological_nav.learn.pairs import load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
-from topological_nav.scenes.rooms import Rooms, find_rooms, recorded_rooms
+from topological_nav.scenes.rooms import Rooms, scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
 
 CHUNK = 252
@@ -71,12 +72,12 @@ def build_map(
         RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
         SceneError, SpaceError: the scene cannot be used.
     """
-    localiser, detector = load_trained(localiser_run), load_trained(detector_run)
-    data = drawn_for(camera_of(localiser, detector), config.supersample)
+    networks = load_networks(localiser_run, detector_run)
+    localiser, detector = networks.localiser, networks.detector
+    data = drawn_for(networks.camera, config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)
-    known = recorded_rooms(scene.digest)
-    rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
+    rooms = scene_rooms(scene, space, data)
     judged = overlay(DataConfig(), detector.about["data"], str(detector_run))
     margin_m, points = judged.passage_margin_m, judged.passage_points
     xy, lacking = place_nodes(space, rooms, config, margin_m, points)
@@ -89,18 +90,18 @@ def build_map(
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
         if config.edge_image == "nearest":
-            turn = np.rint(angle / (2 * np.pi) * len(around)).astype(int) % len(around)
-            looked = images[edges[:, 0], turn]
+            looked = images[edges[:, 0], nearest_turn(angle, len(around))]
         else:
             pictures.total += len(edges)
             looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
         return detector.passage(looked, lengths(xy, edges))
 
-    networks = {"localiser": localiser.about["digest"], "detector": detector.about["digest"]}
-    about = {"settings": to_dict(config), "data": to_dict(data), **networks, "margin_m": margin_m, "points": points}
+    judging = {**networks.digests, "margin_m": margin_m, "points": points}
+    about = {"settings": to_dict(config), "data": to_dict(data), **judging}
     made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
     free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
-    scores = _scores(made, free, config, lacking)
+    scores = {"nodes a room": " ".join(map(str, np.bincount(made.room))), **edge_scores(made, free, config.passable)}
+    scores |= {"lacking": "; ".join(lacking)} if lacking else {}
     if config.check:
         places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
         looked = pictures.draw_around(places, around, "check")
@@ -229,15 +230,11 @@ def forget(parts: Path) -> None:
         parts.rmdir()
 
 
-def _scores(made: TopologicalMap, free: np.ndarray, config: MapConfig, lacking: list[str]) -> dict[str, Any]:
-    open_ = made.p >= config.passable
-    parts = made.open_parts(config.passable)
-    scores: dict[str, Any] = {
-        "nodes a room": " ".join(str(n) for n in np.bincount(made.room)),
+def edge_scores(made: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:
+    """How a map's edges compare with the plan, and what open ones join, in words; see `Built`."""
+    open_, parts = made.p >= passable, made.open_parts(passable)
+    return {
         "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
         "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
         "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
     }
-    if lacking:
-        scores["lacking"] = "; ".join(lacking)
-    return scores

@@ -16,14 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import networkx as nx
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_arrays
 from topological_nav.errors import MapError, readable
-from topological_nav.learn.localise import nearest_node
 
 FORMAT = 1
 """Of map files; raised whenever older ones would be read wrongly."""
@@ -36,8 +34,6 @@ class Route:
     """A way through a map."""
 
     nodes: tuple[int, ...]
-    angles_rad: tuple[float, ...]
-    """Absolute heading of each leg, one fewer than nodes."""
     cost: float
     """Sum of the legs' weights."""
 
@@ -71,16 +67,6 @@ class TopologicalMap:
         """[E] of the edges."""
         return lengths(self.xy_w, self.edges)
 
-    @functools.cached_property
-    def graph(self) -> nx.DiGraph:
-        """The edges with `weight`, `p` and `angle_rad`."""
-        graph = nx.DiGraph()
-        graph.add_nodes_from(range(len(self.xy_w)))
-        rows = zip(self.edges.tolist(), self.weight.tolist(), self.p.tolist(), self.angle_rad.tolist(), strict=True)
-        for (a, b), weight, p, angle in rows:
-            graph.add_edge(a, b, weight=weight, p=p, angle_rad=angle)
-        return graph
-
     def plan(self, start: int, goal: int) -> Route:
         """The cheapest way between two nodes, by Dijkstra's algorithm.
 
@@ -90,13 +76,13 @@ class TopologicalMap:
         for node in (start, goal):
             if not 0 <= node < len(self.xy_w):
                 raise MapError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
-        try:
-            found: Any = nx.single_source_dijkstra(self.graph, start, goal)
-        except nx.NetworkXNoPath:
-            raise MapError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser") from None
-        cost, nodes = found
-        angles = tuple(self.graph.edges[a, b]["angle_rad"] for a, b in zip(nodes, nodes[1:], strict=False))
-        return Route(tuple(nodes), angles, float(cost))
+        cost, before = dijkstra(self._matrix(self.weight), indices=start, return_predecessors=True)
+        if not np.isfinite(cost[goal]):
+            raise MapError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser")
+        nodes = [goal]
+        while nodes[-1] != start:
+            nodes.append(int(before[nodes[-1]]))
+        return Route(tuple(reversed(nodes)), float(cost[goal]))
 
     @functools.cached_property
     def weight(self) -> np.ndarray:
@@ -126,20 +112,15 @@ class TopologicalMap:
         return self._left_to(self.weight, np.arange(len(self.xy_w)))
 
     def _left_to(self, weight: np.ndarray, goals: np.ndarray | int) -> np.ndarray:
-        size = len(self.xy_w)
-        back = csr_array((weight, (self.edges[:, 1], self.edges[:, 0])), shape=(size, size))
-        return np.asarray(dijkstra(back, indices=goals))
+        return np.asarray(dijkstra(self._matrix(weight).T, indices=goals))
 
-    def localise(self, embeddings: np.ndarray) -> np.ndarray:
-        """[Q] i32: the node nearest to each embedding [Q, D], over all images of all nodes."""
-        return nearest_node(embeddings, self.embeddings)[0]
+    def _matrix(self, weight: np.ndarray) -> csr_array:
+        """[N, N] weights of the edges from each node (row) to others."""
+        return csr_array((weight, tuple(self.edges.T)), shape=(len(self.xy_w),) * 2)
 
     def open_parts(self, passable: float) -> list[list[int]]:
         """Nodes that reach each other, both ways, along edges with at least this probability; largest part first."""
-        kept = [(a, b) for a, b, p in self.graph.edges(data="p") if p >= passable]
-        graph = nx.DiGraph(kept)
-        graph.add_nodes_from(self.graph)
-        return sorted((sorted(part) for part in nx.strongly_connected_components(graph)), key=lambda p: (-len(p), p))
+        return parts_of(self.edges[self.p >= passable], len(self.xy_w), both_ways=True)
 
     def thinned(self, share: float, seed: int) -> TopologicalMap:
         """The map with fewer nodes: a sparse one that may fall apart.
@@ -167,6 +148,20 @@ class TopologicalMap:
             angle_rad=self.angle_rad[edges],
             about={**self.about, "thinned": share, "thinned_seed": seed},
         )
+
+
+def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[list[int]]:
+    """Nodes that edges join, the largest part first.
+
+    Args:
+        edges: [E, 2].
+        count: of nodes.
+        both_ways: edges are directed, and nodes of a part must reach each other.
+    """
+    joined = csr_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
+    _, label = connected_components(joined, directed=both_ways, connection="strong")
+    parts = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
+    return sorted(parts, key=lambda part: (-len(part), part))
 
 
 def edge_weight(p: float) -> float:
@@ -235,12 +230,8 @@ _ARRAYS = ("xy_w", "room", "embeddings", "edges", "p", "angle_rad")
 def save_map(made: TopologicalMap, path: Path) -> None:
     """Writes a map as one npz file, whole or not at all."""
     header = {"format": FORMAT, "scene": made.scene, "digest": made.digest, "about": made.about}
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez_compressed(
-            file,
-            header=np.frombuffer(json.dumps(header).encode(), np.uint8),
-            **{name: getattr(made, name) for name in _ARRAYS},
-        )  # type: ignore[arg-type]
+    arrays = {name: getattr(made, name) for name in _ARRAYS}
+    write_arrays(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
 def load_map(path: Path, digest: str | None = None) -> TopologicalMap:

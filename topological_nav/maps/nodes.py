@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import networkx as nx
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.distance import cdist
 
 from topological_nav.config import MapConfig
-from topological_nav.maps.graph import near_pairs
+from topological_nav.maps.graph import near_pairs, parts_of
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.space import FreeSpace
 
@@ -94,13 +93,10 @@ def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, po
     room_m = space.at(cells)
     lattice = _lattice(index, space.resolution_m * (1.0 + TIGHT_COST * np.clip(1.0 - room_m / ROOMY_M, 0.0, 1.0)))
     while True:
-        graph = nx.Graph()
-        graph.add_nodes_from(range(len(xy)))
-        graph.add_edges_from(free_edges(space, xy, edge_m, margin_m, points).tolist())
-        parts = sorted(nx.connected_components(graph), key=lambda part: (-len(part), min(part)))
+        parts = parts_of(free_edges(space, xy, edge_m, margin_m, points), len(xy))
         at = np.array([index.get(tuple(c), -1) for c in space.cells(xy)])
         for part in parts[1:]:
-            mine = np.array(sorted(part))
+            mine = np.array(part)
             others = np.setdiff1d(np.arange(len(xy)), mine)
             mine, others = mine[at[mine] >= 0], others[at[others] >= 0]
             if not len(mine) or not len(others):

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from topological_nav.errors import MapError
+from topological_nav.learn.localise import nearest_turn
 from topological_nav.learn.training import Trained
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
@@ -69,7 +70,7 @@ class NetworkSight:
         asked = self._localiser.embed(images).astype(float)
         nodes, around = self._nodes, self._nodes.shape[1]
         if self.summed:
-            turn = np.rint(np.asarray(heading_rad) / (2 * np.pi) * around).astype(int) % around
+            turn = nearest_turn(np.asarray(heading_rad), around)
             out = np.empty((len(asked), len(nodes)))
             for k in np.unique(turn):
                 rows = turn == k

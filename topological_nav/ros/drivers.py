@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from topological_nav.ros.config import HeadingConfig
 
 if TYPE_CHECKING:
     from interactive_nav.sensing.base import Lens
+    from topological_nav.navigate.navigator import Pilot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,19 +69,6 @@ class HeadingDriver:
         return Command(config.linear_mps, turn)
 
 
-class Pilot(Protocol):
-    """The navigator, with its memory: what `topological_nav.navigate.navigator.Pilot` is for a batch of one."""
-
-    def step(
-        self, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
-    ) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Images [1, H, W, 3], headings [1] and time to linear [1] and angular [1] velocity, and events.
-
-        Of the events, `arrived` and `timed_out` [1] bool are looked at.
-        """
-        ...
-
-
 class PilotDriver:
     """The navigator as a driver: it is done where it arrived, or ran out of time."""
 
@@ -88,7 +76,7 @@ class PilotDriver:
         """Takes what it needs.
 
         Args:
-            pilot: of one episode, its goal known to it.
+            pilot: a batch of one, its goal known to it.
             lens: that its networks learned through.
         """
         self._pilot, self.lens = pilot, lens

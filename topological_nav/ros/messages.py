@@ -169,14 +169,6 @@ def scan_fields(
     }
 
 
-def scan_points(message: Any) -> np.ndarray:
-    """[n, 2] m: where the beams of a sensor_msgs/LaserScan end, in its own frame; without those that met nothing."""
-    ranges = np.asarray(message.ranges, float)
-    angle = message.angle_min + np.arange(len(ranges)) * message.angle_increment
-    met = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
-    return np.stack([ranges[met] * np.cos(angle[met]), ranges[met] * np.sin(angle[met])], -1)
-
-
 def yaw_quat(yaw_rad: float) -> dict[str, float]:
     """geometry_msgs/Quaternion of a turn about z."""
     return {"x": 0.0, "y": 0.0, "z": math.sin(yaw_rad / 2), "w": math.cos(yaw_rad / 2)}

@@ -12,11 +12,11 @@ from PIL import Image
 from interactive_nav.robots import get_robot
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
-from topological_nav.data.dataset import lens_of
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import load_trained
+from topological_nav.data.folders import lens_of
+from topological_nav.drives.driving import local_policy
+from topological_nav.learn.pairs import load_networks
 from topological_nav.maps.graph import load_map
-from topological_nav.maps.sight import NetworkSight, PassagePolicy
+from topological_nav.maps.sight import NetworkSight
 from topological_nav.navigate.navigator import Navigator, Pilot
 from topological_nav.ros.drivers import PilotDriver
 from topological_nav.ros.messages import seen_through
@@ -46,17 +46,11 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
         MapError, RunError: map or networks cannot be used, or do not belong together.
         ConfigError: no goal picture, or one that cannot be read.
     """
-    networks = load_trained(journey.localiser), load_trained(journey.detector)
-    camera, made = camera_of(*networks), load_map(journey.map)
-    lens = lens_of(camera, get_robot(camera.robot))
-    sight = NetworkSight(made, *networks, config.match)
-    if journey.policy == PASSAGE_POLICY:
-        policy = PassagePolicy(sight, config.passable, config.clear_m)
-    else:
-        from topological_nav.drives import driving
-
-        seeing = (journey.localiser, networks[0]), (journey.detector, networks[1])
-        policy = driving.load_policy_beside(journey.policy, *seeing)
+    networks, made = load_networks(journey.localiser, journey.detector), load_map(journey.map)
+    lens = lens_of(networks.camera, get_robot(networks.camera.robot))
+    sight = NetworkSight(made, networks.localiser, networks.detector, config.match)
+    seeing = (journey.localiser, networks.localiser), (journey.detector, networks.detector)
+    policy = local_policy(journey.policy, sight, config, *seeing)
     if not journey.goals:
         raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in journey.goals])

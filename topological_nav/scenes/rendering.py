@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from interactive_nav.pictures.gl import GlPainter
+from interactive_nav.pictures.scene_model import SCENE, picture_spec
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
@@ -27,8 +29,6 @@ DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
 """Least and most images a call on an accelerator, and the most pixels drawn for them."""
 Painter = Callable[[np.ndarray, np.ndarray], Any]
 """Positions [n, 3] and axes [n, 3, 3] of cameras to images [n, H, W, 3] u8, in an array of any kind."""
-_SHOWN = 2
-"""Geom group of all that is drawn."""
 
 
 def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pitch_rad: np.ndarray) -> CameraPose:
@@ -134,7 +134,7 @@ class SceneRenderer:
     def _warp_painter(self, size: int) -> Painter:
         from interactive_nav.sensing.warp import WarpColour
 
-        painter = WarpColour(self._model, self._large, size, [_SHOWN])
+        painter = WarpColour(self._model, self._large, size, list(SCENE))
         xpos = jnp.asarray(np.tile(self._data.geom_xpos, (size, 1, 1)), jnp.float32)
         xmat = jnp.asarray(np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (size, 1, 1, 1)), jnp.float32)
 
@@ -145,11 +145,10 @@ class SceneRenderer:
         return lambda pos, axes: paint(xpos, xmat, pos, axes)
 
     def _gl_painter(self) -> Painter:
-        from topological_nav.scenes.gl import GlPainter
-
-        painter, by = GlPainter(self._model, self._data, self._large, _SHOWN), self._by
+        data, lens, by = self._data, self._large, self._by
+        painter = GlPainter(self._model, lens.width, lens.height)
         # Without `self`: a context holds some 100 MiB, and goes with its renderer, not when cycles are collected.
-        return lambda pos, axes: shrink(painter.draw(pos, axes), by)
+        return lambda pos, axes: shrink(painter.draw(data, CameraPose(pos, axes), lens.fov_deg, SCENE), by)
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
@@ -198,25 +197,12 @@ def shrink(images: Any, by: int) -> Any:
 
 
 def _visual_model(scene: Scene, lens: Lens) -> mujoco.MjModel:
-    """The scene's visual meshes and floor in one group; boxes stand for bodies without a mesh."""
-    spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
-    with_mesh = {g.parent.name for g in spec.geoms if g.group == _SHOWN}
-    for geom in list(spec.geoms):
-        plane, box = geom.type == mujoco.mjtGeom.mjGEOM_PLANE, geom.type == mujoco.mjtGeom.mjGEOM_BOX
-        shown = geom.group == _SHOWN or plane or (box and geom.parent.name not in with_mesh)
-        geom.group = _SHOWN if shown else 4
-        if plane:
-            geom.rgba = [0.56, 0.50, 0.43, 1.0]
-    for camera in list(spec.cameras):
-        spec.delete(camera)  # MJX-Warp would draw through every camera of the model
+    """The scene's visual meshes and floor; boxes stand for bodies without a mesh."""
+    spec = picture_spec(scene)
     if not any(body.joints for body in spec.bodies):
         # MJX-Warp wants at least one degree of freedom.
         body = spec.worldbody.add_body(name="unseen", pos=[0, 0, -60.0])
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE)
         body.mass, body.inertia, body.explicitinertial = 1.0, np.ones(3), True
-    spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
-    spec.worldbody.add_camera(name="view", fovy=lens.fov_deg)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = max(lens.width, 640), max(lens.height, 480)
-    spec.stat.extent = 1.0  # the clipping planes are given as shares of the extent
-    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 100.0
     return spec.compile()

@@ -19,7 +19,7 @@ from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.scene import Scene, load_scene
 from topological_nav.config import DataConfig
 from topological_nav.errors import SpaceError
 from topological_nav.scenes.plans import RECORDED
@@ -129,6 +129,12 @@ def find_rooms(
     if count > len(points):
         raise SpaceError(f"{count} rooms in {len(points)} free cells; expected fewer rooms or a finer map")
     return Rooms(points, cluster(points, method, count, seed), method, by)
+
+
+def scene_rooms(scene: Scene, space: FreeSpace, config: DataConfig) -> Rooms:
+    """A scene's rooms as a dataset of these settings has them; see `find_rooms`."""
+    known = recorded_rooms(scene.digest)
+    return find_rooms(space, config.room_method, config.num_rooms, known, config.seed, config.clearance_m)
 
 
 def recorded_rooms(digest: str) -> np.ndarray | None:

@@ -60,7 +60,7 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
         UserError: the backend is not installed.
     """
     need_engine(backend)
-    config = NavConfig(
+    config = NavConfig.of(
         backend=backend,
         control_mode=CONTROL,
         num_objects=0,
@@ -75,11 +75,11 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
     return InteractiveNav(spec, (scene,), config)
 
 
-def episode_starts(start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, objects: int) -> EpisodeStart:
-    """Starts of B episodes in an environment's first scene, small objects left out."""
+def episode_starts(start_xy_w: Any, yaw_rad: Any, goal_xy_w: Any, objects: int, scene: Any = 0) -> EpisodeStart:
+    """Starts of B episodes, in scenes [B] or one of an environment, small objects left out."""
     batch = len(start_xy_w)
     return EpisodeStart(
-        scene_index=jnp.zeros(batch, jnp.int32),
+        scene_index=jnp.broadcast_to(jnp.asarray(scene, jnp.int32), batch),
         start_xy_w=jnp.asarray(start_xy_w, jnp.float32),
         start_yaw_rad=jnp.asarray(yaw_rad, jnp.float32),
         goal_xy_w=jnp.asarray(goal_xy_w, jnp.float32),

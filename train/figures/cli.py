@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError, UserError
+from interactive_nav_common.errors import FileError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
@@ -23,6 +22,7 @@ from train.figures.frontier import frontier
 from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
+from train.scoring.row_files import PATHS
 from train.scoring.statistics import run_means
 
 import matplotlib.pyplot as plt  # isort: skip
@@ -43,9 +43,10 @@ class Results:
         self.root = root
         logs = sorted([*root.rglob(METRICS), *root.rglob(PACKED_METRICS)])
         self.curves = {log.parent: lines for log in logs if (lines := read_metrics(log))}
-        records = [path for path in sorted(root.rglob("*.npz")) if "checkpoints" not in path.parts]
+        # What begins with a dot is unfinished.
+        records = [path for path in sorted(root.rglob("[!.]*.npz")) if "checkpoints" not in path.parts]
         self.records = [path for path in records if not path.parent.name.startswith("diverged-")]
-        self.tables = [p for p in sorted(root.rglob("*.parquet")) if not p.name.startswith(".")]
+        self.tables = sorted(root.rglob("[!.]*.parquet"))
         if not self.curves and not self.records and not self.tables:
             raise FileError(
                 f"{root}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
@@ -126,7 +127,7 @@ def _of_sweep(found: Results, split: str | None) -> Iterator[tuple[str, Callable
     for path in found.records:
         name, _, asked = path.stem.rpartition("-")  # the same digest: the same episodes
         r = runs.get(name)
-        if r is not None and path.parent.name == "_paths":
+        if r is not None and path.parent.name == PATHS:
             groups.setdefault((r["robot"], r["algorithm"], r["seed"], asked), {})[r["k_int"]] = path
     drawn = set()
     for key, by_k_int in sorted(groups.items()):
@@ -177,29 +178,26 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+@reports_errors("train.figures")
 def main(argv: Sequence[str] | None = None) -> int:
     """Draws; 0 when done, 2 on a user's error."""
     arguments = parser().parse_args(argv)
     split = None if arguments.split == "all" else arguments.split
-    try:
-        if arguments.tables:
-            found = Results(Path(arguments.results))
-            if not set(found.rows.column_names) >= SWEPT or not run_means(found.rows):
-                raise FileError(
-                    f"{arguments.results}: no rows of learned runs; evaluate them first (python -m train.sweep FILE "
-                    "--only evaluate, or python -m train.evaluate RUN_DIR)"
-                )
-            print(document(found.rows, chosen_split(found.rows, split)), end="")
-            return 0
-        for name, draw in figures_of(Path(arguments.results), split):
-            path = Path(arguments.out) / f"{name}.{arguments.format}"
-            with style.applied():
-                figure = draw()
-                with whole_file(path) as partial:
-                    figure.savefig(partial, format=arguments.format)
-            plt.close(figure)
-            print(path)
-    except UserError as error:
-        print(f"train.figures: {error}", file=sys.stderr)
-        return 2
+    if arguments.tables:
+        found = Results(Path(arguments.results))
+        if not set(found.rows.column_names) >= SWEPT or not run_means(found.rows):
+            raise FileError(
+                f"{arguments.results}: no rows of learned runs; evaluate them first (python -m train.sweep FILE "
+                "--only evaluate, or python -m train.evaluate RUN_DIR)"
+            )
+        print(document(found.rows, chosen_split(found.rows, split)), end="")
+        return 0
+    for name, draw in figures_of(Path(arguments.results), split):
+        path = Path(arguments.out) / f"{name}.{arguments.format}"
+        with style.applied():
+            figure = draw()
+            with whole_file(path) as partial:
+                figure.savefig(partial, format=arguments.format)
+        plt.close(figure)
+        print(path)
     return 0

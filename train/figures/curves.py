@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -33,7 +32,7 @@ def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
     Args:
         runs: name -> lines of its metrics.jsonl.
     """
-    figure, axes = plt.subplots(1, len(CURVES), figsize=(4 * len(CURVES), 3.2), layout="constrained")
+    figure, (axes,) = style.panels((4 * len(CURVES), 3.2), 1, len(CURVES))
     for axis, (key, label) in zip(axes, CURVES, strict=True):
         for name, lines in runs.items():
             seen = [(line["env_steps"], line[key]) for line in lines if key in line]
@@ -88,39 +87,30 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
     return (sums[..., high] - sums[..., low]) / (high - low)
 
 
-Cell = tuple[str, str, float]
-"""Robot, algorithm, k_int."""
-
-
-def cell_curves(cells: Mapping[Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
+def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
     """Goals reached, INS_0.5 and reward of training episodes over env steps: a line a cell, with its seeds' interval.
 
     Args:
         cells: (robot, algorithm, k_int) -> lines of metrics of each of its runs.
     """
-    robots = sorted({cell[0] for cell in cells}, reverse=True)
-    algorithms = style.in_order({cell[1] for cell in cells})
-    k_ints = sorted({cell[2] for cell in cells})
-    with style.applied():
-        size = (3.3 * len(CELL_CURVES), 2.5 * len(robots) + 0.7)
-        figure, grid = plt.subplots(len(robots), len(CELL_CURVES), figsize=size, squeeze=False, layout="constrained")
-        seeds = set()
-        for (robot, algorithm, k_int), runs in sorted(cells.items()):
-            colour, marker = style.look(style.ALGORITHMS, algorithm, algorithms)
-            look = {"color": colour, "marker": marker, "markersize": 4, **style.look_of(k_int, k_ints)}
-            for axis, (key, _) in zip(grid[robots.index(robot)], CELL_CURVES, strict=True):
-                seeds |= _draw_cell(axis, key, [with_goal_rate(lines) for lines in runs], look)
-        for row, robot in zip(grid, robots, strict=True):
-            for axis, (key, label) in zip(row, CELL_CURVES, strict=True):
-                _label(axis, key, label)
-                axis.set_title(style.robot_name(robot))
-        handles = [*style.algorithm_handles(algorithms, 4), *style.k_int_handles(k_ints, 4)]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-        figure.suptitle(
-            f"training episodes that ended (exploring policy), mean of {style.seeds_text(seeds)}, 95 % t interval\n"
-            "before all environments have had the time of a whole episode, those that end are those that succeed",
-            fontsize=9,
-        )
+    looks = style.Looks(cells)
+    size = (3.3 * len(CELL_CURVES), 2.5 * len(looks.robots) + 0.7)
+    figure, grid = style.panels(size, len(looks.robots), len(CELL_CURVES))
+    seeds = set()
+    for (robot, algorithm, k_int), runs in sorted(cells.items()):
+        look = {**looks.algorithm(algorithm), "markersize": 4, **looks.k_int(k_int)}
+        for axis, (key, _) in zip(grid[looks.robots.index(robot)], CELL_CURVES, strict=True):
+            seeds |= _draw_cell(axis, key, [with_goal_rate(lines) for lines in runs], look)
+    for row, robot in zip(grid, looks.robots, strict=True):
+        for axis, (key, label) in zip(row, CELL_CURVES, strict=True):
+            _label(axis, key, label)
+            axis.set_title(style.robot_name(robot))
+    style.legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)])
+    figure.suptitle(
+        f"training episodes that ended (exploring policy), mean of {style.seeds_text(seeds)}, 95 % t interval\n"
+        "before all environments have had the time of a whole episode, those that end are those that succeed",
+        fontsize=9,
+    )
     return figure
 
 
@@ -131,10 +121,8 @@ def _draw_cell(axis: Any, key: str, runs: Sequence[Sequence[Mapping[str, Any]]],
         return set()
     values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
     points = [estimate(column) for column in values.T]
-    axis.plot(steps, [point.mean for point in points], markevery=max(1, len(steps) // 6), linewidth=1.2, **look)
-    bounds = BOUNDS.get(key, (-np.inf, np.inf))
-    low, high = (np.clip([getattr(p, end) for p in points], *bounds) for end in ("low", "high"))
-    axis.fill_between(steps, low, high, color=look["color"], alpha=0.12, linewidth=0)
+    look = {**look, "markevery": max(1, len(steps) // 6), "linewidth": 1.2}
+    style.draw_means(axis, steps, points, BOUNDS.get(key, style.ANY), **look)
     return {len(values)}
 
 

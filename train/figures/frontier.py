@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from interactive_nav_common.statistics import interval
-from train.figures.style import policy_colour
+from train.figures.style import panels, policy_colour
 
 
 def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
@@ -23,7 +22,7 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
     """
     names = np.asarray(rows["policy"])
     scores = {name: np.asarray(rows[name], float) for name in ("path_efficiency", "effort_efficiency")}
-    figure, axis = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
+    figure, ((axis,),) = panels((6.4, 5.2))
     swept: list[tuple[float, float, float]] = []
     for k, policy in enumerate(dict.fromkeys(names)):
         x, y = (values[names == policy] for values in scores.values())

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from train.figures import style
 from train.figures.style import policy_colour
 
 FURNITURE_COLOUR = "#ecd9b8"
@@ -40,24 +39,21 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
     aspects = [_aspect(paths, policies[0], i) for i in chosen]
     heights = [4.0 * max(aspects[k : k + columns]) + 0.9 for k in range(0, count, columns)]
     size = (4.4 * columns, sum(heights) + 0.6)
-    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", height_ratios=heights)
+    figure, grid = style.panels(size, rows, columns, height_ratios=heights)
     for axis in grid.flat[count:]:
         axis.set_axis_off()
     for axis, i in zip(grid.flat, chosen, strict=False):
         _draw_episode(axis, paths, policies, i)
-    handles = [
-        Line2D([], [], color=policy_colour(p, k), linestyle=LINES[k % len(LINES)], label=p)
-        for k, p in enumerate(policies)
-    ]
     grey: dict[str, Any] = {"color": "0.35", "linestyle": ""}
-    handles += [
-        Line2D([], [], marker="o", markerfacecolor="w", label="start", markersize=8, **grey),
-        Line2D([], [], marker="*", label="goal", markersize=11, **grey),
+    handles = [
+        *(style.handle(p, color=policy_colour(p, k), linestyle=LINES[k % len(LINES)]) for k, p in enumerate(policies)),
+        style.handle("start", marker="o", markerfacecolor="w", markersize=8, **grey),
+        style.handle("goal", marker="*", markersize=11, **grey),
         Patch(color=FURNITURE_COLOUR, label="furniture at start, as far as it bars the robot"),
-        Line2D([], [], marker="s", markerfacecolor="none", label="object at start", markersize=6, **grey),
-        Line2D([], [], marker="s", label="object at end (coloured by who moved it)", markersize=6, **grey),
+        style.handle("object at start", marker="s", markerfacecolor="none", markersize=6, **grey),
+        style.handle("object at end (coloured by who moved it)", marker="s", markersize=6, **grey),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    style.legend(figure, handles, 4, fontsize=8, frameon=False)
     return figure
 
 

@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from interactive_nav_common.statistics import estimate, p_text
 from train.figures import style
@@ -23,111 +21,78 @@ DOTS = 3000
 """Episodes drawn at most as dots."""
 FREE, WALLS = "0.7", "#e3b778"
 """Colours of episodes: that touched no wall, and that did."""
+EFFORT = ("kinematic_effort", "dynamic_effort")
 SPLITS = {"train": "seen (training) scenes", "test": "unseen (test) scenes", None: "all scenes"}
 
 
-class Legend:
-    """Values that a set of runs has on the sweep's axes."""
-
-    def __init__(self, means: Sequence[RunMean]):
-        self.robots = sorted({run.robot for run in means}, reverse=True)
-        self.algorithms = style.in_order({run.algorithm for run in means})
-        self.k_ints = sorted({run.k_int for run in means})
-        self.seeds = style.seeds_text({len(runs) for runs in cells(means).values()})
+def _robots_runs(rows: pa.Table, robot: str, split: str | None) -> list[RunMean]:
+    return [run for run in run_means(rows, split) if run.robot == robot]
 
 
 def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
     """INS_alpha over alpha (paper, figures 5 and 12): above a panel an algorithm, below a panel a k_int."""
-    means = [run for run in run_means(rows, split) if run.robot == robot]
-    has, by_cell = Legend(means), cells(means)
-    with style.applied():
-        wide = max(len(has.algorithms), len(has.k_ints))
-        size = (2.9 * wide, 6.0)
-        figure, grid = plt.subplots(
-            2, wide, figsize=size, squeeze=False, sharex=True, sharey=True, layout="constrained"
-        )
-        for axis in grid.flat:
-            axis.set_visible(False)
-        for (_, algorithm, k_int), runs in by_cell.items():
-            points = [estimate(run.ins(alpha) for run in runs) for alpha in ALPHAS]
-            colour, marker = style.look(style.ALGORITHMS, algorithm, has.algorithms)
-            places = (grid[0, has.algorithms.index(algorithm)], grid[1, has.k_ints.index(k_int)])
-            for axis, title in zip(places, (style.name_of(algorithm), f"k$_{{int}}$ = {k_int:g}"), strict=True):
-                axis.set_visible(True)
-                axis.set_title(title)
-                axis.plot(
-                    ALPHAS,
-                    [p.mean for p in points],
-                    color=colour,
-                    marker=marker,
-                    markevery=5,
-                    markersize=5,
-                    **style.look_of(k_int, has.k_ints),
-                )
-                axis.fill_between(
-                    ALPHAS, [p.low for p in points], [p.high for p in points], color=colour, alpha=0.13, linewidth=0
-                )
-        low, high = grid[0, 0].get_ylim()
-        grid[0, 0].set_ylim(max(low, -0.02), min(high, 1.02))  # no score lies outside, though an interval may
-        for axis in grid[:, 0]:
-            axis.set_ylabel("INS$_α$")
-        for axis in grid[1]:
-            axis.set_xlabel("α: 0 effort only, 1 path only")
-        for axis in grid[0]:
-            axis.tick_params(labelbottom=True)
-        handles = [*style.algorithm_handles(has.algorithms), *style.k_int_handles(has.k_ints)]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-        figure.suptitle(f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds}, 95 % t interval", fontsize=9)
+    by_cell = cells(_robots_runs(rows, robot, split))
+    looks = style.Looks(by_cell)
+    wide = max(len(looks.algorithms), len(looks.k_ints))
+    figure, grid = style.panels((2.9 * wide, 6.0), 2, wide, sharex=True, sharey=True)
+    for axis in grid.flat:
+        axis.set_visible(False)
+    for (_, algorithm, k_int), runs in by_cell.items():
+        points = [estimate(run.ins(alpha) for run in runs) for alpha in ALPHAS]
+        look = {**looks.algorithm(algorithm), **looks.k_int(k_int), "markevery": 5, "markersize": 5}
+        places = (grid[0, looks.algorithms.index(algorithm)], grid[1, looks.k_ints.index(k_int)])
+        for axis, title in zip(places, (style.name_of(algorithm), f"k$_{{int}}$ = {k_int:g}"), strict=True):
+            axis.set_visible(True)
+            axis.set_title(title)
+            style.draw_means(axis, ALPHAS, points, **look)
+    low, high = grid[0, 0].get_ylim()
+    grid[0, 0].set_ylim(max(low, -0.02), min(high, 1.02))  # no score lies outside, though an interval may
+    for axis in grid[:, 0]:
+        axis.set_ylabel("INS$_α$")
+    for axis in grid[1]:
+        axis.set_xlabel("α: 0 effort only, 1 path only")
+    for axis in grid[0]:
+        axis.tick_params(labelbottom=True)
+    style.legend(figure, [*looks.algorithm_handles(), *looks.k_int_handles()])
+    figure.suptitle(f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % t interval", fontsize=9)
     return figure
 
 
 def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
     """Path against effort efficiency of each cell (paper, figures 6 and 11), before those who never learned."""
-    means = [run for run in run_means(rows, split) if run.robot == robot]
-    has = Legend(means)
-    with style.applied():
-        figure, axis = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
-        for algorithm in has.algorithms:
-            colour, marker = style.look(style.ALGORITHMS, algorithm, has.algorithms)
-            _chain(axis, [run for run in means if run.algorithm == algorithm], has.k_ints, colour, marker)
-        _yardsticks(axis, rows, robot, split)
-        step = _finish_plane(axis)
-        handles = [*style.algorithm_handles(has.algorithms), *_without_line(style.k_int_handles(has.k_ints))]
-        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6))
-        axis.set_title(
-            f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {has.seeds}, 95 % t intervals\n"
-            f"grey lines: equal INS$_{{0.5}}$, steps of {step:g}"
-        )
+    means = _robots_runs(rows, robot, split)
+    looks = style.Looks(cells(means))
+    figure, ((axis,),) = style.panels((5.6, 4.9))
+    for algorithm in looks.algorithms:
+        runs = [run for run in means if run.algorithm == algorithm]
+        _chain(axis, runs, looks, looks.algorithm(algorithm))
+    _yardsticks(axis, rows, robot, split)
+    step = _finish_plane(axis)
+    handles = [*looks.algorithm_handles(), *looks.k_int_handles(linestyle="")]
+    style.legend(figure, handles, min(len(handles), 6))
+    axis.set_title(
+        f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % t intervals\n"
+        f"grey lines: equal INS$_{{0.5}}$, steps of {step:g}"
+    )
     return figure
 
 
 def robots_plane(rows: pa.Table, split: str | None) -> Figure:
     """Path against effort efficiency of each robot (paper, figure 9)."""
     means = run_means(rows, split)
-    has = Legend(means)
-    with style.applied():
-        wide = len(has.algorithms)
-        figure, grid = plt.subplots(
-            1, wide, figsize=(3.4 * wide + 0.6, 3.9), squeeze=False, sharex=True, sharey=True, layout="constrained"
-        )
-        for axis, algorithm in zip(grid[0], has.algorithms, strict=True):
-            for robot in has.robots:
-                colour, marker = style.look(style.ROBOTS, robot, has.robots)
-                runs = [run for run in means if (run.algorithm, run.robot) == (algorithm, robot)]
-                _chain(axis, runs, has.k_ints, colour, marker)
-            axis.set_title(style.name_of(algorithm))
-        _finish_plane(*grid[0])
-        for axis in grid[0, 1:]:
-            axis.set_ylabel("")
-        looks = {robot: style.look(style.ROBOTS, robot, has.robots) for robot in has.robots}
-        handles = [
-            Line2D([], [], color=c, marker=m, markersize=5, linestyle="-", label=style.robot_name(robot))
-            for robot, (c, m) in looks.items()
-        ]
-        figure.legend(
-            handles=[*handles, *_without_line(style.k_int_handles(has.k_ints))], loc="outside lower center", ncols=5
-        )
-        figure.suptitle(f"{SPLITS[split]}; mean of {has.seeds}, 95 % t intervals", fontsize=9)
+    looks = style.Looks(cells(means))
+    wide = len(looks.algorithms)
+    figure, grid = style.panels((3.4 * wide + 0.6, 3.9), 1, wide, sharex=True, sharey=True)
+    for axis, algorithm in zip(grid[0], looks.algorithms, strict=True):
+        for robot in looks.robots:
+            runs = [run for run in means if (run.algorithm, run.robot) == (algorithm, robot)]
+            _chain(axis, runs, looks, looks.robot(robot))
+        axis.set_title(style.name_of(algorithm))
+    _finish_plane(*grid[0])
+    for axis in grid[0, 1:]:
+        axis.set_ylabel("")
+    style.legend(figure, [*looks.robot_handles(), *looks.k_int_handles(linestyle="")], 5)
+    figure.suptitle(f"{SPLITS[split]}; mean of {looks.seeds}, 95 % t intervals", fontsize=9)
     return figure
 
 
@@ -137,50 +102,37 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
     Forces on walls count in the dynamic term, so episodes that touched one look different.
     """
     means = run_means(rows, split)
-    has = Legend(means)
+    looks = style.Looks(cells(means))
     episodes = learned_rows(rows, split)
     told = "structure_steps" in episodes.column_names
     touched = episodes["structure_steps"].to_numpy() > 0 if told else np.zeros(len(episodes), bool)
-    with style.applied():
-        wide = len(has.robots)
-        figure, grid = plt.subplots(1, wide, figsize=(3.9 * wide, 4.3), squeeze=False, layout="constrained")
-        for axis, robot in zip(grid[0], has.robots, strict=True):
-            chosen = np.asarray(episodes["robot"].to_pylist()) == robot
-            x, y = (episodes[name].to_numpy()[chosen] for name in ("kinematic_effort", "dynamic_effort"))
-            shown = np.random.default_rng(0).permutation(len(x))[:DOTS]
-            walls = touched[chosen][shown]
-            for at, colour, above in ((~walls, FREE, 2), (walls, WALLS, 1)):
-                axis.scatter(x[shown][at], y[shown][at], s=3, color=colour, linewidths=0, rasterized=True, zorder=above)
-            runs = [run for run in means if run.robot == robot]
-            for run in runs:
-                colour, marker = style.look(style.ALGORITHMS, run.algorithm, has.algorithms)
-                axis.plot(
-                    run.scores["kinematic_effort"],
-                    run.scores["dynamic_effort"],
-                    color=colour,
-                    marker=marker,
-                    fillstyle=style.fill_of(run.k_int, has.k_ints),
-                    markersize=6,
-                    linestyle="",
-                    zorder=3,
-                )
-            over_runs = correlation(
-                (run.scores["kinematic_effort"] for run in runs), (run.scores["dynamic_effort"] for run in runs)
-            )
-            axis.set_title(
-                f"{style.robot_name(robot)}\nr over runs: {over_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
-            )
-            axis.set_xlabel("kinematic term of E$_{eff}$")
-            axis.set_ylabel("dynamic term of E$_{eff}$")
-            low = max(0.0, 0.1 * np.floor(10 * min(x.min(), y.min())))
-            axis.set_xlim(low - 0.02, 1.02)
-            axis.set_ylim(low - 0.02, 1.02)
-            axis.set_aspect("equal")
-        kinds = ((FREE, "episode"), (WALLS, "episode that touched a wall")) if touched.any() else ((FREE, "episode"),)
-        dots: list[Any] = [Line2D([], [], color=c, marker=".", linestyle="", label=name) for c, name in kinds]
-        handles = _without_line([*style.algorithm_handles(has.algorithms), *style.k_int_handles(has.k_ints)])
-        figure.legend(handles=[*handles, *dots], loc="outside lower center", ncols=4)
-        figure.suptitle(SPLITS[split] or "", fontsize=9)
+    wide = len(looks.robots)
+    figure, grid = style.panels((3.9 * wide, 4.3), 1, wide)
+    for axis, robot in zip(grid[0], looks.robots, strict=True):
+        chosen = np.asarray(episodes["robot"].to_pylist()) == robot
+        x, y = (episodes[name].to_numpy()[chosen] for name in EFFORT)
+        shown = np.random.default_rng(0).permutation(len(x))[:DOTS]
+        walls = touched[chosen][shown]
+        for at, colour, above in ((~walls, FREE, 2), (walls, WALLS, 1)):
+            axis.scatter(x[shown][at], y[shown][at], s=3, color=colour, linewidths=0, rasterized=True, zorder=above)
+        runs = [run for run in means if run.robot == robot]
+        for run in runs:
+            look = {**looks.algorithm(run.algorithm), "fillstyle": looks.fill(run.k_int), "linestyle": ""}
+            axis.plot(*(run.scores[name] for name in EFFORT), markersize=6, zorder=3, **look)
+        over_runs = correlation(*([run.scores[name] for run in runs] for name in EFFORT))
+        axis.set_title(
+            f"{style.robot_name(robot)}\nr over runs: {over_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
+        )
+        axis.set_xlabel("kinematic term of E$_{eff}$")
+        axis.set_ylabel("dynamic term of E$_{eff}$")
+        low = max(0.0, 0.1 * np.floor(10 * min(x.min(), y.min())))
+        axis.set_xlim(low - 0.02, 1.02)
+        axis.set_ylim(low - 0.02, 1.02)
+        axis.set_aspect("equal")
+    kinds = ((FREE, "episode"), (WALLS, "episode that touched a wall"))[: 1 + bool(touched.any())]
+    dots = [style.handle(name, color=c, marker=".", linestyle="", markersize=6) for c, name in kinds]
+    style.legend(figure, [*looks.algorithm_handles(linestyle=""), *looks.k_int_handles(linestyle=""), *dots], 4)
+    figure.suptitle(SPLITS[split] or "", fontsize=9)
     return figure
 
 
@@ -188,67 +140,46 @@ def seen_and_unseen(rows: pa.Table) -> Figure:
     """INS_0.5 of each cell on training and on test scenes, with the test of the paper (figure 13)."""
     pairs, test = seen_unseen(rows)
     assert test is not None, "there are rows of both"
-    has = Legend([train for train, _ in pairs])
-    by_cell = cells([train for train, _ in pairs])
-    unseen = cells([test for _, test in pairs])
-    order = sorted(by_cell, key=lambda c: (has.robots.index(c[0]), has.algorithms.index(c[1]), c[2]))
-    with style.applied():
-        size = (max(5.6, 0.62 * len(order) + 1.4), 3.9)
-        figure, axis = plt.subplots(figsize=size, layout="constrained")
-        for i, cell in enumerate(order):
-            colour, marker = style.look(style.ALGORITHMS, cell[1], has.algorithms)
-            for runs, shift, fill in ((by_cell[cell], -0.14, "full"), (unseen[cell], 0.14, "none")):
-                e = estimate(run.ins(0.5) for run in runs)
-                bar = None if math.isnan(e.half) else e.half
-                axis.errorbar(
-                    i + shift, e.mean, bar, color=colour, marker=marker, fillstyle=fill, capsize=2, markersize=6
-                )
-                x = np.full(len(runs), i + shift + 0.09 * np.sign(shift))
-                axis.scatter(x, [run.ins(0.5) for run in runs], s=5, color="0.5", linewidths=0, zorder=1)
-        axis.set_xticks(range(len(order)))
-        robot_too = len(has.robots) > 1
-        labels = [f"{style.name_of(a)}\n{k:g}" + (f"\n{style.robot_name(r)}" if robot_too else "") for r, a, k in order]
-        axis.set_xticklabels(labels, fontsize=7)
-        axis.set_xlabel("algorithm, k$_{int}$" + (", robot" if robot_too else ""))
-        axis.set_ylabel("INS$_{0.5}$")
-        axis.grid(axis="x", visible=False)
-        p = "" if math.isnan(test.p_value) else f", one-sample t test p {p_text(test.p_value)}"
-        axis.set_title(
-            f"unseen minus seen: {test.difference:+.3f} over {len(pairs)} runs{p}\n"
-            "markers: mean over seeds, 95 % t interval; dots: runs"
-        )
-        handles = [
-            Line2D([], [], color="0.3", marker="o", linestyle="", fillstyle="full", label="training scenes"),
-            Line2D([], [], color="0.3", marker="o", linestyle="", fillstyle="none", label="unseen scenes"),
-        ]
-        handles = [*_without_line(style.algorithm_handles(has.algorithms)), *handles]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    by_cell, unseen = (cells([pair[side] for pair in pairs]) for side in (0, 1))
+    looks = style.Looks(by_cell)
+    order = sorted(by_cell, key=lambda c: (looks.robots.index(c[0]), looks.algorithms.index(c[1]), c[2]))
+    figure, ((axis,),) = style.panels((max(5.6, 0.62 * len(order) + 1.4), 3.9))
+    for i, cell in enumerate(order):
+        look = {**looks.algorithm(cell[1]), "capsize": 2, "markersize": 6}
+        for runs, shift, fill in ((by_cell[cell], -0.14, "full"), (unseen[cell], 0.14, "none")):
+            e = estimate(run.ins(0.5) for run in runs)
+            axis.errorbar(i + shift, e.mean, e.half, fillstyle=fill, **look)
+            x = np.full(len(runs), i + shift + 0.09 * np.sign(shift))
+            axis.scatter(x, [run.ins(0.5) for run in runs], s=5, color="0.5", linewidths=0, zorder=1)
+    axis.set_xticks(range(len(order)))
+    robot_too = len(looks.robots) > 1
+    labels = [f"{style.name_of(a)}\n{k:g}" + (f"\n{style.robot_name(r)}" if robot_too else "") for r, a, k in order]
+    axis.set_xticklabels(labels, fontsize=7)
+    axis.set_xlabel("algorithm, k$_{int}$" + (", robot" if robot_too else ""))
+    axis.set_ylabel("INS$_{0.5}$")
+    axis.grid(axis="x", visible=False)
+    p = "" if math.isnan(test.p_value) else f", one-sample t test p {p_text(test.p_value)}"
+    axis.set_title(
+        f"unseen minus seen: {test.difference:+.3f} over {len(pairs)} runs{p}\n"
+        "markers: mean over seeds, 95 % t interval; dots: runs"
+    )
+    grey: dict[str, Any] = {"color": "0.3", "marker": "o", "linestyle": "", "markersize": 6}
+    kinds = (("training scenes", "full"), ("unseen scenes", "none"))
+    scenes = [style.handle(label, fillstyle=fill, **grey) for label, fill in kinds]
+    style.legend(figure, [*looks.algorithm_handles(linestyle=""), *scenes])
     return figure
 
 
-def _chain(axis: Axes, runs: Sequence[RunMean], k_ints: list[float], colour: str, marker: str) -> None:
+def _chain(axis: Axes, runs: Sequence[RunMean], looks: style.Looks, look: dict[str, Any]) -> None:
     """A marker with intervals for each k_int, joined in its order."""
     places = []
     for k_int in sorted({run.k_int for run in runs}):
-        chosen = [run for run in runs if run.k_int == k_int]
-        p = estimate(run.scores["path_efficiency"] for run in chosen)
-        e = estimate(run.scores["effort_efficiency"] for run in chosen)
-        axis.errorbar(
-            p.mean,
-            e.mean,
-            None if math.isnan(e.half) else e.half,
-            None if math.isnan(p.half) else p.half,
-            color=colour,
-            marker=marker,
-            markersize=7,
-            fillstyle=style.fill_of(k_int, k_ints),
-            capsize=2,
-            elinewidth=0.8,
-            linestyle="",
-            zorder=4,
-        )
+        scores = [run.scores for run in runs if run.k_int == k_int]
+        p, e = (estimate(score[name] for score in scores) for name in ("path_efficiency", "effort_efficiency"))
+        bars: dict[str, Any] = {"capsize": 2, "elinewidth": 0.8, "markersize": 7, "linestyle": "", "zorder": 4}
+        axis.errorbar(p.mean, e.mean, e.half, p.half, fillstyle=looks.fill(k_int), **look, **bars)
         places.append((p.mean, e.mean))
-    axis.plot(*np.array(places).T, color=colour, linewidth=0.9, alpha=0.7, zorder=3)
+    axis.plot(*np.array(places).T, color=look["color"], linewidth=0.9, alpha=0.7, zorder=3)
 
 
 def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> None:
@@ -337,9 +268,3 @@ def _finish_plane(*axes: Axes) -> float:
         axis.set_xlabel(style.P_LABEL)
         axis.set_ylabel(style.E_LABEL)
     return step
-
-
-def _without_line(handles: list[Line2D]) -> list[Line2D]:
-    for handle in handles:
-        handle.set_linestyle("")
-    return handles

@@ -6,13 +6,19 @@ Colours are Okabe and Ito's (2008). An algorithm is a colour and a marker, k_int
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import matplotlib
+import numpy as np
+
+from interactive_nav_common.statistics import Estimate
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 BLUE, ORANGE, GREEN, PINK, SKY, VERMILION = "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00"
@@ -22,6 +28,7 @@ POLICIES = {"learned": BLUE, "follower": GREEN, "random": PINK, "avoider": VERMI
 SPARE = ((PINK, "D"), (ORANGE, "v"), (SKY, "P"), ("0.3", "X"))
 FILLS = ("none", "left", "full")
 LINES: tuple[Any, ...] = (":", "--", "-", "-.")
+ANY = (-np.inf, np.inf)
 P_LABEL, E_LABEL = "P$_{eff}$ (SPL)", "E$_{eff}$"
 RC: dict[Any, Any] = {
     "font.size": 9,
@@ -48,12 +55,11 @@ def applied() -> Iterator[None]:
         yield
 
 
-def look(kind: dict[str, tuple[str, str]], name: str, among: list[str]) -> tuple[str, str]:
+def look(kind: dict[str, tuple[str, str]], name: str, among: list[str]) -> dict[str, Any]:
     """Colour and marker of an algorithm or robot; what has none of its own gets a spare one."""
-    if name in kind:
-        return kind[name]
     others = [other for other in among if other not in kind]
-    return SPARE[others.index(name) % len(SPARE)]
+    colour, marker = kind[name] if name in kind else SPARE[others.index(name) % len(SPARE)]
+    return {"color": colour, "marker": marker}
 
 
 def in_order(algorithms: set[str]) -> list[str]:
@@ -61,38 +67,78 @@ def in_order(algorithms: set[str]) -> list[str]:
     return sorted(algorithms, key=lambda name: (list(ALGORITHMS).index(name) if name in ALGORITHMS else 99, name))
 
 
-def fill_of(k_int: float, among: list[float]) -> Any:
-    """Marker fill: the higher k_int, the fuller."""
-    place = sorted(among).index(k_int)
-    if len(among) == 1:
-        return "full"
-    return FILLS[round(place * (len(FILLS) - 1) / (len(among) - 1))]
+Cell = tuple[str, str, float]
+"""Robot, algorithm, k_int."""
 
 
-def line_of(k_int: float, among: list[float]) -> Any:
-    """Line style: the higher k_int, the more solid."""
-    place = sorted(among).index(k_int)
-    return LINES[2] if len(among) == 1 else LINES[min(place, 3)] if len(among) <= 3 else LINES[place % 4]
+class Looks:
+    """What stands for what in a figure of some cells.
+
+    Args:
+        cells: with their runs.
+    """
+
+    def __init__(self, cells: Mapping[Cell, Sequence[Any]]):
+        self.robots = sorted({robot for robot, _, _ in cells}, reverse=True)
+        self.algorithms = in_order({algorithm for _, algorithm, _ in cells})
+        self.k_ints = sorted({k_int for _, _, k_int in cells})
+        self.seeds = seeds_text({len(runs) for runs in cells.values()})
+
+    def algorithm(self, name: str) -> dict[str, Any]:
+        """Colour and marker."""
+        return look(ALGORITHMS, name, self.algorithms)
+
+    def robot(self, name: str) -> dict[str, Any]:
+        """Colour and marker."""
+        return look(ROBOTS, name, self.robots)
+
+    def fill(self, k_int: float) -> Any:
+        """Marker fill of a k_int: the higher, the fuller."""
+        last = len(self.k_ints) - 1
+        return FILLS[round(self.k_ints.index(k_int) * (len(FILLS) - 1) / last)] if last else "full"
+
+    def line(self, k_int: float) -> Any:
+        """Line style of a k_int: the higher, the more solid."""
+        return LINES[self.k_ints.index(k_int) % len(LINES)] if len(self.k_ints) > 1 else "-"
+
+    def k_int(self, k_int: float) -> dict[str, Any]:
+        """Marker fill and line style."""
+        return {"fillstyle": self.fill(k_int), "linestyle": self.line(k_int)}
+
+    def algorithm_handles(self, **more: Any) -> list[Line2D]:
+        """For a legend."""
+        return [handle(name_of(name), **{**self.algorithm(name), **more}) for name in self.algorithms]
+
+    def robot_handles(self) -> list[Line2D]:
+        """For a legend."""
+        return [handle(robot_name(name), **self.robot(name)) for name in self.robots]
+
+    def k_int_handles(self, **more: Any) -> list[Line2D]:
+        """For a legend."""
+        grey = {"color": "0.3", "marker": "o"}
+        return [handle(f"k$_{{int}}$ = {k:g}", **{**grey, **self.k_int(k), **more}) for k in self.k_ints]
 
 
-def look_of(k_int: float, among: list[float]) -> dict[str, Any]:
-    """Marker fill and line style of a k_int."""
-    return {"fillstyle": fill_of(k_int, among), "linestyle": line_of(k_int, among)}
+def handle(label: str, **look: Any) -> Line2D:
+    """Of a legend."""
+    return Line2D([], [], label=label, **{"markersize": 5, **look})
 
 
-def algorithm_handles(algorithms: list[str], markersize: float = 5) -> list[Line2D]:
-    """For a legend."""
-    looks = {algorithm: look(ALGORITHMS, algorithm, algorithms) for algorithm in algorithms}
-    return [
-        Line2D([], [], color=colour, marker=marker, markersize=markersize, label=name_of(algorithm))
-        for algorithm, (colour, marker) in looks.items()
-    ]
+def panels(size: tuple[float, float], rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes [rows, columns]."""
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
 
 
-def k_int_handles(k_ints: list[float], markersize: float = 5) -> list[Line2D]:
-    """For a legend."""
-    grey = {"color": "0.3", "marker": "o", "markersize": markersize}
-    return [Line2D([], [], label=f"k$_{{int}}$ = {k:g}", **grey, **look_of(k, k_ints)) for k in k_ints]
+def legend(figure: Figure, handles: Sequence[Artist], columns: int | None = None, **more: Any) -> None:
+    """Below the panels."""
+    figure.legend(handles=list(handles), loc="outside lower center", ncols=columns or len(handles), **more)
+
+
+def draw_means(axis: Axes, x: Any, points: Sequence[Estimate], bounds: tuple[float, float] = ANY, **look: Any) -> None:
+    """Means over runs as a line, and their intervals, as far as they lie within bounds, as a band."""
+    axis.plot(x, [point.mean for point in points], **look)
+    low, high = (np.clip([getattr(point, end) for point in points], *bounds) for end in ("low", "high"))
+    axis.fill_between(x, low, high, color=look["color"], alpha=0.13, linewidth=0)
 
 
 def policy_colour(policy: str, index: int) -> str:

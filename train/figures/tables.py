@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from interactive_nav_common.statistics import estimate, interval
+from interactive_nav_common.rows import markdown
+from interactive_nav_common.statistics import estimate, mean_text
 from train.figures import style
-from train.scoring.statistics import cells, claims, learned_rows, run_means
+from train.scoring.statistics import Finding, cells, claims, learned_rows, run_means
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
 NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
-
-
-def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
-    """A table."""
-    rows = [list(header), ["---"] * len(header), *([str(cell) for cell in line] for line in lines)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 
 def score_cells(rows: pa.Table) -> str:
@@ -46,19 +42,14 @@ def yardsticks(rows: pa.Table) -> str:
         if name == "learned":
             continue
         at = (robots == robot) & (policy == name) & (splits == split)
-        scores = []
-        for score in NAMES:
-            values = rows[score].to_numpy()[at]
-            low, high = interval(score, values)
-            scores.append(f"{values.mean():.3f} [{low:.3f}, {high:.3f}]")
+        scores = (mean_text(score, rows[score].to_numpy()[at]) for score in NAMES)
         lines.append((style.robot_name(robot), name, SPLITS.get(split, split), f"{int(at.sum()):,}", *scores))
     return markdown(("robot", "policy", "scenes", "episodes", *COLUMNS), lines) if lines else ""
 
 
-def claim_lines(rows: pa.Table, split: str | None) -> str:
+def claim_lines(findings: Iterable[Finding]) -> str:
     """The paper's claims and what the runs say to them."""
-    lines = [(f.claim, f.compared, f.result, f.verdict) for f in claims(rows, split)]
-    return markdown(("claim", "compared", "difference [95 % interval], p", "here"), lines)
+    return markdown(("claim", "compared", "difference [95 % interval], p", "here"), map(dataclasses.astuple, findings))
 
 
 def without_walls(rows: pa.Table) -> pa.Table:
@@ -71,12 +62,9 @@ def effort_lines(rows: pa.Table, split: str | None) -> str:
     free = without_walls(rows)
     if len(free) == len(rows):
         return ""
-    lines = [
-        (f.claim, f.compared, f.result, f.verdict)
-        for f in claims(free, split)
-        if any(name in f"{f.claim} {f.compared}," for name in ("E_eff", "INS_0,"))
-    ]
-    return markdown(("claim", "compared", "difference [95 % interval], p", "here"), lines)
+    return claim_lines(
+        f for f in claims(free, split) if any(name in f"{f.claim} {f.compared}," for name in ("E_eff", "INS_0,"))
+    )
 
 
 def need_lines(rows: pa.Table) -> str:
@@ -136,7 +124,7 @@ def document(rows: pa.Table, split: str | None) -> str:
         f"On {shown} scenes unless the line says otherwise. Two-sided Welch t tests over seeds, each seed's score the "
         "mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
         "`undecided` and `no significant difference` say that these runs cannot tell, not that there is none.",
-        claim_lines(rows, split),
+        claim_lines(claims(rows, split)),
     ]
     if effort := effort_lines(rows, split):
         parts += [

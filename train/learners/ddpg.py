@@ -24,7 +24,8 @@ from brax.training.acme import running_statistics
 from brax.training.networks import FeedForwardNetwork
 
 from train.config import DDPGConfig, TrainConfig
-from train.learners import networks, offpolicy
+from train.learners import offpolicy
+from train.learners.actor_critic import ActorCritic, make_networks, shares_encoder, soft_update
 
 
 @flax.struct.dataclass
@@ -92,42 +93,25 @@ def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: 
 
 
 @dataclasses.dataclass(frozen=True)
-class DDPG:
+class DDPG(ActorCritic):
     """All that learning does not change; an `offpolicy.Agent`."""
 
     config: DDPGConfig
     networks: DDPGNetworks
-    size: networks.ObservationSize
-    action_size: int
-    shared: bool
-    """The policy looks through the critic's encoder."""
 
     @property
-    def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+    def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
         """Of policy and critic."""
         return optax.adam(self.config.actor_learning_rate), optax.adam(self.config.critic_learning_rate)
 
     def init(self, key_networks: jax.Array, key: jax.Array) -> DDPGState:
         """A learner that has learned nothing."""
-        key_policy, key_q = jax.random.split(key_networks)
-        policy_params = offpolicy.own_params(self.networks.policy_network.init(key_policy), self.shared)
-        q_params = self.networks.q_network.init(key_q)
-        policy_optimizer, q_optimizer = self._optimizers
-        return DDPGState(
-            policy_optimizer_state=policy_optimizer.init(policy_params),
-            policy_params=policy_params,
-            target_policy_params=policy_params,
-            q_optimizer_state=q_optimizer.init(q_params),
-            q_params=q_params,
-            target_q_params=q_params,
-            normalizer_params=networks.init_normalizer(self.size),
-            gradient_steps=jnp.zeros((), jnp.int32),
-            key=key,
-        )
+        common = self.begun(key_networks)
+        return DDPGState(**common, target_policy_params=common["policy_params"], key=key)
 
     def policy(self, learner: DDPGState) -> types.Policy:
         """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); never random."""
-        params = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
+        params = self.whole_policy(learner.policy_params, learner.q_params)
 
         def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
             del key
@@ -157,39 +141,20 @@ class DDPG:
         del key  # nothing is drawn
         c = self.config
         critic_loss, actor_loss = make_losses(self.networks, c.reward_scaling, c.discounting)
-        policy_optimizer, q_optimizer = self._optimizers
-        normalizer = learner.normalizer_params
-        critic_loss_value, q_params, q_optimizer_state = offpolicy.descend(critic_loss, q_optimizer)(
-            learner.q_params,
-            offpolicy.seeing(learner.target_policy_params, learner.target_q_params, self.shared),
-            normalizer,
-            learner.target_q_params,
+        acting = self.whole_policy(learner.target_policy_params, learner.target_q_params)
+        changed, metrics = self.descended(
+            learner,
+            critic_loss,
+            (acting, learner.normalizer_params, learner.target_q_params, transitions),
+            actor_loss,
+            (transitions,),
             transitions,
-            optimizer_state=learner.q_optimizer_state,
         )
-        own_loss = offpolicy.own_actor_loss(actor_loss, self.shared)
-        actor_loss_value, policy_params, policy_optimizer_state = offpolicy.descend(own_loss, policy_optimizer)(
-            learner.policy_params,
-            learner.q_params,
-            normalizer,
-            transitions,
-            optimizer_state=learner.policy_optimizer_state,
-        )
-        steps = learner.gradient_steps + 1
-        tau = jnp.where(steps % c.target_update_period == 0, c.tau, 0.0)
-        metrics = {
-            "critic_loss": critic_loss_value,
-            "actor_loss": actor_loss_value,
-            "q_mean": offpolicy.mean_q(self.networks.q_network, learner, transitions),
-        }
+        tau = jnp.where(changed["gradient_steps"] % c.target_update_period == 0, c.tau, 0.0)
         return learner.replace(  # type: ignore[attr-defined]
-            policy_optimizer_state=policy_optimizer_state,
-            policy_params=policy_params,
-            target_policy_params=offpolicy.soft_update(learner.target_policy_params, policy_params, tau),
-            q_optimizer_state=q_optimizer_state,
-            q_params=q_params,
-            target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, tau),
-            gradient_steps=steps,
+            **changed,
+            target_policy_params=soft_update(learner.target_policy_params, changed["policy_params"], tau),
+            target_q_params=soft_update(learner.target_q_params, changed["q_params"], tau),
         ), metrics
 
 
@@ -200,10 +165,11 @@ def make_agent(env: Env, config: TrainConfig) -> DDPG:
         ValueError: images too small for the convolutions, or nothing for the critic to see.
     """
     size: Any = env.observation_size
-    policy_network = offpolicy.make_policy_network(config.network, config.ddpg, size, env.action_size)
-    q_network = offpolicy.make_q_network(config.network, config.ddpg, size, env.action_size, config.ddpg.num_critics)
+    policy_network, q_network = make_networks(
+        env, config.network, config.ddpg, env.action_size, config.ddpg.num_critics
+    )
     made = DDPGNetworks(policy_network, q_network)  # type: ignore[call-arg]
-    return DDPG(config.ddpg, made, size, env.action_size, offpolicy.shares_encoder(config.network, size))
+    return DDPG(config.ddpg, made, size, env.action_size, shares_encoder(config.network, size))
 
 
 train = functools.partial(offpolicy.train, make_agent)

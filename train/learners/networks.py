@@ -58,12 +58,14 @@ def update_normalizer(
     statistics: running_statistics.RunningStatisticsState, observation: Any
 ) -> running_statistics.RunningStatisticsState:
     """The statistics after a batch of observations [..., N]."""
-    return running_statistics.update(statistics, vector_part(observation))
+    with jax.numpy_rank_promotion("allow"):  # Brax's statistics promote
+        return running_statistics.update(statistics, vector_part(observation))
 
 
 def normalize(observation: Any, statistics: running_statistics.RunningStatisticsState) -> Any:
     """The observation with its vector part normalised; images pass."""
-    part = running_statistics.normalize(vector_part(observation), statistics)  # type: ignore[arg-type]
+    with jax.numpy_rank_promotion("allow"):  # as above
+        part = running_statistics.normalize(vector_part(observation), statistics)  # type: ignore[arg-type]
     return {**observation, **part} if isinstance(observation, Mapping) else part  # type: ignore[dict-item]
 
 

@@ -21,14 +21,12 @@ from typing import Any, Protocol
 import flax.struct
 import jax
 import jax.numpy as jnp
-import optax
 from brax.envs import Env
-from brax.training import gradients, types
-from brax.training import networks as brax_networks
+from brax.training import types
 from brax.training.acme import running_statistics
 
 from interactive_nav_common.errors import ConfigError
-from train.config import NetworkConfig, OffPolicyConfig, TrainConfig
+from train.config import OffPolicyConfig, TrainConfig
 from train.learners import networks, replay_buffer
 from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
 from train.learners.replay_buffer import Replay
@@ -263,92 +261,3 @@ def template(make_agent: Callable[[Env, TrainConfig], Agent], env: Env, config: 
     """A learner in the shape of this config's checkpoints."""
     key = jax.random.PRNGKey(0)
     return make_agent(env, config).init(key, key)
-
-
-def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformation) -> Callable[..., Any]:
-    """A step down a loss: (params, *rest, optimizer_state=) -> (loss, params, optimizer_state)."""
-    # No axis to average gradients over: one device.
-    return gradients.gradient_update_fn(loss, optimizer, None)  # type: ignore[arg-type]
-
-
-def own_actor_loss(actor_loss: Callable[..., jax.Array], shared: bool) -> Callable[..., jax.Array]:
-    """The policy's loss in what its optimiser moves: (policy_params, q_params, normalizer_params, *rest) -> ()."""
-
-    def loss(policy_params: Any, q_params: Any, normalizer_params: Any, *rest: Any) -> jax.Array:
-        return actor_loss(seeing(policy_params, q_params, shared), normalizer_params, q_params, *rest)
-
-    return loss
-
-
-def mean_q(q_network: brax_networks.FeedForwardNetwork, learner: Any, transitions: types.Transition) -> jax.Array:
-    """() mean value that a learner's critics see in what was done."""
-    return jnp.mean(
-        q_network.apply(learner.normalizer_params, learner.q_params, transitions.observation, transitions.action)
-    )
-
-
-def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
-    """Targets moved by `tau` towards the networks they follow, written as Brax writes it."""
-    return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)
-
-
-def make_policy_network(
-    network: NetworkConfig, config: OffPolicyConfig, size: networks.ObservationSize, outputs: int
-) -> brax_networks.FeedForwardNetwork:
-    """Observations to what parametrises actions.
-
-    Args:
-        network: encoders; read where observations have images.
-        config: layers.
-        size: of observations.
-        outputs: numbers that parametrise an action.
-    """
-    prepare, layers = networks.preprocess(config.normalize_observations), config.policy_hidden_layer_sizes
-    if isinstance(size, Mapping):
-        return networks.make_split(network, size, True, prepare, networks.Head(layers, outputs)).whole()
-    return brax_networks.make_policy_network(
-        outputs,
-        size,
-        preprocess_observations_fn=prepare,  # type: ignore[arg-type]
-        hidden_layer_sizes=layers,
-    )
-
-
-def make_q_network(
-    network: NetworkConfig, config: OffPolicyConfig, size: networks.ObservationSize, action_size: int, critics: int
-) -> brax_networks.FeedForwardNetwork:
-    """Observations and actions to values [..., critics]; with images the critics look through one encoder."""
-    prepare, layers = networks.preprocess(config.normalize_observations), config.q_hidden_layer_sizes
-    if isinstance(size, Mapping):
-        head = networks.TwinHead(layers, network.action_features, critics, config.q_layer_norm)
-        images = network.critic_inputs == "all"
-        return networks.make_split(network, size, images, prepare, head, action_size).whole()
-    return brax_networks.make_q_network(
-        size,
-        action_size,
-        preprocess_observations_fn=prepare,  # type: ignore[arg-type]
-        hidden_layer_sizes=layers,
-        n_critics=critics,
-        layer_norm=config.q_layer_norm,
-    )
-
-
-def shares_encoder(network: NetworkConfig, size: networks.ObservationSize) -> bool:
-    """Whether the policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
-    return network.share_encoder and isinstance(size, Mapping)
-
-
-def seeing(policy_params: Any, q_params: Any, shared: bool) -> Any:
-    """The parameters of the whole policy network.
-
-    Args:
-        policy_params: what the policy's optimiser moves.
-        q_params: whose encoder it looks through, if one is shared; the policy's loss does not move it.
-        shared: see `shares_encoder`.
-    """
-    return {**policy_params, "encoder": q_params["encoder"]} if shared else policy_params
-
-
-def own_params(policy_params: Any, shared: bool) -> Any:
-    """The part of the whole policy network's parameters that is its own."""
-    return {"head": policy_params["head"]} if shared else policy_params

@@ -147,7 +147,7 @@ def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discou
     env = jax.random.randint(key_env, (batch_size,), 0, envs)
     first = replay.position - replay.filled + age
 
-    step = jnp.arange(n_steps)
+    step = jnp.arange(n_steps)[None]
     window = ((first[:, None] + step) % slots, env[:, None])
     done, truncated = replay.done[window], replay.truncated[window]
     ended_before = jnp.cumsum(done, 1) - done > 0

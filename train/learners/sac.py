@@ -25,7 +25,14 @@ from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
 from train.config import SACConfig, TrainConfig
-from train.learners import networks, offpolicy
+from train.learners import offpolicy
+from train.learners.actor_critic import (
+    ActorCritic,
+    descend,
+    make_networks,
+    shares_encoder,
+    soft_update,
+)
 
 
 @flax.struct.dataclass
@@ -46,45 +53,31 @@ class SACState:
 
 
 @dataclasses.dataclass(frozen=True)
-class SAC:
+class SAC(ActorCritic):
     """All that learning does not change; an `offpolicy.Agent`."""
 
     config: SACConfig
     networks: sac_networks.SACNetworks
-    size: networks.ObservationSize
-    action_size: int
-    shared: bool
-    """The policy looks through the critics' encoder."""
 
     @property
-    def _optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+    def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
         """Of policy, critics and temperature."""
         c = self.config
         return tuple(map(optax.adam, (c.actor_learning_rate, c.critic_learning_rate, c.alpha_learning_rate)))
 
     def init(self, key_networks: jax.Array, key: jax.Array) -> SACState:
         """A learner that has learned nothing."""
-        key_policy, key_q = jax.random.split(key_networks)
-        policy_params = offpolicy.own_params(self.networks.policy_network.init(key_policy), self.shared)
-        q_params = self.networks.q_network.init(key_q)
         log_alpha = jnp.log(jnp.float32(self.config.initial_alpha))
-        policy_optimizer, q_optimizer, alpha_optimizer = self._optimizers
         return SACState(
-            policy_optimizer_state=policy_optimizer.init(policy_params),
-            policy_params=policy_params,
-            q_optimizer_state=q_optimizer.init(q_params),
-            q_params=q_params,
-            target_q_params=q_params,
-            alpha_optimizer_state=alpha_optimizer.init(log_alpha),
+            **self.begun(key_networks),
+            alpha_optimizer_state=self.optimizers[2].init(log_alpha),
             alpha_params=log_alpha,
-            normalizer_params=networks.init_normalizer(self.size),
-            gradient_steps=jnp.zeros((), jnp.int32),
             key=key,
         )
 
     def policy(self, learner: SACState, deterministic: bool) -> types.Policy:
         """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-        params = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
+        params = self.whole_policy(learner.policy_params, learner.q_params)
         return sac_networks.make_inference_fn(self.networks)((learner.normalizer_params, params), deterministic)
 
     def init_noise(self) -> tuple[()]:
@@ -102,11 +95,10 @@ class SAC:
     ) -> tuple[SACState, dict[str, jax.Array]]:
         """Temperature, critics, policy, targets: Brax's step with its keys split in the same places."""
         alpha_loss, critic_loss, actor_loss = make_losses(self)
-        policy_optimizer, q_optimizer, alpha_optimizer = self._optimizers
         _, key_alpha, key_critic, key_actor = jax.random.split(key, 4)
-        seen_policy = offpolicy.seeing(learner.policy_params, learner.q_params, self.shared)
+        seen_policy = self.whole_policy(learner.policy_params, learner.q_params)
         normalizer, alpha = learner.normalizer_params, jnp.exp(learner.alpha_params)
-        alpha_loss_value, alpha_params, alpha_optimizer_state = offpolicy.descend(alpha_loss, alpha_optimizer)(
+        alpha_loss_value, alpha_params, alpha_optimizer_state = descend(alpha_loss, self.optimizers[2])(
             learner.alpha_params,
             seen_policy,
             normalizer,
@@ -114,43 +106,20 @@ class SAC:
             key_alpha,
             optimizer_state=learner.alpha_optimizer_state,
         )
-        critic_loss_value, q_params, q_optimizer_state = offpolicy.descend(critic_loss, q_optimizer)(
-            learner.q_params,
-            seen_policy,
-            normalizer,
-            learner.target_q_params,
-            alpha,
+        changed, metrics = self.descended(
+            learner,
+            critic_loss,
+            (seen_policy, normalizer, learner.target_q_params, alpha, transitions, key_critic),
+            actor_loss,
+            (alpha, transitions, key_actor),
             transitions,
-            key_critic,
-            optimizer_state=learner.q_optimizer_state,
         )
-        own_loss = offpolicy.own_actor_loss(actor_loss, self.shared)
-        actor_loss_value, policy_params, policy_optimizer_state = offpolicy.descend(own_loss, policy_optimizer)(
-            learner.policy_params,
-            learner.q_params,
-            normalizer,
-            alpha,
-            transitions,
-            key_actor,
-            optimizer_state=learner.policy_optimizer_state,
-        )
-        metrics = {
-            "critic_loss": critic_loss_value,
-            "actor_loss": actor_loss_value,
-            "alpha_loss": alpha_loss_value,
-            "alpha": jnp.exp(alpha_params),
-            "q_mean": offpolicy.mean_q(self.networks.q_network, learner, transitions),
-        }
         return learner.replace(  # type: ignore[attr-defined]
-            policy_optimizer_state=policy_optimizer_state,
-            policy_params=policy_params,
-            q_optimizer_state=q_optimizer_state,
-            q_params=q_params,
-            target_q_params=offpolicy.soft_update(learner.target_q_params, q_params, self.config.tau),
+            **changed,
+            target_q_params=soft_update(learner.target_q_params, changed["q_params"], self.config.tau),
             alpha_optimizer_state=alpha_optimizer_state,
             alpha_params=alpha_params,
-            gradient_steps=learner.gradient_steps + 1,
-        ), metrics
+        ), {**metrics, "alpha_loss": alpha_loss_value, "alpha": jnp.exp(alpha_params)}
 
 
 def make_losses(agent: SAC) -> tuple[Any, Any, Any]:
@@ -169,10 +138,9 @@ def make_agent(env: Env, config: TrainConfig) -> SAC:
     """
     size: Any = env.observation_size
     actions = distribution.NormalTanhDistribution(event_size=env.action_size)
-    policy_network = offpolicy.make_policy_network(config.network, config.sac, size, actions.param_size)
-    q_network = offpolicy.make_q_network(config.network, config.sac, size, env.action_size, critics=2)
+    policy_network, q_network = make_networks(env, config.network, config.sac, actions.param_size, 2)
     made = sac_networks.SACNetworks(policy_network, q_network, actions)  # type: ignore[call-arg]
-    return SAC(config.sac, made, size, env.action_size, offpolicy.shares_encoder(config.network, size))
+    return SAC(config.sac, made, size, env.action_size, shares_encoder(config.network, size))
 
 
 train = functools.partial(offpolicy.train, make_agent)

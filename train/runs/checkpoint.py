@@ -17,8 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav_common.errors import FileError
-from train.runs import policy_file
+from interactive_nav_common.files import writing
 from train.errors import CheckpointError
+from train.runs import policy_file
+from train.runs.run_folder import GOES_ON
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 
@@ -54,24 +56,22 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
     final = root / f"{meta.env_steps:012d}"
     partial = root / f".partial-{meta.env_steps:012d}"
     try:
-        remove_partial(root)
-        partial.mkdir(parents=True)
-        _write(partial / LEARNER, flax.serialization.to_bytes(jax.device_get(snapshot.learner)))
-        if snapshot.env_state is not None and megabytes(snapshot.env_state) <= env_state_limit_mb:
-            leaves = [np.asarray(raw) for raw in map(_raw, jax.tree.leaves(snapshot.env_state))]
-            with open(partial / ENV_STATE, "wb") as file:
-                np.savez(file, *leaves)
-                _flush(file)
-        _write(partial / META, json.dumps(dataclasses.asdict(meta), indent=1).encode())
-        if final.exists():
-            _remove(final)
-        os.replace(partial, final)
-    except OSError as error:
+        with writing(final, GOES_ON, "cannot write the checkpoint"):
+            remove_partial(root)
+            partial.mkdir(parents=True)
+            _write(partial / LEARNER, flax.serialization.to_bytes(jax.device_get(snapshot.learner)))
+            if snapshot.env_state is not None and megabytes(snapshot.env_state) <= env_state_limit_mb:
+                leaves = [np.asarray(raw) for raw in map(_raw, jax.tree.leaves(snapshot.env_state))]
+                with open(partial / ENV_STATE, "wb") as file:
+                    np.savez(file, *leaves)
+                    _flush(file)
+            _write(partial / META, json.dumps(dataclasses.asdict(meta), indent=1).encode())
+            if final.exists():
+                _remove(final)
+            os.replace(partial, final)
+    except FileError:
         shutil.rmtree(partial, ignore_errors=True)
-        raise FileError(
-            f"{final}: cannot write the checkpoint ({error.strerror or error}); make room and start again: "
-            f"the run continues from its last checkpoint"
-        ) from None
+        raise
     kept = list_checkpoints(root)
     best = best_checkpoint(kept)
     for old in kept[:-keep]:

@@ -48,7 +48,10 @@ def acting_part(learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
 
 
 def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarray]:
-    """Large weights as i8 and, under `<name>:scale`, f32 scales of their last axis; others as f16; vectors as is.
+    """Large weights as Huffman codes (u8) of i8, with their shapes under `<name>:shape` and the f32 scales of their last
+    axis under `<name>:scale`; others as f16; vectors as is.
+
+    Rounded weights hold no repetitions, which is all that zip's own methods would add: those take a tenth more.
 
     Args:
         leaves: name -> array.
@@ -66,52 +69,30 @@ def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarra
         inputs = tuple(range(array.ndim - 1))
         scale = np.maximum(step * array.std(inputs), np.abs(array).max(inputs) / _LEVELS).astype(np.float32)
         scale[scale == 0] = 1.0
-        out[name] = np.rint(array / scale).astype(np.int8)
-        out[name + SCALE] = scale
+        coder = zlib.compressobj(9, strategy=zlib.Z_HUFFMAN_ONLY)
+        codes = coder.compress(np.rint(array / scale).astype(np.int8).tobytes()) + coder.flush()
+        out[name] = np.frombuffer(codes, np.uint8)
+        out[name + SHAPE], out[name + SCALE] = np.array(array.shape, np.int32), scale
     return out
 
 
 def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Back from `packed`, to within half a scale."""
-    return {
-        name: array.astype(np.float32) * arrays[name + SCALE] if name + SCALE in arrays else array
-        for name, array in arrays.items()
-        if not name.endswith(SCALE)
-    }
-
-
-def coded(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The i8 arrays as u8 Huffman codes, and under `<name>:shape` their shapes; others as they are.
-
-    Rounded weights hold no repetitions, which is all that zip's own methods would add: those take a tenth more.
-    """
     out: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
-        if array.dtype == np.int8:
-            coder = zlib.compressobj(9, strategy=zlib.Z_HUFFMAN_ONLY)
-            out[name] = np.frombuffer(coder.compress(array.tobytes()) + coder.flush(), np.uint8)
-            out[name + SHAPE] = np.array(array.shape, np.int32)
-        else:
+        if name + SHAPE in arrays:
+            levels = np.frombuffer(zlib.decompress(array.tobytes()), np.int8).reshape(arrays[name + SHAPE])
+            out[name] = levels.astype(np.float32) * arrays[name + SCALE]
+        elif not name.endswith((SHAPE, SCALE)):
             out[name] = array
     return out
-
-
-def decoded(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Back from `coded`, exactly."""
-    return {
-        name: np.frombuffer(zlib.decompress(array.tobytes()), np.int8).reshape(arrays[name + SHAPE])
-        if name + SHAPE in arrays
-        else array
-        for name, array in arrays.items()
-        if not name.endswith(SHAPE)
-    }
 
 
 def write(source: Path, algorithm: str, target: Path, step: float = STEP) -> None:
     """A `learner.msgpack` as a `policy.npz`."""
     learner = flax.serialization.msgpack_restore(source.read_bytes())
     with whole_file(target) as partial, open(partial, "wb") as file:
-        np.savez(file, **coded(packed(acting_part(learner, algorithm), step)))  # type: ignore[arg-type]
+        np.savez(file, **packed(acting_part(learner, algorithm), step))  # type: ignore[arg-type]
 
 
 def read(path: Path, template: Any) -> Any:
@@ -122,7 +103,7 @@ def read(path: Path, template: Any) -> Any:
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
-            leaves = unpacked(decoded({name: stored[name] for name in stored.files}))
+            leaves = unpacked({name: stored[name] for name in stored.files})
     except Exception as error:  # noqa: BLE001  (zip and npy readers raise many kinds for a damaged file)
         raise CheckpointError(f"{path}: not readable ({' '.join(str(error).split())[:200]})") from None
     flat = flax.traverse_util.flatten_dict(flax.serialization.to_state_dict(template), sep="/", keep_empty_nodes=True)

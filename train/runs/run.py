@@ -23,9 +23,11 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
+from interactive_nav_common.metrics_file import mean_over_episodes
 from interactive_nav_common.locks import locked
 from interactive_nav_common.signals import stop_signals
 from train.runs import checkpoint, tracking
+from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.learners.algorithms import ALGORITHMS
 from train.runs.checkpoint import CheckpointMeta
@@ -34,7 +36,7 @@ from train.errors import CheckpointError
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import RunFolder, claim
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.versions import versions
 
 
@@ -45,7 +47,7 @@ def make_env(config: EnvConfig) -> Any:
         ConfigError: an unknown robot, an unusable scene, or settings that do not fit each other.
     """
     try:
-        return interactive_nav.make(config.robot, config.scenes, **config.nav_fields())
+        return interactive_nav.make(**flatten(config))
     except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
 
@@ -60,14 +62,14 @@ def config_to_play(
     Args:
         folder: of the run.
         words: `env.key=value`; a backend that they name is taken as it is.
-        scenes: folders; None: those that it was trained on.
+        scenes: folders or sets of scenes; None: those that it was trained on.
         console: told of another backend.
 
     Raises:
         UserError: the folder is no run, or a word is wrong.
     """
     config = config_io.apply_overrides(folder.read_config(), words)
-    env = dataclasses.replace(config.env, scenes=tuple(scenes) if scenes else config.env.scenes)
+    env = dataclasses.replace(config.env, scenes=scene_folders(scenes) if scenes else config.env.scenes)
     if not any(word.startswith("env.backend=") for word in words):
         try:
             resolve_backend(env.backend)
@@ -75,7 +77,7 @@ def config_to_play(
             there = resolve_backend("auto")
             told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(told, highlight=False, soft_wrap=True)
-            env = dataclasses.replace(env, backend=there)
+            env = replace(env, backend=there)
     return dataclasses.replace(config, env=env)
 
 
@@ -161,17 +163,17 @@ class FolderCallbacks:
         each had the time for a whole episode, scores would flatter.
         """
         run = self._config.run
-        fair = self._began_together + num_envs(self._config) * self._config.env.episode_steps
+        fair = self._began_together + num_envs(self._config) * self._config.env.rules.episode_steps
         since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
-        lines = [line for line in read_metrics(self._folder.metrics) if line["env_steps"] > since]
+        lines = [line for line in self._folder.read_metrics() if line["env_steps"] > since]
         meta = CheckpointMeta(
             env_steps=snapshot.env_steps,
             wall_s=self._wall_s(),
-            score=mean_score(lines, run.best_metric),
+            score=mean_over_episodes(lines, f"episode/{run.best_metric}"),
             began_together=self._began_together,
             algorithm=self._config.algorithm,
             robot=self._config.env.robot,
-            observations=self._config.env.observations,
+            observations=self._config.env.sensors.observations,
             observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
         )
@@ -193,13 +195,6 @@ class FolderCallbacks:
             self._events.close()
         if self._tracker:
             self._tracker.close()
-
-
-def mean_score(lines: list[dict[str, Any]], name: str) -> float | None:
-    """Mean of a score over the episodes of some lines of metrics; None where none ended."""
-    scored = [(line[f"episode/{name}"], line["episodes"]) for line in lines if f"episode/{name}" in line]
-    episodes = sum(count for _, count in scored)
-    return sum(score * count for score, count in scored) / episodes if episodes else None
 
 
 def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
@@ -298,13 +293,13 @@ def num_envs(config: TrainConfig) -> int:
 
 def last_metrics(folder: RunFolder) -> dict[str, Any]:
     """The last logged line, without its step; empty if there is none."""
-    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    lines = folder.read_metrics()
     return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
 
 
 def failures(folder: RunFolder) -> dict[str, float]:
     """Steps (episodes for `nonfinite`) in which physics failed, over all logged episodes; those that are not 0."""
-    lines = read_metrics(folder.metrics) if folder.metrics.is_file() else []
+    lines = folder.read_metrics()
     totals = {
         name: sum(line.get(f"episode/{name}", 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES
     }
@@ -319,7 +314,7 @@ def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics
         "run": config.run.name,
         "algorithm": config.algorithm,
         "robot": config.env.robot,
-        "k_int": config.env.k_int,
+        "k_int": config.env.rules.k_int,
         "seed": config.run.seed,
         "completed": result.completed,
         "env_steps": result.snapshot.env_steps,

@@ -16,12 +16,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import write_text, writing
 from interactive_nav_common.metrics_file import METRICS, read_metrics, write_metrics
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
-from train.config_io import flatten, from_yaml, to_yaml
+from train.config_io import from_yaml, to_yaml
 
 MAY_CHANGE = (
     *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),
@@ -30,6 +31,7 @@ MAY_CHANGE = (
 )
 """Settings that a run may be continued with at other values: they do not change what an update does."""
 HEADROOM_MB = 64.0
+GOES_ON = "make room and start again: the run continues from its last checkpoint"
 
 
 class RunFolder:
@@ -106,23 +108,17 @@ class RunFolder:
         Raises:
             FileError: the disk is full or no longer writable.
         """
-        try:
-            with open(self.metrics, "a") as file:
-                file.write(json.dumps(line) + "\n")
-        except OSError as error:
-            raise FileError(
-                f"{self.metrics}: cannot be written ({error.strerror or error}); make room and start again: "
-                "the run continues from its last checkpoint"
-            ) from None
+        with writing(self.metrics, GOES_ON), open(self.metrics, "a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl; none where nothing was logged."""
+        return read_metrics(self.metrics) if self.metrics.is_file() else []
 
     def cut_metrics(self, env_steps: int) -> None:
         """Drops the lines after a checkpoint that a run continues from: their steps are taken again."""
         if self.metrics.is_file():
-            write_metrics(self.metrics, [line for line in read_metrics(self.metrics) if line["env_steps"] <= env_steps])
-
-
-
-
+            write_metrics(self.metrics, [line for line in self.read_metrics() if line["env_steps"] <= env_steps])
 
 
 def claim(path: Path, needed_mb: float = 0.0) -> None:
@@ -136,16 +132,12 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
         FileError: it cannot be made or written, or the disk is too full.
     """
     needed_mb += HEADROOM_MB
-    try:
+    with writing(path, "expected a writable folder (run.out_dir)"):
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".write-probe"
         probe.write_bytes(bytes(1 << 16))
         probe.unlink()
         free_mb = shutil.disk_usage(path).free / 1e6
-    except OSError as error:
-        raise FileError(
-            f"{path}: cannot be written ({error.strerror or error}); expected a writable folder (run.out_dir)"
-        ) from None
     if free_mb < needed_mb:
         raise FileError(
             f"{path}: {free_mb:.0f} MB free on its disk, expected {needed_mb:.0f} MB for checkpoints; "

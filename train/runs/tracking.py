@@ -11,10 +11,11 @@ import uuid
 from pathlib import Path
 from typing import Any
 
+from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
 from train.config import TrainConfig
-from train.config_io import flatten
+
 
 ID_FILE = "wandb_id"
 
@@ -58,7 +59,7 @@ class Tracker:
                 id=kept.read_text().strip(),
                 resume="allow",
                 dir=str(folder),
-                group=f"{config.env.robot}-{config.algorithm}-k_int{config.env.k_int:g}",
+                group=f"{config.env.robot}-{config.algorithm}-k_int{config.env.rules.k_int:g}",
                 config={**flatten(config), "versions": versions},
                 settings=wandb.Settings(console="off", silent=True),
             )

@@ -167,7 +167,7 @@ def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: Eval
         "robot": env.robot.name,
         "algorithm": config.algorithm,
         "policy": None,
-        "k_int": float(config.env.k_int),
+        "k_int": float(config.env.rules.k_int),
         "seed": config.run.seed,
         "checkpoint_steps": None,
         "deterministic": asked.deterministic,

@@ -18,8 +18,9 @@ import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.spatial
 
-from interactive_nav.geodesic import clearance, largest_component
+from interactive_nav.geodesic import crossed_cells, largest_component, sampled_clearance
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import wrap_angle
 from train.scoring.steering import velocity_towards
 
 CELL_M = 0.05
@@ -117,14 +118,9 @@ class _SceneGrid:
 
     def __init__(self, env: Any, index: int):
         world, maps = env.world, env.scenes[index].maps
-        self.shape = tuple(math.ceil(n * maps.resolution_m / CELL_M - 1e-9) for n in maps.traversable.shape)
         self.origin_w = np.asarray(maps.origin_w, float)
-        margin = clearance(maps.traversable, maps.resolution_m)
-        rows, columns = self.shape
-        r = (np.arange(rows) + 0.5) * CELL_M / maps.resolution_m - 0.5
-        c = (np.arange(columns) + 0.5) * CELL_M / maps.resolution_m - 0.5
-        grid = np.meshgrid(r, c, indexing="ij")
-        self.room_m = scipy.ndimage.map_coordinates(margin, grid, order=1, mode="constant", cval=0.0)
+        self.room_m = sampled_clearance(maps.traversable, maps.resolution_m, CELL_M)
+        self.shape = self.room_m.shape
         self.free = largest_component(self.room_m >= env.robot.footprint_radius_m)
         self.occupied = np.flatnonzero(world.occupied[index])
         bodies = world.layout.slot_body[self.occupied]
@@ -159,14 +155,11 @@ class PathGrid:
             ok = free[a] & free[b]
             mean = 0.5 * (cost[a] + cost[b])
             through = np.zeros(mean.shape)
-            if abs(dr) + abs(dc) > 1:
-                # The two cells in the middle of a knight's move, the two beside a diagonal.
-                sign = 1 if dc > 0 else -1
-                middles = {(1, 1): [(0, sign), (1, 0)], (1, 2): [(0, sign), (1, sign)], (2, 1): [(1, 0), (1, sign)]}
-                for mr, mc in middles[dr, abs(dc)]:
-                    m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
-                    ok = ok & free[m]
-                    through = through + cost[m]
+            # The two cells in the middle of a knight's move, the two beside a diagonal.
+            for mr, mc in set(crossed_cells((dr, dc))) - {(0, 0), (dr, dc)}:
+                m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
+                ok = ok & free[m]
+                through = through + cost[m]
             if abs(dr) + abs(dc) == 3:
                 mean = 0.5 * mean + 0.25 * through
             sources.append(index[a][ok])
@@ -199,11 +192,6 @@ class PathGrid:
                 return np.zeros((0, 2), np.int64)
             path.append(previous[path[-1]])
         return np.stack(np.unravel_index(path, self._shape), -1)
-
-
-def plan_path(free: np.ndarray, cost: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-    """The cheapest path between two cells of a grid that is needed once; see `PathGrid`."""
-    return PathGrid(free, cost).path(start, goal)
 
 
 class Planner:
@@ -296,7 +284,7 @@ class Planner:
             near = np.maximum(near, np.clip(1.0 - (away_m - radius - MARGIN_M) / NEAR_M, 0.0, 1.0) * ~hits)
         cost = cost + NEAR_COST * near if self._weight != 0.0 else cost + 0.2 * near
         start, end = self._cell(grid, pos), self._cell(grid, goal)
-        way = plan_path(free, cost, start, end)
+        way = PathGrid(free, cost).path(start, end)
         path = grid.origin_w + (way[:, ::-1] + 0.5) * CELL_M
         # The nearest free cells stand for start and goal: a way between others than those is none.
         far = len(path) and (
@@ -321,6 +309,5 @@ class Planner:
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ahead, axis=0), axis=-1))])
         target = ahead[min(int(np.searchsorted(along, LOOK_AHEAD_M)), len(ahead) - 1)]
         offset = target - pos
-        bearing = math.atan2(offset[1], offset[0]) - yaw
-        bearing = (bearing + math.pi) % (2 * math.pi) - math.pi
+        bearing = wrap_angle(math.atan2(offset[1], offset[0]) - yaw)
         return velocity_towards(self._env.robot.twist, float(bearing), CRUISE_M_S, ALIGNED_RAD, np)

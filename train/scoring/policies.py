@@ -74,18 +74,13 @@ def make_follower(env: Any) -> PolicyFn:
             f"policy follower: robot '{env.robot.name}' takes no base velocity in control mode "
             f"'{env.robot.control_mode}', expected one of its modes that does; leave it out of --policies"
         )
-    if "waypoints" not in config.observations:
+    if "waypoints" not in config.sensors.observations:
         raise UserError(
-            f"policy follower: observations are {', '.join(config.observations)}, "
+            f"policy follower: observations are {', '.join(config.sensors.observations)}, "
             "expected waypoints among them; leave it out of --policies"
         )
-    waypoint = min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 1
+    waypoint = min(max(round(LOOK_AHEAD_M / config.rules.waypoint_spacing_m), 1), config.rules.num_waypoints) - 1
     return functools.partial(waypoint_follower, env.robot, waypoint)
-
-
-def make_learned(act: Any) -> PolicyFn:
-    """A Brax policy (observation, key) -> (action, extras) without its extras."""
-    return lambda observation, key: act(observation, key)[0]
 
 
 YARDSTICKS: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}

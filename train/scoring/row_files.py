@@ -37,14 +37,24 @@ class EvaluationAsked:
         return f"{run}-{digest[:8]}.parquet"
 
 
-def files_of_run(dataset: Path, run: str) -> list[Path]:
+PATHS = "_paths"
+"""Folder of recorded paths in a dataset; readers of a dataset pass over it."""
+
+
+def files_of_run(dataset: Path, run: str, ending: str = ".parquet") -> list[Path]:
     """Files of rows in a dataset folder that are of one run."""
-    name = re.compile(re.escape(run) + r"-[0-9a-f]{8}\.parquet")
-    return sorted(path for path in dataset.glob("*.parquet") if name.fullmatch(path.name))
+    name = re.compile(re.escape(run) + r"-[0-9a-f]{8}" + re.escape(ending))
+    return sorted(path for path in dataset.glob(f"*{ending}") if name.fullmatch(path.name))
 
 
 def paths_beside(rows: Path) -> Path:
-    """Where the recorded paths of a file of rows lie: in a dataset's `_paths`, which readers of a folder pass over."""
+    """Where the recorded paths of a file of rows lie: in a dataset's `PATHS`."""
     in_dataset = re.search(r"-[0-9a-f]{8}\.parquet$", rows.name)
-    folder = rows.parent / "_paths" if in_dataset else rows.parent
+    folder = rows.parent / PATHS if in_dataset else rows.parent
     return folder / f"{rows.stem}.npz"
+
+
+def lonely_paths(dataset: Path, run: str) -> list[Path]:
+    """Recorded paths of one run without their rows, which are written after them."""
+    every = files_of_run(dataset / PATHS, run, ".npz")
+    return [path for path in every if not (dataset / f"{path.stem}.parquet").is_file()]

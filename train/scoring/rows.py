@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from rich.table import Table
 
-from interactive_nav_common.statistics import RESAMPLES, interval
+from interactive_nav_common.statistics import RESAMPLES, mean_text
 
 if TYPE_CHECKING:
     from train.scoring.rollout import Episodes
@@ -60,10 +60,6 @@ def score_table(rows: pa.Table, title: str) -> Table:
         made.add_column(label, justify="right")
     policies = np.asarray(rows["policy"].to_pylist())
     for policy in dict.fromkeys(policies):
-        cells = []
-        for name in SCORES:
-            values = rows[name].to_numpy()[policies == policy]
-            low, high = interval(name, values)
-            cells.append(f"{values.mean():.3f} [{low:.3f}, {high:.3f}]")
+        cells = (mean_text(name, rows[name].to_numpy()[policies == policy]) for name in SCORES)
         made.add_row(policy, *cells, str(int((policies == policy).sum())))
     return made

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.signals import stop_signals
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
@@ -72,52 +72,49 @@ def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
     return LocalLauncher(Machine(find_gpus(), sweep.config.launch.slots))
 
 
+@reports_errors("train.sweep")
 def main(argv: Sequence[str] | None = None, programs: Programs | None = None) -> int:
     """Runs a sweep; see `Outcome.exit_code`."""
     arguments = parser().parse_args(argv)
     console = Console()
-    try:
-        chosen = [name for name in (arguments.sweep, arguments.config) if name]
-        if len(chosen) != 1:
-            raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
-        if arguments.time_limit is not None and not arguments.time_limit > 0:
-            raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
-        if not 0 < arguments.policy_step <= 4:
-            raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")
-        if arguments.unfinished and arguments.only != "evaluate":
-            raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
-        sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
-        folder = SweepFolder(sweep)
-        if arguments.status:
-            states = [folder.state(run) for run in sweep.runs]
-            console.print(status_table(states))
-            console.print(totals(states), highlight=False, soft_wrap=True)
-            return 0
-        if arguments.export:
-            from train.sweep.export import export
+    chosen = [name for name in (arguments.sweep, arguments.config) if name]
+    if len(chosen) != 1:
+        raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
+    if arguments.time_limit is not None and not arguments.time_limit > 0:
+        raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
+    if not 0 < arguments.policy_step <= 4:
+        raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")
+    if arguments.unfinished and arguments.only != "evaluate":
+        raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
+    sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
+    folder = SweepFolder(sweep)
+    if arguments.status:
+        states = [folder.state(run) for run in sweep.runs]
+        console.print(status_table(states))
+        console.print(totals(states), highlight=False, soft_wrap=True)
+        return 0
+    if arguments.export:
+        from train.sweep.export import export
 
-            size, best = export(folder, Path(arguments.export), arguments.policy_step)
-            for name in best.values():
-                console.print(f"checkpoint of {name}", highlight=False)
-            console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)
-            return 0
-        if arguments.resume and not (folder.root / "configs").is_dir():
-            raise ConfigError(f"--resume: {folder.root} holds no sweep; leave --resume out to begin it")
-        claim(folder.root)
-        folder.prepare()
-        launcher = make_launcher(arguments.launcher, arguments.ray_address, sweep)
-        stages = (arguments.only,) if arguments.only else STAGES
-        try:
-            with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:
-                display.event(f"{folder.root}: {len(sweep.runs)} runs")
-                outcome = Scheduler(
-                    folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs
-                ).run(stops, arguments.time_limit)
-        finally:
-            launcher.close()
-    except UserError as error:
-        print(f"train.sweep: {error}", file=sys.stderr)
-        return 2
+        size, best = export(folder, Path(arguments.export), arguments.policy_step)
+        for name in best.values():
+            console.print(f"checkpoint of {name}", highlight=False)
+        console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)
+        return 0
+    if arguments.resume and not (folder.root / "configs").is_dir():
+        raise ConfigError(f"--resume: {folder.root} holds no sweep; leave --resume out to begin it")
+    claim(folder.root)
+    folder.prepare()
+    launcher = make_launcher(arguments.launcher, arguments.ray_address, sweep)
+    stages = (arguments.only,) if arguments.only else STAGES
+    try:
+        with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:
+            display.event(f"{folder.root}: {len(sweep.runs)} runs")
+            outcome = Scheduler(folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs).run(
+                stops, arguments.time_limit
+            )
+    finally:
+        launcher.close()
     console.print(status_table(outcome.states))
     console.print(totals(outcome.states), highlight=False, soft_wrap=True)
     if outcome.elsewhere:

@@ -37,12 +37,17 @@ class Share:
 
 def find_gpus() -> list[Gpu]:
     """The NVIDIA GPUs that this process may use; none where there are none."""
-    query = ["nvidia-smi", "--query-gpu=index,uuid,memory.total", "--format=csv,noheader,nounits"]
+    return parse_gpus(gpu_listing("index,uuid,memory.total"), os.environ.get("CUDA_VISIBLE_DEVICES"))
+
+
+def gpu_listing(fields: str) -> str:
+    """nvidia-smi's line for each NVIDIA GPU; nothing where there are none."""
+    query = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
     try:
         done = subprocess.run(query, capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired):
-        return []
-    return parse_gpus(done.stdout if done.returncode == 0 else "", os.environ.get("CUDA_VISIBLE_DEVICES"))
+        return ""
+    return done.stdout if done.returncode == 0 else ""
 
 
 def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:

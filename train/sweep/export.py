@@ -12,15 +12,14 @@ from typing import Any
 
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import whole_file
-from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, read_metrics, write_metrics
+from interactive_nav_common.files import whole_file, writing
+from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from train.errors import CheckpointError
 from train.runs import checkpoint
 from train.runs.policy_file import STEP
 from train.runs.run_folder import RunFolder
-from train.scoring.row_files import files_of_run, paths_beside
+from train.scoring.row_files import PATHS, files_of_run, paths_beside
 from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
@@ -48,7 +47,7 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
         FileError: it cannot be written.
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
-    try:
+    with writing(out, "make room"):
         _merge_rows(folder, out / "rows")
         for run in runs:
             source, target = RunFolder(folder.runs / run.name), out / "runs" / run.name
@@ -63,8 +62,6 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
         best = best_runs(folder, runs)
         for name in best.values():
             _keep_checkpoint(folder, name, out / "runs" / name / "checkpoints", step)
-    except OSError as error:
-        raise FileError(f"{out}: cannot be written ({error.strerror or error}); make room") from None
     return sum(path.stat().st_size for path in out.rglob("*") if path.is_file()), best
 
 
@@ -86,7 +83,7 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
     # Paths, then rows, then what is no longer wanted: rows are never without paths as new as they.
     paths = [paths_beside(path) for path in new if paths_beside(path).is_file()]
     for path in paths:
-        with whole_file(out / "_paths" / path.name) as partial:
+        with whole_file(out / PATHS / path.name) as partial:
             shutil.copy2(path, partial)
     write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None)
     for path in old:
@@ -123,9 +120,7 @@ def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
         made = {name: group[-1][name] for name in KEPT[:3] if name in group[-1]}
         made["episodes"] = sum(line.get("episodes", 0.0) for line in group)
         for name in dict.fromkeys(name for line in group for name in line if name.startswith("episode/")):
-            scored = [(line[name], line["episodes"]) for line in group if name in line]
-            count = sum(episodes for _, episodes in scored)
-            made[name] = sum(value * episodes for value, episodes in scored) / count
+            made[name] = mean_over_episodes(group, name)
         out.append({name: value if isinstance(value, int) else float(f"{value:.5g}") for name, value in made.items()})
     return out
 

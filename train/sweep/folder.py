@@ -19,12 +19,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import remove_partial, write_text
 from interactive_nav_common.locks import is_locked
 from interactive_nav_common.rows import read_notes
 from train.config_io import to_yaml
 from train.runs.run_folder import RunFolder
-from train.scoring.row_files import EvaluationAsked, files_of_run, paths_beside
+from train.scoring.row_files import PATHS, EvaluationAsked, files_of_run, lonely_paths, paths_beside
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
 
 TAIL_BYTES = 1 << 16
@@ -55,7 +55,7 @@ class SweepFolder:
         self.rows, self.runs = self.root / "rows", self.root / "runs"
 
     def prepare(self) -> None:
-        """Makes the folder and writes the config of each run.
+        """Makes the folder, writes the config of each run, and removes what killed evaluations left.
 
         Raises:
             FileError: it cannot be written.
@@ -64,6 +64,12 @@ class SweepFolder:
             write_text(self.config(run.name), to_yaml(run.config))
         for name in ("runs", "rows", "logs", "locks", "failed"):
             (self.root / name).mkdir(exist_ok=True)
+        for folder in (self.rows, self.rows / PATHS):
+            remove_partial(folder)
+        for run in self.sweep.runs:
+            for paths in lonely_paths(self.rows, run.name):
+                if not is_locked(self.lock(run.name)):  # else its rows are yet to come
+                    paths.unlink(missing_ok=True)
 
     def config(self, run: str) -> Path:
         """The config that `python -m train` is given."""

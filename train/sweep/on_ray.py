@@ -2,25 +2,55 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
+from collections.abc import Callable
 from typing import Any
 
 from interactive_nav_common.errors import ConfigError
 from train.sweep.devices import Gpu, Share, share_env
 from train.sweep.jobs import LOST, Child, Job
+from train.sweep.local import Launcher
 
 
-def _work(job: Job, cwd: str, fraction: float) -> Any:
-    """In the actor: the job's process, with the GPU that Ray gave it."""
-    os.chdir(cwd)
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    share = Share(Gpu(visible, 0.0) if visible and fraction else None, fraction or 1.0)
-    return Child(job, share_env(share, job.launch))
+class Worker(Child):
+    """In the actor: the job's process, with the GPU that Ray gave it; `stop` and `kill` come while `wait` waits."""
+
+    def __init__(self, job: Job, cwd: str, fraction: float):
+        os.chdir(cwd)
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+        share = Share(Gpu(visible, 0.0) if visible and fraction else None, fraction or 1.0)
+        super().__init__(job, share_env(share, job.launch))
 
 
-class RayLauncher:
+class Actor:
+    """A worker as its launcher sees it."""
+
+    def __init__(self, ray: Any, worker: Any):
+        self._ray, self._worker, self._code = ray, worker, worker.wait.remote()
+
+    def poll(self) -> int | None:
+        """The exit code, or None while it runs."""
+        ready, _ = self._ray.wait([self._code], timeout=0)
+        if not ready:
+            return None
+        try:
+            code = self._ray.get(self._code)
+        except self._ray.exceptions.RayError:
+            code = LOST
+        self._ray.kill(self._worker)
+        return code
+
+    def stop(self) -> None:
+        """Asks the job to save and end."""
+        self._worker.stop.remote()
+
+    def kill(self) -> None:
+        """Ends the job."""
+        self._worker.kill.remote()
+
+
+class RayLauncher(Launcher):
     """Actors on a Ray cluster, each with the CPU cores and the part of a GPU that its run asks for.
 
     Args:
@@ -31,6 +61,7 @@ class RayLauncher:
     """
 
     def __init__(self, address: str):
+        super().__init__()
         try:
             import ray
         except ImportError:
@@ -48,69 +79,26 @@ class RayLauncher:
                     f"--launcher ray: no cluster at {address!r} ({first}); start one with `ray start --head`, "
                     "join other machines with `ray start --address=HEAD:6379`, or give --ray-address"
                 ) from None
-
-        class Worker:
-            """Holds one job's process; `stop` and `kill` come while `wait` waits."""
-
-            def __init__(self, job: Job, cwd: str, fraction: float):
-                self._child = _work(job, cwd, fraction)
-
-            def wait(self) -> int:
-                return self._child.wait()
-
-            def stop(self) -> None:
-                self._child.stop()
-
-            def kill(self) -> None:
-                self._child.kill()
-
         remote: Any = ray.remote
         self._worker = remote(max_concurrency=2, max_restarts=0)(Worker)
-        self._running: list[tuple[Job, Any, Any, float]] = []
+        self._given = 0.0
+        """GPUs."""
 
-    def start(self, job: Job) -> str | None:
-        """See `train.sweep.local.Launcher`."""
+    def _begin(self, job: Job) -> tuple[Any, str, Callable[[], None]] | None:
         total = self._ray.cluster_resources()
-        gpus, cpus = total.get("GPU", 0.0), total.get("CPU", 0.0)
-        fraction = min(1.0, job.factor / job.launch.runs_per_gpu) if gpus else 0.0
-        cpus -= sum(other.launch.cpus_per_run for other, *_ in self._running)
-        gpus -= sum(taken for *_, taken in self._running)
-        if cpus < job.launch.cpus_per_run or gpus < fraction - 1e-9:
+        cpus = total.get("CPU", 0.0) - sum(other.launch.cpus_per_run for other, *_ in self._running)
+        fraction = min(1.0, job.factor / job.launch.runs_per_gpu) if total.get("GPU") else 0.0
+        if cpus < job.launch.cpus_per_run or total.get("GPU", 0.0) - self._given < fraction - 1e-9:
             return None
-        actor = self._worker.options(num_cpus=job.launch.cpus_per_run, num_gpus=fraction).remote(
-            job, os.getcwd(), fraction
-        )
-        self._running.append((job, actor, actor.wait.remote(), fraction))
-        return "ray"
+        room = self._worker.options(num_cpus=job.launch.cpus_per_run, num_gpus=fraction)
+        self._given += fraction
 
-    def ended(self) -> list[tuple[Job, int]]:
-        """See `train.sweep.local.Launcher`."""
-        over, still = [], []
-        for job, actor, result, fraction in self._running:
-            ready, _ = self._ray.wait([result], timeout=0)
-            if not ready:
-                still.append((job, actor, result, fraction))
-                continue
-            try:
-                over.append((job, self._ray.get(result)))
-            except self._ray.exceptions.RayError:
-                over.append((job, LOST))
-            self._ray.kill(actor)
-        self._running = still
-        return over
+        def give_back() -> None:
+            self._given -= fraction
 
-    def stop(self) -> None:
-        """See `train.sweep.local.Launcher`."""
-        for _, actor, _, _ in self._running:
-            actor.stop.remote()
-
-    def kill(self) -> None:
-        """See `train.sweep.local.Launcher`."""
-        done = [actor.kill.remote() for _, actor, _, _ in self._running]
-        with contextlib.suppress(self._ray.exceptions.RayError):
-            self._ray.get(done, timeout=10)
+        return Actor(self._ray, room.remote(job, os.getcwd(), fraction)), "ray", give_back
 
     def close(self) -> None:
-        """See `train.sweep.local.Launcher`."""
+        """Leaves the cluster."""
         if self._mine:
             self._ray.shutdown()

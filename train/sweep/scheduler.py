@@ -8,8 +8,9 @@ import os
 import signal
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
+from interactive_nav_common.config import replace
 from train.sweep.folder import (
     RunState,
     SweepFolder,
@@ -21,6 +22,7 @@ from train.sweep.folder import (
 from train.sweep.jobs import LOCKED, LOST, Job
 from train.sweep.local import Launcher
 from train.sweep.spec import RunSpec
+from train.sweep.table import SweepDisplay
 
 STAGES = ("train", "evaluate")
 POLL_S = 0.5
@@ -71,18 +73,6 @@ class Outcome:
         return 1 if any(s.state != "running" for s in left) else 0
 
 
-class Display(Protocol):
-    """What a person sees."""
-
-    def event(self, text: str, style: str = "") -> None:
-        """Something happened."""
-        ...
-
-    def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:
-        """How far the runs are; must be cheap to call often."""
-        ...
-
-
 class Scheduler:
     """Decides what runs next.
 
@@ -101,7 +91,7 @@ class Scheduler:
         self,
         folder: SweepFolder,
         launcher: Launcher,
-        display: Display,
+        display: SweepDisplay,
         stages: Sequence[str] = STAGES,
         redo: bool = False,
         unfinished: bool = False,
@@ -166,44 +156,33 @@ class Scheduler:
     def _states(self) -> list[RunState]:
         return [self._folder.state(run) for run in self._runs.values()]
 
-    def _to_train(self, states: Sequence[RunState]) -> list[str]:
-        """Runs to train, begun ones first."""
-        if "train" not in self._stages:
-            return []
-        left = [
-            state
-            for state in states
-            if not state.over and state.name not in self._busy and ("train", state.name) not in self._given_up
-        ]
-        return [state.name for state in sorted(left, key=lambda state: state.env_steps == 0)]
-
-    def _to_evaluate(self, states: Sequence[RunState]) -> list[str]:
-        if "evaluate" not in self._stages:
-            return []
-        names = []
-        for state in states:
-            far = state.over or (self._unfinished and state.env_steps > 0)
-            fresh = state.name not in self._redo and self._folder.evaluated(self._runs[state.name])
-            if far and not fresh and state.name not in self._busy and ("evaluate", state.name) not in self._given_up:
-                names.append(state.name)
-        return names
+    def _needs(self, stage: str, state: RunState) -> bool:
+        """Whether a stage is to be run for a run as far as it is."""
+        if stage not in self._stages or state.name in self._busy or (stage, state.name) in self._given_up:
+            return False
+        if stage == "train":
+            return not state.over
+        far = state.over or (self._unfinished and state.env_steps > 0)
+        return far and (state.name in self._redo or not self._folder.evaluated(self._runs[state.name]))
 
     def _waiting(self, states: Sequence[RunState]) -> list[str]:
-        return [*self._to_train(states), *self._to_evaluate(states)]
+        return [state.name for stage in STAGES for state in states if self._needs(stage, state)]
 
-    def _free(self, names: list[str]) -> list[str]:
+    def _free(self, stage: str, states: Sequence[RunState]) -> list[str]:
+        """Runs that need a stage and that nobody else was seen to work on, begun ones first."""
         now = self._clock()
-        return [name for name in names if self._not_before.get(name, 0.0) <= now]
+        left = [s for s in states if self._needs(stage, s) and self._not_before.get(s.name, 0.0) <= now]
+        return [s.name for s in (sorted(left, key=lambda s: s.env_steps == 0) if stage == "train" else left)]
 
     def _start(self, states: list[RunState]) -> list[RunState]:
         """Starts what there is room for: training first, then evaluation."""
-        for name in self._free(self._to_train(states)):
+        for name in self._free("train", states):
             command = words_of_training(self._folder, name, self._programs.train)
-            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.threads:
+            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.physics.threads:
                 command = [*command, f"env.threads={_threads(self._runs[name])}"]
             if not self._begin("train", [name], command):
                 return states
-        for group in self._groups(self._free(self._to_evaluate(states))):
+        for group in self._groups(self._free("evaluate", states)):
             command = words_of_evaluation(self._folder, group, self._programs.evaluate)
             if not self._begin("evaluate", group, command):
                 return states
@@ -213,7 +192,7 @@ class Scheduler:
         """Runs to evaluate by one process each: those of one environment (k_int is in no score)."""
         kinds: dict[Any, list[str]] = {}
         for name in names:
-            env = dataclasses.replace(self._runs[name].config.env, k_int=0.0)
+            env = replace(self._runs[name].config.env, k_int=0.0)
             kinds.setdefault(name if name in self._alone else env, []).append(name)
         size = EVALUATED_TOGETHER
         return [group[i : i + size] for group in kinds.values() for i in range(0, len(group), size)]

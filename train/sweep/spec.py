@@ -11,9 +11,22 @@ from typing import Any
 
 import yaml
 
+from interactive_nav_common.config import (
+    AtLeastOne,
+    Natural,
+    NotNegative,
+    Positive,
+    Settings,
+    flatten,
+    nearest,
+    nested,
+    overlay,
+    settings_help,
+)
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.sets import scene_folders
 from train import config_io
-from train.config import TrainConfig, require, require_positive, validate
+from train.config import TrainConfig, validate
 
 SWEEP_DIR = config_io.PRESET_DIR / "sweeps"
 BARE = ("algorithm", "env.robot")
@@ -22,14 +35,14 @@ PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluateConfig:
+class EvaluateConfig(Settings):
     """The fixed episodes that every trained run plays; see `python -m train.evaluate --help`."""
 
     scenes: tuple[str, ...] = ()
     """Scene folders; empty: those that the run was trained on."""
-    episodes: int = 1000
+    episodes: AtLeastOne = 1000
     """Episodes of each run."""
-    seed: int = 1_000_000
+    seed: Natural = 1_000_000
     """Which episodes."""
     balanced: bool = True
     """Scenes take turns; otherwise each episode draws one."""
@@ -37,47 +50,44 @@ class EvaluateConfig:
     """best, last or a number of env steps."""
     stochastic: bool = True
     """Sample actions instead of taking their mode."""
-    record: int = 8
+    record: Natural = 8
     """First episodes whose paths are kept for pictures."""
-    batch: int | None = None
+    batch: AtLeastOne | None = None
     """Episodes played at a time; auto: by backend."""
 
     def __post_init__(self) -> None:
-        require(self, "episodes batch", 1)
-        require(self, "seed record", 0)
+        super().__post_init__()
         if self.checkpoint not in ("best", "last") and not self.checkpoint.isdecimal():
-            raise ValueError(f"checkpoint is {self.checkpoint!r}, expected best, last or a number of env steps")
+            raise ConfigError(f"checkpoint is {self.checkpoint!r}, expected best, last or a number of env steps")
 
 
 @dataclasses.dataclass(frozen=True)
-class LaunchConfig:
+class LaunchConfig(Settings):
     """How runs share a machine."""
 
-    runs_per_gpu: int = 1
+    runs_per_gpu: AtLeastOne = 1
     """Runs that share a GPU; one that runs out of memory is tried again with twice the share."""
-    gpu_memory_gb: float | None = None
+    gpu_memory_gb: Positive | None = None
     """Memory that one run needs: on GPUs too small for runs_per_gpu of them fewer are packed; auto: not looked at."""
     jax_memory_share: float = 0.6
     """Part of a run's share of the GPU that JAX reserves; the rest is for Warp, the renderer and CUDA."""
-    slots: int = 1
+    slots: AtLeastOne = 1
     """Runs at a time on a machine without a GPU; each gets its part of the cores."""
-    cpus_per_run: int = 1
+    cpus_per_run: AtLeastOne = 1
     """CPU cores that a run reserves on a Ray cluster."""
-    retries: int = 2
+    retries: Natural = 2
     """Times that a crashed run is started again by one command; a refused config or diverged numbers are not."""
-    grace_s: float = 300.0
+    grace_s: NotNegative = 300.0
     """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
 
     def __post_init__(self) -> None:
-        require(self, "runs_per_gpu slots cpus_per_run", 1)
-        require(self, "retries grace_s", 0)
-        require_positive(self, "gpu_memory_gb")
+        super().__post_init__()
         if not 0.0 < self.jax_memory_share <= 1.0:
-            raise ValueError(f"jax_memory_share is {self.jax_memory_share!r}, expected above 0 and at most 1")
+            raise ConfigError(f"jax_memory_share is {self.jax_memory_share!r}, expected above 0 and at most 1")
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepConfig:
+class SweepConfig(Settings):
     """A sweep as its file says it."""
 
     name: str = ""
@@ -148,31 +158,13 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
     Raises:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
-    _mapping(plain, where, "the file")
-    fields = {field.name: field for field in dataclasses.fields(SweepConfig)}
-    made: dict[str, Any] = {}
-    for key, value in plain.items():
-        if key not in fields:
-            raise ConfigError(f"{where}: unknown key {key!r}{config_io.nearest(str(key), list(fields))}")
-        if key in ("evaluate", "launch"):
-            base = EvaluateConfig() if key == "evaluate" else LaunchConfig()
-            made[key] = config_io.overlay(base, {} if value is None else value, where, f"{key}.")
-        elif key in ("grid", "settings"):
-            made[key] = _mapping({} if value is None else value, where, key)
-        elif key in ("overrides", "skip"):
-            if not isinstance([] if value is None else value, list):
-                raise ConfigError(f"{where}: {key}: got {value!r}, expected a list")
-            made[key] = value or []
-        elif not isinstance(value, str):
-            raise ConfigError(f"{where}: {key}: got {value!r} ({type(value).__name__}), expected text")
-        else:
-            made[key] = value
-    made["name"] = made.get("name") or default_name
-    if made["name"] != Path(made["name"]).name or made["name"] == "..":
-        raise ConfigError(f"{where}: name is {made['name']!r}, expected one folder name (out_dir says where it lies)")
-    if not made.get("preset"):
+    config = overlay(SweepConfig(), plain, where)
+    if config.name != Path(config.name).name or config.name == "..":
+        raise ConfigError(f"{where}: name is {config.name!r}, expected one folder name (out_dir says where it lies)")
+    if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
-    return SweepConfig(**made)
+    evaluate = dataclasses.replace(config.evaluate, scenes=scene_folders(config.evaluate.scenes))
+    return dataclasses.replace(config, name=config.name or default_name, evaluate=evaluate)
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
@@ -181,10 +173,10 @@ def expand(config: SweepConfig, where: str) -> Sweep:
     Raises:
         ConfigError: a setting that does not exist, a value it cannot have, or two runs of one name.
     """
-    settings_known = list(config_io.flatten(TrainConfig()))
+    settings_known = list(flatten(TrainConfig()))
     for axis, values in config.grid.items():
         if axis not in settings_known:
-            raise ConfigError(f"{where}: grid: unknown key {axis!r}{config_io.nearest(str(axis), settings_known)}")
+            raise ConfigError(f"{where}: grid: unknown key {axis!r}{nearest(str(axis), settings_known)}")
         if axis in ("run.name", "run.out_dir"):
             raise ConfigError(f"{where}: grid: {axis} is the sweep's own to choose")
         if not isinstance(values, list) or not values:
@@ -204,12 +196,12 @@ def expand(config: SweepConfig, where: str) -> Sweep:
         launch = config.launch
         layers = [config.settings] + [entry["settings"] for entry in overrides if _matches(entry["where"], values)]
         for layer in [*layers, values]:
-            train = config_io.from_dict(_nested(layer, told), train, told)
+            train = config_io.from_dict(nested(layer.items(), told), train, told)
         for entry in overrides:
             if _matches(entry["where"], values):
-                launch = config_io.overlay(launch, entry["launch"], told, "launch.")
+                launch = overlay(launch, entry["launch"], told, "launch.")
         run = dataclasses.replace(train.run, name=name, out_dir=str(root / "runs"))
-        train = dataclasses.replace(train, run=run)
+        train = config_io.with_scenes(dataclasses.replace(train, run=run))
         validate(train)
         if name in runs:
             raise ConfigError(f"{where}: two runs are named {name!r}; give the grid values that can be told apart")
@@ -254,42 +246,13 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
 
 def help_text() -> str:
     """One line for each key of a sweep's file."""
-    lines: list[tuple[str, str]] = []
-    for prefix, part in (("", SweepConfig()), ("evaluate.", EvaluateConfig()), ("launch.", LaunchConfig())):
-        docs = config_io.field_docs(type(part))
-        for field in dataclasses.fields(part):
-            value = getattr(part, field.name)
-            if not dataclasses.is_dataclass(value):
-                shown = config_io.AUTO if value is None else value if isinstance(value, (str, int, float)) else ""
-                lines.append((f"{prefix}{field.name}: {shown}", docs[field.name]))
-    width = max(len(left) for left, _ in lines) + 2
-    return "\n".join(f"  {left:<{width}}{doc}" for left, doc in lines)
+    return settings_help(SweepConfig(), equals=": ")
 
 
 def _mapping(value: Any, where: str, what: str) -> Any:
     if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}: {what}: got {value!r} ({type(value).__name__}), expected a mapping of settings")
+        raise ConfigError(f"{where}: {what}: got {value!r}, expected a mapping")
     return value
-
-
-def _nested(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Dotted keys taken apart; nested ones stay."""
-    nested: dict[str, Any] = {}
-    for key, value in settings.items():
-        *sections, last = str(key).split(".")
-        place = nested
-        for section in sections:
-            place = place.setdefault(section, {})
-            if not isinstance(place, dict):
-                raise ConfigError(f"{where}: {key}: {section} has a value already")
-        if isinstance(value, Mapping):
-            inner = place.setdefault(last, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"{where}: {key}: has a value already")
-            inner.update(_nested(value, where))
-        else:
-            place[last] = value
-    return nested
 
 
 def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
@@ -297,7 +260,7 @@ def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
     _mapping(entry, where, "the entry")
     for key in entry:
         if key not in known:
-            raise ConfigError(f"{where}: unknown key {key!r}{config_io.nearest(str(key), known)}")
+            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), known)}")
     made = {key: _mapping(entry.get(key) or {}, where, key) for key in known}
     return {**made, "where": _where(made["where"], config, where)}
 
@@ -307,7 +270,7 @@ def _where(entry: Any, config: SweepConfig, where: str) -> dict[str, list[Any]]:
     wanted = {}
     for axis, value in _mapping(entry, where, "where").items():
         if axis not in config.grid:
-            near = config_io.nearest(str(axis), list(config.grid))
+            near = nearest(str(axis), list(config.grid))
             raise ConfigError(f"{where}: {axis!r} is no axis of the grid{near}; axes: {', '.join(config.grid)}")
         values = value if isinstance(value, list) and value not in config.grid[axis] else [value]
         for item in values:
@@ -324,7 +287,7 @@ def _matches(wanted: Mapping[str, list[Any]], values: Mapping[str, Any]) -> bool
 def _filled(preset: str, values: Mapping[str, Any], where: str) -> str:
     def value_of(match: re.Match[str]) -> str:
         if match[1] not in values:
-            near = config_io.nearest(match[1], list(values))
+            near = nearest(match[1], list(values))
             raise ConfigError(f"{where}: preset: {{{match[1]}}} is no axis of the grid{near}")
         return str(values[match[1]])
 

@@ -17,9 +17,9 @@ import math
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.gait import GRAVITY_M_S2, check_mode
-from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap
-from interactive_nav_common.rotations import rotate_back
+from interactive_nav.metrics import GRAVITY
+from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, check_mode, set_servo
+from interactive_nav_common.rotations import rotate_back, yaw_from_quat
 
 MASS_KG = 0.5
 INERTIA = (0.0023, 0.0023, 0.004)
@@ -91,16 +91,8 @@ def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
             gear = [0.0] * 6
             gear[k] = 1.0
             gain = 30.0 * (MASS_KG if k < 3 else INERTIA[k - 3])
-            spec.add_actuator(
-                name=name,
-                target="quadrotor_centre",
-                trntype=mujoco.mjtTrn.mjTRN_SITE,
-                gear=gear,
-                gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                gainprm=[gain] + [0.0] * 9,
-                biasprm=[0.0, 0.0, -gain] + [0.0] * 7,
-            )
+            centre, site = "quadrotor_centre", mujoco.mjtTrn.mjTRN_SITE
+            set_servo(spec.add_actuator(name=name, target=centre, trntype=site, gear=gear), (0.0, gain), None)
         return
     for name, spin in zip(ROTORS, _SPIN, strict=True):
         spec.add_actuator(
@@ -115,7 +107,7 @@ def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
 
 def _thrusts(acceleration_up, angular_acceleration, xp):
     """Body-frame specific thrust [...] and angular acceleration [..., 3] to four thrusts [..., 4] in 0 .. 10 N."""
-    torque = angular_acceleration * xp.asarray(INERTIA)
+    torque = angular_acceleration * xp.broadcast_to(xp.asarray(INERTIA), angular_acceleration.shape)
     wrench = xp.concatenate([MASS_KG * acceleration_up[..., None], torque], -1)
     return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
 
@@ -132,8 +124,7 @@ def _rate_law(command, state, xp):
 def _velocity_law(command, state, xp):
     """(vx, vy, vz m/s along the heading, yaw rate rad/s) to thrusts."""
     quat, velocity_w = state.qpos[..., 3:7], state.qvel[..., :3]
-    w, x, y, z = (quat[..., k] for k in range(4))
-    heading = xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    heading = yaw_from_quat(quat)
     cos, sin = xp.cos(heading), xp.sin(heading)
     wanted_w = xp.stack(
         [
@@ -144,15 +135,15 @@ def _velocity_law(command, state, xp):
         -1,
     )
     lift = _VELOCITY_GAIN * (wanted_w - velocity_w)
-    most = GRAVITY_M_S2 * math.tan(MAX_TILT_RAD)
+    most = GRAVITY * math.tan(MAX_TILT_RAD)
     across = xp.clip(lift[..., :2], -most, most)
-    up = xp.clip(lift[..., 2:], -0.5 * GRAVITY_M_S2, GRAVITY_M_S2) + GRAVITY_M_S2
+    up = xp.clip(lift[..., 2:], -0.5 * GRAVITY, GRAVITY) + GRAVITY
     thrust_w = xp.concatenate([across, up], -1)
     size = xp.sqrt((thrust_w**2).sum(-1, keepdims=True))
     # The thrust axis in the body frame is z; turning it onto the wanted direction d takes z x d.
     d = rotate_back(quat, thrust_w / size)
-    yaw_rate_w = xp.stack([0 * w, 0 * w, command[..., 3]], -1)
-    rates = rotate_back(quat, yaw_rate_w) + _TILT_GAIN * xp.stack([-d[..., 1], d[..., 0], 0 * w], -1)
+    yaw_rate_w = xp.stack([0 * heading, 0 * heading, command[..., 3]], -1)
+    rates = rotate_back(quat, yaw_rate_w) + _TILT_GAIN * xp.stack([-d[..., 1], d[..., 0], 0 * heading], -1)
     thrust = MASS_KG * size[..., 0] * xp.maximum(d[..., 2], 0.0)
     return _fly_rates(xp.clip(rates, -MAX_RATE_RAD_S, MAX_RATE_RAD_S), thrust, state, xp)
 
@@ -176,7 +167,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...], C
         ("roll rate rad/s", "pitch rate rad/s", "yaw rate rad/s", "total thrust N"),
         (-MAX_RATE_RAD_S, -MAX_RATE_RAD_S, -MAX_YAW_RAD_S, 0.0),
         # Action 0 hovers: the middle of the range is the weight.
-        (MAX_RATE_RAD_S, MAX_RATE_RAD_S, MAX_YAW_RAD_S, 2 * MASS_KG * GRAVITY_M_S2),
+        (MAX_RATE_RAD_S, MAX_RATE_RAD_S, MAX_YAW_RAD_S, 2 * MASS_KG * GRAVITY),
         _rate_law,
     ),
     "thrust": (tuple(f"{name[16:]} rotor N" for name in ROTORS), (0.0,) * 4, (MAX_THRUST_N,) * 4, None),
@@ -209,11 +200,13 @@ def quadrotor(control_mode: str = "native") -> RobotSpec:
     """
     check_mode("quadrotor", control_mode, _MODES)
     names, low, high, law = _TABLE["velocity" if control_mode == "native" else control_mode]
+    velocity = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 1.0))
     drive = {
-        "velocity": ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 1.0)),
+        "native": velocity,
+        "velocity": velocity,
         "kinematic": ((1.0, 0.0), *((0.0, 0.0),) * 4, (0.0, 1.0)),
         "twist": ((1.0, 0.0), (0.0, 1.0)),
-    } | {"native": ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 1.0))}
+    }
     matrix = drive.get(control_mode)
     return RobotSpec(
         name="quadrotor",

@@ -19,13 +19,13 @@ from interactive_nav.types import EpisodeStart
 from scenes_mjcf.schema import SceneError
 
 DRAWS = 10_000
-CONFIG = NavConfig(num_objects=10)
+CONFIG = NavConfig.of(num_objects=10)
 
 
 @pytest.fixture(scope="module")
 def built(two_rooms):
     world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), CONFIG)
-    return world, build_tables(world, CONFIG)
+    return world, build_tables(world, CONFIG.rules)
 
 
 @pytest.fixture(scope="module")
@@ -211,10 +211,10 @@ def test_what_cannot_be_met_is_taken_for_nearest_and_told(built):
 
 def test_distances_that_no_pair_has_are_refused(two_rooms):
     # From corner to corner the straight line would be 5.6 m, but the partition's gap is a way round of 5.8 m.
-    config = NavConfig(num_objects=0, min_goal_distance_m=5.6, max_goal_distance_m=5.62)
+    config = NavConfig.of(num_objects=0, min_goal_distance_m=5.6, max_goal_distance_m=5.62)
     world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), config)
     with pytest.raises(SceneError, match="no start and goal of robot 'turtlebot' are at least 5.6 m apart and at most"):
-        build_tables(world, config)
+        build_tables(world, config.rules)
 
 
 def test_an_episode_off_its_distances_is_counted(room):

@@ -49,7 +49,7 @@ def world(tmp_path_factory):
     b = write_room(folder / "b", (1.6, 3.0), ())
     c = write_room(folder / "c", (4.0, 3.0), (("basket", 0.55, 0.0, BLOCK_KG, BLOCK_FRICTION),))
     scenes = (load_scene(a), load_scene(b), load_scene(c))
-    return build_world(get_robot("turtlebot"), scenes, NavConfig(num_objects=0, **CONTACTS))
+    return build_world(get_robot("turtlebot"), scenes, NavConfig.of(num_objects=0, **CONTACTS))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +87,7 @@ def trajectory(world, backend, settings=CONTACTS):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_backend, "summarise_forces", watched)
         patch.setattr(mjx_batch, "summarise_forces", watched)
-        config = NavConfig(backend=backend, num_objects=0, sleep=False, **settings)
+        config = NavConfig.of(backend=backend, num_objects=0, sleep=False, **settings)
         step = jax.jit(jax.vmap(make_physics(world, config).step))
         qpos = world.rest_qpos[SCENE].copy()
         qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
@@ -231,7 +231,7 @@ def test_mjx_warp_agrees_with_c_mujoco(world, native, mjx_warp):
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_WARP, reason="the package warp-lang (extra 'warp') is not installed")
 def test_overflowing_buffers_are_counted(world):
-    config = NavConfig(backend="warp", num_objects=0, contacts_per_env=2, constraints_per_env=16, **CONTACTS)
+    config = NavConfig.of(backend="warp", num_objects=0, contacts_per_env=2, constraints_per_env=16, **CONTACTS)
     physics = make_physics(world, config)
     still = jnp.zeros((len(SCENE), world.models[0].nv), jnp.float32)
     state = PhysicsState(jnp.asarray(world.rest_qpos[SCENE], jnp.float32), still, still)
@@ -240,7 +240,7 @@ def test_overflowing_buffers_are_counted(world):
 
 
 def test_sleep_changes_nothing_that_moves(world, native):
-    physics = make_physics(world, NavConfig(backend="native", num_objects=0, sleep=True, **CONTACTS))
+    physics = make_physics(world, NavConfig.of(backend="native", num_objects=0, sleep=True, **CONTACTS))
     qpos = world.rest_qpos[SCENE].copy()
     qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
     qpos[:, 0] = START_X
@@ -281,7 +281,8 @@ def _first_step_speed(limit: str, joint: str, mjx_jax: bool) -> float:
     model = mujoco.MjModel.from_xml_string(xml)
     if mjx_jax:
         data = mjx.make_data(model, impl="jax").replace(ctrl=jnp.array([25.0]))
-        return float(jax.jit(mjx.step)(mjx.put_model(model, impl="jax"), data).qvel[0])
+        with jax.numpy_rank_promotion("allow"):  # MJX counts on it
+            return float(jax.jit(mjx.step)(mjx.put_model(model, impl="jax"), data).qvel[0])
     data = mujoco.MjData(model)
     data.ctrl[:] = 25.0
     mujoco.mj_step(model, data)

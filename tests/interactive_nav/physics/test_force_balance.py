@@ -23,6 +23,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes import spec as spec_module
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
+from interactive_nav_common.config import replace
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
@@ -68,7 +69,7 @@ def make_world(folder, **settings):
     for i, (kg, mu) in enumerate(BLOCKS):
         write_room(folder / str(i), (8.0, 3.0), (("basket", 0.55, 0.0, kg, mu),))
         scenes.append(load_scene(folder / str(i)))
-    config = NavConfig(num_objects=0, sleep=False, **settings)
+    config = NavConfig.of(num_objects=0, sleep=False, **settings)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
         return build_world(get_robot("turtlebot"), tuple(scenes), config), config
@@ -130,7 +131,7 @@ def run(world, config, backend, cases: Sequence[int] = range(len(CASES))) -> Pus
         patch.setattr(native_backend, "summarise_forces", watched)
         patch.setattr(mjx_batch, "summarise_forces", watched)
         patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
-        physics = make_physics(world, dataclasses.replace(config, backend=backend))
+        physics = make_physics(world, replace(config, backend=backend))
         _read_both(physics, world)
         step = jax.jit(jax.vmap(physics.step))
         qpos = world.rest_qpos[scene].copy()

@@ -33,7 +33,7 @@ def world(tmp_path_factory):
     base = tmp_path_factory.mktemp("window")
     full = write_room(base / "full", (8.0, 5.0), FURNITURE)
     empty = write_room(base / "empty", (3.0, 3.0), (("basket", 0.7, 0.0, 1.0, 0.3),))
-    return build_world(get_robot("turtlebot"), (load_scene(full), load_scene(empty)), NavConfig(num_objects=2))
+    return build_world(get_robot("turtlebot"), (load_scene(full), load_scene(empty)), NavConfig.of(num_objects=2))
 
 
 def _state(world, scene, robot_xy=(0.0, 0.0)):
@@ -45,8 +45,8 @@ def _state(world, scene, robot_xy=(0.0, 0.0)):
 
 @pytest.mark.parametrize("scene", [0, 1])
 def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
-    window = Window(world, NavConfig(num_objects=2, **ALL))
-    assert window.complete
+    window = Window(world, NavConfig.of(num_objects=2, **ALL))
+    assert sum(group.width for group in window.groups) == world.layout.num_slots
     chosen, walls, missed = window.select(jnp.asarray(scene), _state(world, scene))
     fields, model, inner, outer = window.fields(jnp.asarray(scene), chosen, walls), world.models[scene], window, world
     assert int(missed) == 0 and set(fields) == set(FIELDS)
@@ -74,7 +74,7 @@ def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
 
 
 def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world):
-    two = Window(world, NavConfig(num_objects=2, active_furniture=2))
+    two = Window(world, NavConfig.of(num_objects=2, active_furniture=2))
     kinds = {tuple(g.slots): i for i, g in enumerate(two.groups)}
     free = next(i for slots, i in kinds.items() if len(slots) == 4)
     group = two.groups[free]
@@ -85,13 +85,13 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
 
     assert names((0.0, 0.0)) == ({"chair_0", "chair_1"}, 0)
     assert names((-2.0, 0.0))[0] >= {"table_1"}
-    one = Window(world, NavConfig(num_objects=2, active_furniture=1))
+    one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
     # Between the chairs both are within 0.18 + 0.6 m; only one is simulated.
     assert int(one.select(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
 
 
 def test_a_moving_object_outranks_one_at_rest(world):
-    one = Window(world, NavConfig(num_objects=2, active_furniture=1))
+    one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
     state = _state(world, 0)
     slot = world.names[0].index("chair_1")
     moving = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[slot]].set(0.5))
@@ -101,7 +101,7 @@ def test_a_moving_object_outranks_one_at_rest(world):
 
 
 def test_enter_and_leave_are_inverse(world):
-    window = Window(world, NavConfig(num_objects=2, active_furniture=2))
+    window = Window(world, NavConfig.of(num_objects=2, active_furniture=2))
     state = _state(world, 0)
     key = jax.random.PRNGKey(0)
     state = state.replace(qpos=state.qpos + 0.01 * jax.random.normal(key, state.qpos.shape))
@@ -122,7 +122,7 @@ def test_a_push_in_a_window_is_that_of_the_whole_building(world):
     """The robot pushes one chair into the next for 1.5 s: C MuJoCo with everything, MJX-JAX with two of four."""
 
     def run(backend, **settings):
-        physics = make_physics(world, NavConfig(backend=backend, num_objects=2, sleep=False, **settings))
+        physics = make_physics(world, NavConfig.of(backend=backend, num_objects=2, sleep=False, **settings))
         state = jax.tree.map(lambda x: x[None], _state(world, 0))
         step = jax.jit(jax.vmap(physics.step))
         for _ in range(15):

@@ -70,7 +70,7 @@ def test_the_robots_own_view_is_the_sensors_view(scene_and_state):
 def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes):
     """The second basket is 8 to both, and a desk 4 or, apart from tables, 11."""
     room = write_room(tmp_path / "room", blocks=(("desk", 0.7, 0.5, 9.0, 0.5),))
-    config = NavConfig(num_objects=6, segmentation_classes=classes)
+    config = NavConfig.of(num_objects=6, segmentation_classes=classes)
     world = build_world(get_robot("turtlebot"), (load_scene(room),), config)
     env = types.SimpleNamespace(world=world, scenes=world.scenes, sensors=Sensors(world, config, "native"))
     qpos = world.rest_qpos[0].copy()
@@ -85,7 +85,7 @@ def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes):
     observed = set(np.unique(env.sensors.boxes.class_id[0]))
     assert seen == observed | {1} and {6, 8, 4 if classes == 4 else 11} <= seen
     view = SceneView(get_robot("turtlebot"), world.scenes[0], pick(6), classes)
-    assert set(np.unique(view._class)) == seen
+    assert set(np.unique(view.class_id)) == seen
     assert CLASSES[8] == "basket" and CLASSES[7] == "pot" and CLASSES[10] == "shoe"
     np.testing.assert_allclose(PALETTE[: len(CLASS_COLOURS)], CLASS_COLOURS, atol=1e-6)
 

@@ -217,9 +217,7 @@ import matplotlib
 matplotlib.use("svg")
 from matplotlib import pyplot
 import interactive_nav.topdown
-from interactive_nav.robot_study import picture
-from interactive_nav.robots import get_robot
-picture._with_matplotlib(*picture.stage(get_robot("turtlebot")))
+import interactive_nav.robot_study.picture
 print(matplotlib.get_backend(), pyplot.get_fignums())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -43,7 +43,7 @@ def hall(folder: Path):
 
 def hall_world(robot: RobotSpec, folder: Path) -> World:
     """The robot's models in the hall."""
-    return build_world(robot, (hall(folder),), NavConfig(num_objects=0))
+    return build_world(robot, (hall(folder),), NavConfig.of(num_objects=0))
 
 
 def move(world: World, commands: np.ndarray, backend: str = "native") -> Motion:
@@ -54,7 +54,7 @@ def move(world: World, commands: np.ndarray, backend: str = "native") -> Motion:
         commands: [T, N, A], in the commands' units, of T control steps and N runs side by side.
         backend: of the physics.
     """
-    physics = make_physics(world, NavConfig(backend=backend, num_objects=0))
+    physics = make_physics(world, NavConfig.of(backend=backend, num_objects=0))
     steps, runs, _ = commands.shape
     layout = world.layout
     qpos = np.repeat(world.rest_qpos[:1], runs, 0)

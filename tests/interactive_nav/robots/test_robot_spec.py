@@ -75,11 +75,11 @@ def brake_world(tmp_path_factory):
 
     robot = dataclasses.replace(get_robot("turtlebot"), control=law, control_every_substep=True)
     scene = load_scene(write_room(tmp_path_factory.mktemp("law") / "room", (4.0, 3.0), ()))
-    return build_world(robot, (scene,), NavConfig(num_objects=0))
+    return build_world(robot, (scene,), NavConfig.of(num_objects=0))
 
 
 def _run(world, backend, periods=4):
-    physics = make_physics(world, NavConfig(backend=backend, num_objects=0, sleep=False))
+    physics = make_physics(world, NavConfig.of(backend=backend, num_objects=0, sleep=False))
     qpos = np.repeat(world.rest_qpos[:1], 2, 0)
     qpos[:, :7] = [0, 0, 0, 1, 0, 0, 0]
     still = jnp.zeros((2, world.models[0].nv), jnp.float32)

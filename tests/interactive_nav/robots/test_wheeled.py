@@ -36,7 +36,7 @@ def _simulate(robot, model, data, action, seconds):
 
 def _alone(robot):
     """The robot alone in an empty hall, at home: model and data."""
-    world = build_world(robot, (hall(()),), NavConfig(num_objects=0))
+    world = build_world(robot, (hall(()),), NavConfig.of(num_objects=0))
     model = world.models[0]
     data = mujoco.MjData(model)
     data.qpos[:] = world.rest_qpos[0]
@@ -89,7 +89,7 @@ def test_pushing_at_constant_speed_balances_the_floors_friction(name):
     robot, load = get_robot(name, "twist"), LOADS[1 if name != "turtlebot" else 0]
     front = 0.6
     scene = hall((box(load, front + load.half_m[0], 0.0),))
-    world = build_world(robot, (scene,), NavConfig(num_objects=0))
+    world = build_world(robot, (scene,), NavConfig.of(num_objects=0))
     model = world.models[0]
     data = mujoco.MjData(model)
     data.qpos[:] = world.rest_qpos[0]
@@ -368,7 +368,7 @@ def test_everything_has_a_name_and_only_primitives_collide(name):
 
 
 def test_pictures_need_no_display():
-    image = picture(get_robot("jackrabbot2"), renderer="matplotlib")
+    image = picture(get_robot("jackrabbot2"), renderer="rays")
     assert image.shape == (480, 480, 3) and image.dtype == np.uint8
     ink = (image < 200).any(-1)
     assert 0.05 < ink.mean() < 0.7  # a robot, on a light ground

@@ -47,7 +47,7 @@ class _Stage:
     """One robot before one door, stepped like the environment does."""
 
     def __init__(self, robot, door):
-        config = NavConfig(backend="native", num_objects=0, sleep=False, threads=1)
+        config = NavConfig.of(backend="native", num_objects=0, sleep=False, threads=1)
         self.robot, self.world = robot, build_world(robot, (hall((door,)),), config)
         self._step = jax.jit(make_physics(self.world, config).step)
         qpos = self.world.rest_qpos[0].copy()

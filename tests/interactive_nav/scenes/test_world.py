@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from interactive_nav.config import NavConfig
+from interactive_nav.config import NavConfig, TaskRules
 from interactive_nav.navigation.tables import build_tables, furniture_map
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes import objects
@@ -20,7 +20,7 @@ from tests.toys import write_room
 
 @pytest.fixture(scope="module")
 def world(room, two_rooms):
-    return build_world(get_robot("turtlebot"), (load_scene(room), load_scene(two_rooms)), NavConfig(num_objects=3))
+    return build_world(get_robot("turtlebot"), (load_scene(room), load_scene(two_rooms)), NavConfig.of(num_objects=3))
 
 
 def test_slots_masses_and_names(world):
@@ -34,7 +34,11 @@ def test_slots_masses_and_names(world):
     )
     np.testing.assert_allclose(world.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
     assert world.robot_mass_kg == pytest.approx(2.673)
-    assert world.settle_m.max() < 0.01
+    for model, rest in zip(world.models, world.rest_qpos, strict=True):
+        furniture = [
+            at for kind, at in zip(world.layout.slot_kind, world.layout.slot_qpos, strict=True) if kind == "free"
+        ]
+        assert max(np.abs(rest[at : at + 3] - model.qpos0[at : at + 3]).max() for at in furniture) < 0.01
 
 
 def test_models_of_different_scenes_have_one_structure(world):
@@ -107,20 +111,20 @@ def test_small_objects_are_of_four_kinds_with_real_masses():
 def test_hulls_take_one_scene_only(room, two_rooms):
     scenes = (load_scene(room), load_scene(two_rooms))
     with pytest.raises(ValueError, match="collision='hulls' with 2 scenes"):
-        build_world(get_robot("turtlebot"), scenes, NavConfig(collision="hulls"))
+        build_world(get_robot("turtlebot"), scenes, NavConfig.of(collision="hulls"))
     with pytest.raises(ValueError, match="scenes is empty"):
         build_world(get_robot("turtlebot"), (), NavConfig())
 
 
 def test_a_scene_with_no_room_is_refused(tmp_path):
     closet = load_scene(write_room(tmp_path / "closet", (1.0, 0.8), blocks=()))
-    world = build_world(get_robot("turtlebot"), (closet,), NavConfig(num_objects=0))
+    world = build_world(get_robot("turtlebot"), (closet,), NavConfig.of(num_objects=0))
     with pytest.raises(SceneError, match="no room for a start and a goal 1.0 m apart"):
-        build_tables(world, NavConfig(num_objects=0))
+        build_tables(world, TaskRules(num_objects=0))
     slit = load_scene(write_room(tmp_path / "slit", (3.0, 0.3), blocks=()))
-    world = build_world(get_robot("turtlebot"), (slit,), NavConfig(num_objects=0))
+    world = build_world(get_robot("turtlebot"), (slit,), NavConfig.of(num_objects=0))
     with pytest.raises(SceneError, match="no room for robot 'turtlebot'"):
-        build_tables(world, NavConfig(num_objects=0))
+        build_tables(world, TaskRules(num_objects=0))
 
 
 @pytest.mark.parametrize(
@@ -166,7 +170,7 @@ def test_a_door_keeps_its_range_in_radians_and_swings(world):
 
 
 def test_goals_and_starts_are_clear_of_furniture_and_walls(world, two_rooms):
-    tables = build_tables(world, NavConfig(num_objects=3))
+    tables = build_tables(world, TaskRules(num_objects=3))
     scene = world.scenes[1]
     cubes = np.array([[1.2, 0.0], [-1.2, 1.0]])  # 0.4 m cubes, see the fixture
     goals = np.asarray(tables.goal_xy_w[1])[: int(tables.num_goals[1])]

@@ -8,7 +8,7 @@ import pytest
 
 from interactive_nav.robots.spec import Camera
 from interactive_nav.sensing.base import look_along
-from interactive_nav.sensing.boxes import box_poses, with_robot
+from interactive_nav.sensing.boxes import box_poses
 from interactive_nav.sensing.mount import make_mount
 from scenes_mjcf.categories import class_id
 
@@ -46,17 +46,6 @@ def test_box_poses_equal_c_mujocos(world, boxes, jumble):
             np.testing.assert_allclose(axes[i, b], data.geom_xmat[geom].reshape(3, 3), atol=1e-5)
             compared += 1
     assert compared > 60
-
-
-def test_a_box_about_the_robot_follows_it(world, boxes, jumble):
-    scene, qpos, _, _ = jumble
-    more = with_robot(boxes, world)
-    assert more.num_boxes == boxes.num_boxes + 1
-    centre, _ = jax.jit(lambda s, q: box_poses(more, s, q))(scene, qpos)
-    at = world.layout.robot_qpos
-    np.testing.assert_allclose(centre[:, -1, :2], qpos[:, at : at + 2], atol=1e-5)
-    before, _ = jax.jit(lambda s, q: box_poses(boxes, s, q))(scene, qpos)
-    np.testing.assert_allclose(centre[:, :-1], before, atol=1e-6)
 
 
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><freejoint name="free"/><geom size=".1"/>

@@ -27,7 +27,7 @@ ALL = ("goal", "velocity", "waypoints", "localisation", "odometry", "collision",
 
 @pytest.fixture(scope="module")
 def world(room):
-    return build_world(get_robot("turtlebot"), (load_scene(room),), NavConfig(num_objects=0))
+    return build_world(get_robot("turtlebot"), (load_scene(room),), NavConfig.of(num_objects=0))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def moment(world):
 
 
 def sense(world, moment, **settings):
-    sensors = Sensors(world, NavConfig(num_objects=0, **settings), "native")
+    sensors = Sensors(world, NavConfig.of(num_objects=0, **settings), "native")
     return sensors, jax.jit(sensors.observe)(*moment)
 
 
@@ -192,7 +192,7 @@ def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
 )
 def test_bad_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
-        NavConfig(**settings)
+        NavConfig.of(**settings)
 
 
 def test_no_sensor_uses_the_key_that_the_next_episode_is_drawn_from():

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import interactive_nav
-from interactive_nav.config import ORIGINAL_CODE, make_config, original_code
+from interactive_nav.config import ORIGINAL_CODE, make_config
 from interactive_nav.scenes.contacts import from_sensors, rolling_geoms, sensor_addresses
 from interactive_nav.task.env import SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import EpisodeStart
+from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
 from tests.toys import write_room
 
@@ -59,7 +60,7 @@ _RESETS: dict[bool, Any] = {}
 
 def begin(env, goal=(1.6, 0.0), x=-0.7):
     """First state, which only options of waypoints and potential change: the others share a compiled reset."""
-    special = env.config.waypoint_style != "ahead" or env.config.potential != "continuous"
+    special = env.config.rules.waypoint_style != "ahead" or env.config.rules.potential != "continuous"
     if special or False not in _RESETS:
         reset = jax.jit(jax.vmap(env.reset_to))
         _RESETS[special] = reset
@@ -90,7 +91,7 @@ def paper(pushed):
 
 
 def test_the_original_code_at_once():
-    config = original_code(episode_steps=200)
+    config = make_config(variant="code", episode_steps=200)
     changed = {k: getattr(config, k) for k in ORIGINAL_CODE}
     assert changed == {**ORIGINAL_CODE, "episode_steps": 200}
     assert ORIGINAL_CODE["episode_steps"] == 500 and not config.bootstrap_at_time_limit
@@ -254,7 +255,7 @@ def test_robot_mass_variants_and_gravity(pushed, paper):
         assert float(last.metrics["kinematic_effort"][0]) == pytest.approx(kinematic, rel=1e-4)
         assert float(last.metrics["dynamic_effort"][0]) == pytest.approx(dynamic, rel=1e-4)
     heavy = dataclasses.replace(env.robot, root_link_kg=1.0)
-    other = interactive_nav.InteractiveNav(heavy, env.scenes, dataclasses.replace(env.config, robot_mass="links"))
+    other = interactive_nav.InteractiveNav(heavy, env.scenes, replace(env.config, robot_mass="links"))
     assert other.score_mass_kg == pytest.approx(1.673)
 
 

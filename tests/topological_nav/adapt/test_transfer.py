@@ -17,7 +17,7 @@ from topological_nav.__main__ import main
 from topological_nav.adapt import adaptation, transfer
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import load_passages, load_rooms
-from topological_nav.errors import DatasetError, RunError
+from topological_nav.errors import DatasetError, RunError, Stopped
 from topological_nav.learn.runs import run_epochs
 from topological_nav.learn.training import load_trained, localisation
 from topological_nav.maps.graph import load_map
@@ -119,7 +119,8 @@ def test_a_stopped_adaptation_goes_on_to_the_same_weights(made, alexnet, adapted
     out = tmp_path / "stopped"
     places = alexnet, made.data, made.data, out, SHORT
     told = []
-    assert adaptation.adapt_features(*places, told.append, lambda: True) is None
+    with pytest.raises(Stopped):
+        adaptation.adapt_features(*places, told.append, lambda: 2)
     assert len(told) == 1 and "epoch 1 of 2" in told[0] and not (out / "network.json").exists()
     assert adaptation.adapt_features(*places) is not None
     assert same(weights(out), weights(adapted[0]))
@@ -135,16 +136,18 @@ def counting(out, epochs, stop_after=None):
         return {"n": 2 * learner["n"] + 1}, {"loss": learner["n"].astype(float)}
 
     start = {"n": np.array(1)}
-    learner = run_epochs(
-        out, "count", start, epoch, epochs, jax.random.PRNGKey(0), told.append, lambda: len(told) == stop_after
-    )
-    return None if learner is None else int(learner["n"]), len(told)
+    stop = lambda: 15 * (len(told) == stop_after)  # noqa: E731
+    try:
+        learner = run_epochs(out, "count", start, epoch, epochs, jax.random.PRNGKey(0), told.append, stop)
+    except Stopped as stopped:
+        return f"stopped by signal {stopped.args[0]}", len(told)
+    return int(learner["n"]), len(told)
 
 
 def test_epochs_go_on_where_they_stopped_and_lines_that_were_lost_are_written_again(tmp_path):
     out = tmp_path / "stopped"
     out.mkdir()
-    assert counting(out, 4, stop_after=2) == (None, 2)
+    assert counting(out, 4, stop_after=2) == ("stopped by signal 15", 2)
     # As if killed after a line was written and before its checkpoint.
     with open(out / "metrics.jsonl", "a") as file:
         file.write(json.dumps({"phase": "count", "epoch": 3, "loss": 99.0}) + "\n")
@@ -198,9 +201,11 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_weights(made, configurations,
     out = tmp_path / "stopped"
     places = made.passages, made.data, out, SHORT
     asked = []
-    assert transfer.passage_configurations(*places, should_stop=lambda: asked.append(1) is None) is None
-    seen = iter([False, False, True])
-    assert transfer.passage_configurations(*places, should_stop=lambda: next(seen)) is None
+    with pytest.raises(Stopped):
+        transfer.passage_configurations(*places, should_stop=lambda: asked.append(1) is None)
+    seen = iter([0, 0, 15])
+    with pytest.raises(Stopped):
+        transfer.passage_configurations(*places, should_stop=lambda: next(seen))
     results = transfer.passage_configurations(*places)
     assert results == configurations[1]
     assert same(weights(out), weights(configurations[0]))

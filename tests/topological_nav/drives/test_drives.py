@@ -16,6 +16,7 @@ from interactive_nav_common.errors import UserError
 from tests.topological_nav.conftest import DRIVEN
 from topological_nav.__main__ import main
 from topological_nav.config import DriveConfig
+from topological_nav.data.folders import lens_of
 from topological_nav.data.shards import read_shard
 from topological_nav.drives import dataset as driving
 from topological_nav.drives.fleet import make_env
@@ -73,7 +74,7 @@ def test_commands_stay_within_bounds_and_move_the_robot(drives):
 
 def test_images_are_what_the_robot_saw(drives, driven, painted):
     robot, scene = get_robot("ttbot"), load_scene(painted)
-    renderer = SceneRenderer(scene, driving.lens_of(CONFIG, robot), 1)
+    renderer = SceneRenderer(scene, lens_of(CONFIG, robot), 1)
     seen = 0
     for rows, images in driving.drive_images(driven):
         assert len(images) == drives.steps[rows].sum() and images.shape[1:] == (32, 32, 3)
@@ -109,14 +110,14 @@ def test_an_interrupted_folder_is_completed_to_the_same(drives, driven, painted,
 
 
 def test_other_settings_and_other_folders_are_refused(driven, painted, tmp_path, capsys):
-    with pytest.raises(DatasetError, match="the drives there have legs = 3, these 2"):
+    with pytest.raises(DatasetError, match="was made with legs = 3, expected 2"):
         driving.simulate_drives([painted], driven, dataclasses.replace(CONFIG, legs=2))
     copy = tmp_path / "drives"
     copy.mkdir()
     header = json.loads((driven / "drives.json").read_text())
     header["scenes"][0]["digest"] = "0" * 64
     (copy / "drives.json").write_text(json.dumps(header))
-    with pytest.raises(DatasetError, match="the drives there are in painted as they were; the scenes differ"):
+    with pytest.raises(DatasetError, match="is of painted as they were; the scenes differ"):
         driving.simulate_drives([painted], copy, CONFIG)
     with pytest.raises(DatasetError, match="holds no drives"):
         driving.load_drives(tmp_path)

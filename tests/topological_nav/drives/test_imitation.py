@@ -19,7 +19,7 @@ from topological_nav.drives.dataset import drive_images
 from topological_nav.drives.driving import load_policy
 from topological_nav.drives.frames import embed_drives
 from topological_nav.drives.policy import Forward, Policy
-from topological_nav.errors import RunError
+from topological_nav.errors import RunError, Stopped
 from topological_nav.learn.learning import Learner
 
 WORDS = (
@@ -91,7 +91,8 @@ def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames):
 def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_path):
     told = []
     out = tmp_path / "run"
-    assert imitation.train_policy(frames, out, CONFIG, told.append, lambda: len(told) >= 4) is None
+    with pytest.raises(Stopped):
+        imitation.train_policy(frames, out, CONFIG, told.append, lambda: len(told) >= 4)
     with pytest.raises(RunError, match="holds no trained policy; finish it"):
         load_policy(out)
     assert imitation.train_policy(frames, out, CONFIG, told.append) is not None

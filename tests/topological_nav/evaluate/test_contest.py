@@ -29,7 +29,7 @@ from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
 WORDS = ("episodes=2", "batch=2", "images=6", "limit_s=22", "backend=native", "max_turn_rad_s=2.0", "passable=0.05")
-CONFIG = EvaluationConfig(
+CONFIG = EvaluationConfig.of(
     episodes=2, batch=2, images=6, limit_s=22.0, backend="native", max_turn_rad_s=2.0, passable=0.05
 )
 
@@ -78,7 +78,7 @@ def watched(contest):
     def watch(time_s, seen, state, events):
         steps.append((time_s, seen, state, events, len(navigator.policy.calls)))
 
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, venue.contest.config, watch)
+    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, watch)
     played = play(player, venue.simulator, venue.episodes, venue.contest.config)
     return venue, navigator.policy, steps, played
 
@@ -181,7 +181,7 @@ def test_everything_that_the_navigator_sees_goes_through_the_other_camera(contes
     assert (venue.camera(xy[1:2], yaw[1:2]) == seen[1:2]).all()
     navigator, looked = venue.navigator("dense"), []
     monkeypatch.setattr(navigator, "goal_nodes", lambda images, around: looked.append(images) or np.zeros(2, np.int32))
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, venue.contest.config)
+    player = NavigatorPlayer(navigator, venue.simulator, venue.camera)
     player.begin(journeys)
     goals = as_seen_from(
         clean.camera(journeys.goal_xy_w, np.zeros(2)), preset("camera"), journeys.goal_xy_w, np.zeros(2)

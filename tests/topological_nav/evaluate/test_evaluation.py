@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 import interactive_nav
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rows import read_rows
 from tests.topological_nav.maps.test_sight import two_rooms_space
@@ -22,11 +23,12 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
-from topological_nav.evaluate.contenders import Marks, learned
+from topological_nav.evaluate.contenders import learned
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
 from topological_nav.evaluate.evaluation import play
 from topological_nav.evaluate.rows import _stem, play_contest
+from topological_nav.navigate.state import Events
 from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.rooms import find_rooms
 from topological_nav.scenes.simulation import Seen, Simulator
@@ -74,8 +76,11 @@ class Line:
         x, step, number = state
         at, none = step % 15, np.zeros(len(x), bool)
         arrived = np.array([self._arrives.get(int(n)) == step for n in number])
-        marks = Marks(none | (at == 0), none | (at == 10), arrived, none | (step >= 60), arrived, none, none)
-        return (x + 0.2 * (at < 10) * ~over, step + 1, number), marks
+        events = Events(
+            localised=arrived, glanced=none, lost=none, blocked=none, arrived=arrived,
+            run_started=none | (at == 0), run_ended=none | (at == 10), timed_out=none | (step >= 60),
+        )  # fmt: skip
+        return (x + 0.2 * (at < 10) * ~over, step + 1, number), events
 
 
 def line_journeys(goals) -> Episodes:
@@ -87,7 +92,7 @@ def line_journeys(goals) -> Episodes:
 
 def test_an_episode_is_won_where_a_run_ends_near_the_goal():
     # Runs end at steps 10, 25, 40, 55, at x = 2, 4, 6, 8.
-    config = EvaluationConfig(run_s=1.0, success_m=1.5)
+    config = EvaluationConfig.of(run_s=1.0, success_m=1.5)
     found = play(Line(), Rails({}), line_journeys([2.0, 3.0, 5.49, 5.51, 30.0]), config)  # type: ignore[arg-type]
     assert found.success.tolist() == [True, True, True, True, False]
     # 3 m: 1 m away at the end of the first run. 5.49: 1.49 m away after the second; 5.51: only after the third.
@@ -102,14 +107,14 @@ def test_an_episode_is_won_where_a_run_ends_near_the_goal():
 def test_contacts_count_by_runs_and_by_seconds():
     # State k is seen after k steps. Run 1: steps 1 to 10, run 2: 16 to 25; 11 to 15 turn on the spot.
     touches = {0: {3, 4, 9}, 1: {12, 13}, 2: {10, 16}, 3: {11}}
-    found = play(Line(), Rails(touches), line_journeys([4.9] * 4), EvaluationConfig(run_s=1.0))  # type: ignore[arg-type]
+    found = play(Line(), Rails(touches), line_journeys([4.9] * 4), EvaluationConfig.of(run_s=1.0))  # type: ignore[arg-type]
     assert found.duration_s.tolist() == pytest.approx([2.5] * 4) and found.runs.tolist() == [2] * 4
     assert found.contact_runs.tolist() == [1, 0, 2, 0]
     assert found.contact_s.tolist() == pytest.approx([0.3, 0.2, 0.2, 0.1])
 
 
 def test_a_run_that_its_episode_cuts_short_counts():
-    found = play(Line({0: 4, 1: 12}), Rails({0: {2}}), line_journeys([9.0, 9.0]), EvaluationConfig(run_s=1.0))  # type: ignore[arg-type]
+    found = play(Line({0: 4, 1: 12}), Rails({0: {2}}), line_journeys([9.0, 9.0]), EvaluationConfig.of(run_s=1.0))  # type: ignore[arg-type]
     assert found.success.tolist() == [True, True] and found.arrived.tolist() == [True, True]
     assert found.runs.tolist() == [1, 1] and found.contact_runs.tolist() == [1, 0]
     assert found.localisations.tolist() == [1, 1] and found.duration_s.tolist() == pytest.approx([0.4, 1.2])
@@ -121,7 +126,7 @@ def test_scenes_have_episodes_by_their_area():
         return count_of(scene, EvaluationConfig())  # type: ignore[arg-type]
 
     assert [of(33.2), of(79.9), of(145.3)] == [25, 40, 60]
-    assert count_of(None, EvaluationConfig(episodes=7)) == 7  # type: ignore[arg-type]
+    assert count_of(None, EvaluationConfig.of(episodes=7)) == 7  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -132,14 +137,14 @@ def rooms():
 
 def test_episodes_lead_from_room_to_room_and_are_fixed(rooms):
     space, labels = rooms
-    config = EvaluationConfig(seed=3)
+    config = EvaluationConfig.of(seed=3)
     found = draw_episodes("ab" * 32, space, labels, 20, config)
     assert (found.start_room != found.goal_room).all() and found.number.tolist() == list(range(20))
     assert (np.linalg.norm(found.start_xy_w - found.goal_xy_w, axis=1) > 2.5).all()
     assert (space.at(found.start_xy_w) >= 0.35).all() and (space.at(found.goal_xy_w) >= 0.35).all()
     fewer = draw_episodes("ab" * 32, space, labels, 5, config)
     assert (fewer.start_xy_w == found.start_xy_w[:5]).all() and (fewer.yaw_rad == found.yaw_rad[:5]).all()
-    assert (draw_episodes("ab" * 32, space, labels, 5, EvaluationConfig(seed=4)).yaw_rad != fewer.yaw_rad).any()
+    assert (draw_episodes("ab" * 32, space, labels, 5, EvaluationConfig.of(seed=4)).yaw_rad != fewer.yaw_rad).any()
     assert (draw_episodes("cd" * 32, space, labels, 5, config).yaw_rad != fewer.yaw_rad).any()
 
 
@@ -174,7 +179,7 @@ def test_the_shortest_way_is_as_long_as_over_eight_neighbours_or_shorter(rooms):
 def test_a_scene_without_such_episodes_is_refused(rooms):
     space, labels = rooms
     with pytest.raises(SpaceError, match="0 of 3 episodes .* more than 50.0 m apart"):
-        draw_episodes("ab" * 32, space, labels, 3, EvaluationConfig(min_goal_m=50.0))
+        draw_episodes("ab" * 32, space, labels, 3, EvaluationConfig.of(min_goal_m=50.0))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +192,7 @@ def toy(tmp_path_factory):
 
 
 def held(toy, out, **settings):
-    config = EvaluationConfig(**{"backend": "native", "episodes": 4, "limit_s": 300.0, "batch": 4, **settings})
+    config = EvaluationConfig.of(**{"backend": "native", "episodes": 4, "limit_s": 300.0, "batch": 4, **settings})
     return Contest((toy,), ("dense", "expert"), out, config, truth=True)
 
 
@@ -249,7 +254,7 @@ def test_another_question_is_played_anew(first, toy, tmp_path):
     contest, (venue,), _ = first
     names = {_stem(venue, "dense")}
     for change in ({"seed": 1}, {"passable": 0.6}, {"thinned": 0.9}):
-        changed = dataclasses.replace(contest, config=dataclasses.replace(contest.config, **change))
+        changed = dataclasses.replace(contest, config=replace(contest.config, **change))
         names.add(_stem(ContestScene(toy, changed, None), "dense"))
     names.add(_stem(venue, "sparse"))
     assert len(names) == 5
@@ -299,7 +304,7 @@ def test_mistakes_are_one_line(words, told, capsys, monkeypatch, tmp_path):
 
 def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, monkeypatch, capsys):
     """Unless the settings themselves ask for what is not here."""
-    trained = TrainConfig(env=EnvConfig(backend="warp"))
+    trained = TrainConfig(env=EnvConfig.of(backend="warp"))
     RunFolder(tmp_path).config.write_text(to_yaml(trained))
     usual = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
@@ -309,7 +314,7 @@ def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, mon
     assert (simulator.env.backend, env.backend, env.scenes) == ("native", "native", (str(scene.path),))
     assert "trained with backend warp, which is not here; played with native" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="backend is 'warp'"):
-        contests._learned(tmp_path, scene, EvaluationConfig(backend="warp"))
+        contests._learned(tmp_path, scene, EvaluationConfig.of(backend="warp"))
 
 
 def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
@@ -325,7 +330,7 @@ def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
 
 @pytest.mark.heavy
 def test_in_a_real_home_true_sight_finds_most_goals(tmp_path):
-    config = EvaluationConfig(backend="native", episodes=8, limit_s=600.0, batch=8)
+    config = EvaluationConfig.of(backend="native", episodes=8, limit_s=600.0, batch=8)
     contest = Contest((Path(APARTMENT),), ("dense",), tmp_path, config, truth=True)
     rows = play_contest(contest, contest_scenes(contest))
     assert np.mean(rows["success"].to_numpy()) >= 0.85
@@ -375,7 +380,7 @@ def test_one_array_tells_what_the_state_holds():
 @pytest.mark.heavy
 def test_the_expert_passes_where_furniture_leaves_a_quarter_of_a_metre(tmp_path):
     """A table closes a room of maple to the expert's grid: it stood still in 18 of 60 episodes."""
-    config = EvaluationConfig(backend="native", episodes=8, batch=8, limit_s=90.0)
+    config = EvaluationConfig.of(backend="native", episodes=8, batch=8, limit_s=90.0)
     contest = Contest((Path("scenes_mjcf/maple"),), ("expert",), tmp_path, config)
     rows = play_contest(contest, contest_scenes(contest)).to_pylist()
     assert [r["success"] for r in rows] == [1.0] * 8 and min(r["path_m"] for r in rows) > 2.5

@@ -11,7 +11,7 @@ from interactive_nav_common.config import overridden
 from interactive_nav_common.metrics_file import read_metrics
 from topological_nav.config import TrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
-from topological_nav.errors import RunError
+from topological_nav.errors import RunError, Stopped
 from topological_nav.learn import training
 from topological_nav.learn.learning import compiled_epoch, in_batches, padded_size
 
@@ -104,7 +104,8 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
     out, config = tmp_path / "run", whole[1]
     told = []
     for stop_after in (1, 3):
-        assert training.train("rooms", made.data, out, config, told.append, lambda n=stop_after: len(told) >= n) is None
+        with pytest.raises(Stopped):
+            training.train("rooms", made.data, out, config, told.append, lambda n=stop_after: len(told) >= n)
         assert len(told) == stop_after
     with pytest.raises(RunError, match="holds no trained network; finish it"):
         training.load_trained(out)

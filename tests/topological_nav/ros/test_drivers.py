@@ -50,7 +50,7 @@ class Three:
 @pytest.mark.parametrize("how", ["arrived", "timed_out"])
 def test_the_navigators_pilot_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
     pilot, lens = Three(how), Lens(4, 3, 90.0)
-    driver = PilotDriver(pilot, lens)
+    driver = PilotDriver(pilot, lens)  # type: ignore[arg-type]
     commands = [driver.step(np.zeros((3, 4, 3), np.uint8), 0.5, 1.0 + 0.1 * k) for k in range(3)]
     assert commands == [Command(0.3, -0.2), Command(0.3, -0.2), Command(0.0, 0.0, done=True)]
     assert pilot.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)] and driver.lens is lens

@@ -75,33 +75,34 @@ def test_updates_equal_those_of_brax(schedule):
     config = make_config(2, learning_rate_schedule=schedule)
     ours = ppo.train(batched(), config, Recorder()).snapshot.learner
     c = config.ppo
-    _, params, _ = brax_ppo.train(
-        batched(),
-        num_timesteps=config.run.num_timesteps,
-        max_devices_per_host=1,
-        wrap_env=False,
-        num_envs=c.num_envs or 0,
-        episode_length=60,
-        learning_rate=c.learning_rate,
-        learning_rate_schedule=None if schedule == "constant" else "ADAPTIVE_KL",
-        desired_kl=c.desired_kl,
-        entropy_cost=c.entropy_cost,
-        discounting=c.discounting,
-        unroll_length=c.unroll_length or 0,
-        batch_size=c.batch_size or 0,
-        num_minibatches=c.num_minibatches or 0,
-        num_updates_per_batch=c.num_updates_per_batch,
-        normalize_observations=True,
-        clipping_epsilon=c.clipping_epsilon,
-        gae_lambda=c.gae_lambda,
-        max_grad_norm=c.max_grad_norm,
-        network_factory=lambda *a, **k: ppo_networks.make_ppo_networks(
-            *a, **k, policy_hidden_layer_sizes=(16,), value_hidden_layer_sizes=(16,)
-        ),
-        seed=config.run.seed,
-        num_evals=1,
-        run_evals=False,
-    )
+    with jax.numpy_rank_promotion("allow"):  # Brax's statistics promote
+        _, params, _ = brax_ppo.train(
+            batched(),
+            num_timesteps=config.run.num_timesteps,
+            max_devices_per_host=1,
+            wrap_env=False,
+            num_envs=c.num_envs or 0,
+            episode_length=60,
+            learning_rate=c.learning_rate,
+            learning_rate_schedule=None if schedule == "constant" else "ADAPTIVE_KL",
+            desired_kl=c.desired_kl,
+            entropy_cost=c.entropy_cost,
+            discounting=c.discounting,
+            unroll_length=c.unroll_length or 0,
+            batch_size=c.batch_size or 0,
+            num_minibatches=c.num_minibatches or 0,
+            num_updates_per_batch=c.num_updates_per_batch,
+            normalize_observations=True,
+            clipping_epsilon=c.clipping_epsilon,
+            gae_lambda=c.gae_lambda,
+            max_grad_norm=c.max_grad_norm,
+            network_factory=lambda *a, **k: ppo_networks.make_ppo_networks(
+                *a, **k, policy_hidden_layer_sizes=(16,), value_hidden_layer_sizes=(16,)
+            ),
+            seed=config.run.seed,
+            num_evals=1,
+            run_evals=False,
+        )
     theirs = (params[0].mean, params[0].std, params[1], params[2])
     mine = (ours.normalizer_params.mean, ours.normalizer_params.std, ours.params.policy, ours.params.value)
     # Same arithmetic, compiled in other pieces: float32 rounding only. An update moves weights by about 1e-2.

@@ -26,7 +26,7 @@ from train.errors import CheckpointError
 from train.learners.learner import Snapshot
 from train.runs.run import train_run
 
-TOY = EnvConfig(scenes=("toy",), backend="native")
+TOY = EnvConfig.of(scenes=("toy",), backend="native")
 
 
 def learner_of(env, algorithm, share):
@@ -100,16 +100,13 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
 def test_within_half_a_step(outputs, inputs, size, step):
     weights = (np.random.default_rng(inputs).normal(size=(inputs, outputs)) * size).astype(np.float32)
     stored = policy_file.packed({"a/kernel": weights, "a/bias": weights[0]}, step)
-    assert set(policy_file.coded(stored)) == set(stored) | ({"a/kernel:shape"} if "a/kernel:scale" in stored else set())
-    again = policy_file.decoded(policy_file.coded(stored))
-    assert again.keys() == stored.keys()
-    assert all(again[name].dtype == array.dtype and (again[name] == array).all() for name, array in stored.items())
+    large = {"a/kernel:scale", "a/kernel:shape"} if weights.size >= policy_file.LARGE else set()
+    assert set(stored) == {"a/kernel", "a/bias"} | large and (not large or stored["a/kernel"].dtype == np.uint8)
     back = policy_file.unpacked(stored)
     np.testing.assert_array_equal(back["a/bias"], weights[0])
     if weights.size < policy_file.LARGE:
         np.testing.assert_array_equal(back["a/kernel"], weights.astype(np.float16))
     else:
-        assert stored["a/kernel"].dtype == np.int8
         half = np.maximum(step * weights.std(0), np.abs(weights).max(0) / 127) / 2
         assert (np.abs(back["a/kernel"] - weights) <= half * (1 + 1e-5) + 1e-30).all()
 
@@ -126,7 +123,8 @@ def test_a_weight_beyond_the_range_of_eight_bits_widens_the_steps():
     weights = np.zeros((5_000, 1), np.float32)
     weights[7] = 5.0  # 70 deviations
     stored = policy_file.packed({"w": weights}, 0.1)
-    assert stored["w"].max() == 127 and policy_file.unpacked(stored)["w"][7] == pytest.approx(5.0)
+    back = policy_file.unpacked(stored)["w"]
+    assert (back / stored["w:scale"]).max() == pytest.approx(127) and back[7] == pytest.approx(5.0)
 
 
 def test_foreign_and_damaged_files_are_told(tmp_path):

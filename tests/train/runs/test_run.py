@@ -32,9 +32,9 @@ from train.runs import checkpoint, run, run_folder
 from train.config import resolve
 from train.config_io import from_yaml
 from train.errors import CheckpointError, DivergedError
-from train.runs.run import check_fits, failures, mean_score, train_run
+from train.runs.run import check_fits, failures, train_run
 from train.runs.run_folder import RunFolder, claim
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.metrics_file import mean_over_episodes, read_metrics
 
 
 def quiet() -> Console:
@@ -208,8 +208,8 @@ def test_score_of_a_checkpoint_weighs_episodes_alike():
         {"episodes": 3.0, "episode/success": 0.2},
         {"episodes": 0.0},
     ]
-    assert mean_score(lines, "success") == pytest.approx(0.4)  # (1 + 3 * 0.2) / 4
-    assert mean_score(lines[2:], "success") is None
+    assert mean_over_episodes(lines, "episode/success") == pytest.approx(0.4)  # (1 + 3 * 0.2) / 4
+    assert mean_over_episodes(lines[2:], "episode/success") is None
 
 
 def test_checkpoint_of_another_robot_is_refused():
@@ -271,8 +271,8 @@ def test_checkpoints_have_no_score_before_every_environment_had_time_for_an_epis
     saved = {c.env_steps: c.score for c in checkpoint.list_checkpoints(folder.checkpoints)}
     assert list(saved) == [512, 1024, 1536] and saved[512] is None
     assert all(line["episodes"] > 0 for line in lines if line["env_steps"] in (512, 768))  # in no score
-    assert saved[1024] == pytest.approx(mean_score([line for line in lines if line["env_steps"] == 1024], "ins_0.5"))
-    assert saved[1536] == pytest.approx(mean_score([line for line in lines if line["env_steps"] > 1024], "ins_0.5"))
+    assert saved[1024] == pytest.approx(mean_over_episodes([line for line in lines if line["env_steps"] == 1024], "episode/ins_0.5"))
+    assert saved[1536] == pytest.approx(mean_over_episodes([line for line in lines if line["env_steps"] > 1024], "episode/ins_0.5"))
     # Without room for the environments all begin anew, and the wait with them.
     config = toy_config(tmp_path, updates=10, keep_checkpoints=9, env_state_limit_mb=0.0)
     (folder.checkpoints / "000000001536" / checkpoint.ENV_STATE).unlink()
@@ -302,14 +302,8 @@ def test_nan_guard_saves_the_batch_and_stops(tmp_path):
 
 
 def _start(tmp_path: Path, *words: str) -> subprocess.Popen:
-    cache = str(getattr(jax.config, "jax_compilation_cache_dir", ""))  # conftest.py made it
-    env = {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": cache,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-    }
     command = [sys.executable, "-m", "tests.train.toy_run", str(tmp_path), *words]
-    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def _wait_for_checkpoint(folder: RunFolder, after: int, process: subprocess.Popen) -> None:

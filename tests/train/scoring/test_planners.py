@@ -14,7 +14,7 @@ import interactive_nav
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
-from train.scoring.planners import CELL_M, Footprints, PathGrid, Planner, plan_path
+from train.scoring.planners import CELL_M, Footprints, PathGrid, Planner
 from train.scoring.policies import make_yardstick
 from train.scoring.rollout import episode_keys, run_episodes
 
@@ -32,19 +32,19 @@ def test_paths_by_hand():
     # A knight's move each: 10 of (1, 2).
     assert length(grid.path((2, 2), (12, 22))) == pytest.approx(10 * CELL_M * math.sqrt(5))
     free[:19, 15] = False  # a wall with a gap on row 19 only
-    path = plan_path(free, ones, (5, 2), (5, 28))
+    path = PathGrid(free, ones).path((5, 2), (5, 28))
     assert (path[path[:, 1] == 15][:, 0] == 19).all() and (path[:, 1] == 15).any()
     free[19, 15] = False
-    assert len(plan_path(free, ones, (5, 2), (5, 28))) == 0
-    assert len(plan_path(np.zeros((4, 4), bool), np.ones((4, 4)), (0, 0), (3, 3))) == 0
+    assert len(PathGrid(free, ones).path((5, 2), (5, 28))) == 0
+    assert len(PathGrid(np.zeros((4, 4), bool), np.ones((4, 4))).path((0, 0), (3, 3))) == 0
 
 
 def test_a_dear_cell_is_gone_round_only_if_that_is_shorter():
     free, cost = np.ones((21, 21), bool), np.ones((21, 21))
     cost[5:16, 10] = 1.5  # 0.05 m through at half as much again costs 0.025 m: cheaper than round
-    assert (plan_path(free, cost, (10, 2), (10, 18))[:, 0] == 10).all()
+    assert (PathGrid(free, cost).path((10, 2), (10, 18))[:, 0] == 10).all()
     cost[5:16, 10] = 60.0
-    path = plan_path(free, cost, (10, 2), (10, 18))
+    path = PathGrid(free, cost).path((10, 2), (10, 18))
     assert abs(path[path[:, 1] == 10][:, 0] - 10).min() >= 5
 
 

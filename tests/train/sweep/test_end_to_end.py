@@ -31,6 +31,7 @@ def test_from_a_file_to_pictures(tmp_path, monkeypatch, capfd):
             "run": {"num_timesteps": 256, "log_every_steps": 64, "checkpoint_every_steps": 128},
         },
         "evaluate": {"scenes": [str(seen), str(unseen)], "episodes": 6, "record": 2, "batch": 4},
+        "launch": {"slots": 2},  # nearly all of a run's time is compiling, on one core
     }
     path = tmp_path / "tiny.yaml"
     path.write_text(yaml.safe_dump(plain))

@@ -114,6 +114,26 @@ def test_stages_can_be_run_and_repeated_alone(tmp_path):
     assert all(p.stat().st_mtime_ns > written[p] for p in folder.rows.iterdir())
 
 
+def test_what_a_killed_evaluation_left_goes_at_the_next_start(tmp_path):
+    """Paths are written before rows: killed between, or while writing, it leaves them without."""
+    path = write_sweep(tmp_path)
+    _, _, folder = sweep(path)
+    paths = folder.rows / "_paths"
+    paths.mkdir()
+    done = paths / f"{next(folder.rows.glob('k_int0-seed0-*.parquet')).stem}.npz"
+    begun = [paths / ".partial-01234567-k_int0-seed0-89abcdef.npz", folder.rows / ".partial-01234567-x.parquet"]
+    lonely, busy = paths / "k_int0-seed0-89abcdef.npz", paths / "k_int1-seed0-89abcdef.npz"
+    others = paths / "k_int0-seed00-89abcdef.npz"
+    for file in (done, *begun, lonely, busy, others):
+        file.touch()
+        os.utime(file, (0, 0))
+    held = take_lock(folder.lock("k_int1-seed0"))
+    assert held is not None
+    folder.prepare()
+    os.close(held)
+    assert sorted(paths.iterdir()) == sorted([done, busy, others]) and len(list(folder.rows.glob("*.parquet"))) == 4
+
+
 def test_failures_stay_with_their_run_and_are_tried_again_so_many_times(tmp_path, monkeypatch):
     fates = {
         "k_int0-seed0": ["crash"],

@@ -1,0 +1,259 @@
+"""A scene as people see it: a scene, a robot and small objects in, a MuJoCo model of what is looked at out.
+
+Every picture and viewer starts from `furnished_spec`. `SceneModel` is what pictures are taken of: its bodies are put
+where a caller wants them, and rays are cast into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTE
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes, body_names
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.scenes.world import World
+from interactive_nav.sensing.base import CameraPose, Lens
+from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.categories import CATEGORIES, class_id
+
+THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
+"""Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
+of a robot that has others to be seen; what is never drawn."""
+SCENE = (THINGS, BUILDING)
+"""What is seen from inside, without the robot."""
+CUT_M = 0.55
+"""Height of the walls in views from outside."""
+
+
+def furnished_spec(
+    scene: Scene, robot: RobotSpec | None, small: Sequence[SmallObject], cut_walls: bool = False
+) -> mujoco.MjSpec:
+    """The scene as stored, with a robot and small objects added, which are boxes and stand at the origin.
+
+    Args:
+        scene: its `scene.xml` is read.
+        robot: or None.
+        small: the small objects.
+        cut_walls: adds the walls once more, cut low.
+    """
+    spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
+    if cut_walls:
+        _add_cut_walls(spec, scene.walls)
+    if robot is not None:
+        robot.add_to(spec)
+    for name, obj in zip(body_names(small), small, strict=True):
+        body = spec.worldbody.add_body(name=name)
+        body.add_freejoint(name=f"{name}_joint")
+        add_boxes(body, obj, name)
+    return spec
+
+
+def picture_spec(
+    scene: Scene,
+    robot: RobotSpec | None = None,
+    small: Sequence[SmallObject] = (),
+    class_of: dict[str, int] | None = None,
+) -> mujoco.MjSpec:
+    """`furnished_spec` in the groups of pictures, with a lamp, and with one camera named `view` instead of its own.
+
+    Args:
+        scene: its visual meshes are drawn; bodies that have none, as their boxes.
+        robot: or None.
+        small: the small objects.
+        class_of: body name -> class id, by which boxes are coloured; None: as they are stored.
+    """
+    spec = furnished_spec(scene, robot, small, cut_walls=robot is not None)
+    own = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
+    movable, little = {m.name for m in scene.movables}, set(body_names(small))
+    with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
+    visible_robot = bool(own & with_mesh)
+    for geom in list(spec.geoms):
+        name = geom.parent.name
+        if name == "cut_walls":
+            continue
+        plane, box = geom.type == mujoco.mjtGeom.mjGEOM_PLANE, geom.type == mujoco.mjtGeom.mjGEOM_BOX
+        if name in own:
+            geom.group = ROBOT_SOLIDS if visible_robot and geom.group != VISUAL_GROUP else ROBOT
+            geom.rgba = [*CATEGORIES["robot"].colour, 1.0]
+            continue
+        bare = box and name not in with_mesh
+        if plane:
+            geom.rgba = [*FLOOR_COLOUR, 1.0]
+        elif bare and class_of is not None:
+            geom.rgba = [*PALETTE[class_of.get(name, 0)], 1.0]
+        if not (plane or bare or geom.group == VISUAL_GROUP):
+            geom.group = HIDDEN
+        else:
+            geom.group = THINGS if plane or name in movable or name in little else BUILDING
+    for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
+        spec.delete(camera)
+    spec.worldbody.add_camera(name="view", fovy=60.0)
+    spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
+    # The clipping planes are given as shares of the extent.
+    spec.stat.extent = 1.0
+    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 100.0
+    return spec
+
+
+class SceneModel:
+    """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
+
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], segmentation_classes: int = 4):
+        """Compiles the model to look at.
+
+        Args:
+            robot: its collision shapes are drawn, or its visual ones where it has any.
+            scene: its visual meshes are drawn.
+            small: the small objects.
+            segmentation_classes: as in `NavConfig`.
+        """
+        self.robot = robot
+        known = {m.name: (class_id(m.category, segmentation_classes == 5), m.category) for m in scene.movables}
+        known |= {n: (o.segmentation_id, o.category) for n, o in zip(body_names(small), small, strict=True)}
+        spec = picture_spec(scene, robot, small, {name: number for name, (number, _) in known.items()})
+        spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        for name in body_names(small):  # out of sight until they are placed
+            self.data.qpos[self.model.joint(f"{name}_joint").qposadr[0] + 2] = -50.0
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        self._inertial_axes_b = matrix_from_quat(self.model.body_iquat)
+        self._geom_axes_b = matrix_from_quat(self.model.geom_quat)
+        mine, rest = ((class_id(kind), kind) for kind in ("robot", "structure"))
+        robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
+        names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
+        rows = [mine if own else known.get(name, rest) for own, name in zip(robots, names, strict=True)]
+        self.class_id = np.array([number for number, _ in rows], np.uint8)
+        """[ngeom] segmentation ids."""
+        self.category = [category for _, category in rows]
+        """[ngeom]"""
+
+    def pose(self, world: World, scene: int, qpos: np.ndarray) -> None:
+        """Puts all bodies where an environment's `qpos` [nq] has them.
+
+        Args:
+            world: the environment's.
+            scene: index of the scene that this is the model of.
+            qpos: [nq].
+        """
+        names, _, pos, quat = world_poses(world, scene, np.asarray(qpos)[None])
+        self.place(names, pos[0], quat[0])
+
+    def place(self, bodies: tuple[str, ...], pos_w: np.ndarray, quat_w: np.ndarray) -> None:
+        """Puts bodies where they are to be drawn; those that are not named stay at rest.
+
+        Args:
+            bodies: B names.
+            pos_w: [B, 3] m.
+            quat_w: [B, 4] w x y z.
+
+        Raises:
+            ValueError: the scene has no body of a name.
+        """
+        model, data = self.model, self.data
+        rotation = np.zeros(9)
+        for name, pos, quat in zip(bodies, pos_w, quat_w, strict=True):
+            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+            if body < 0:
+                raise ValueError(f"no body '{name}' in this scene with robot '{self.robot.name}'; record it again")
+            quat = np.asarray(quat, float)
+            mujoco.mju_quat2Mat(rotation, quat)
+            data.xpos[body], data.xquat[body], data.xmat[body] = pos, quat, rotation
+            axes = rotation.reshape(3, 3)
+            data.xipos[body] = pos + axes @ model.body_ipos[body]
+            data.ximat[body] = (axes @ self._inertial_axes_b[body]).ravel()
+            own = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+            data.geom_xpos[own] = pos + model.geom_pos[own] @ axes.T
+            data.geom_xmat[own] = (axes @ self._geom_axes_b[own]).reshape(-1, 9)
+
+
+def cast(
+    model: mujoco.MjModel, data: mujoco.MjData, origin_w: np.ndarray, unit_w: np.ndarray, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What rays meet first.
+
+    Args:
+        model: what is there.
+        data: where it is.
+        origin_w: (3,) m.
+        unit_w: [n, 3] directions of length 1.
+        groups: geom groups that can be met.
+
+    Returns:
+        [n] geoms, -1 where nothing is met; [n] distances, m; [n, 3] normals.
+    """
+    count = len(unit_w)
+    geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
+    origin, flat = np.asarray(origin_w, float), np.ascontiguousarray(unit_w).ravel()
+    shown = np.isin(np.arange(6), groups).astype(np.uint8)
+    far = mujoco.mjMAXVAL
+    mujoco.mj_multiRay(model, data, origin, flat, shown, 1, -1, geom, distance, normal, count, far)
+    return geom, distance, normal.reshape(-1, 3)
+
+
+def trace(
+    model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the pixels of a camera show.
+
+    Args:
+        model: what is there.
+        data: where it is.
+        pose: of one camera.
+        lens: its.
+        groups: geom groups that are seen.
+
+    Returns:
+        [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 where nothing is met; [H, W] depths along the optical axis,
+        m; [H, W, 3] normals.
+    """
+    ray = lens.rays(pose)
+    length = np.linalg.norm(ray, axis=-1, keepdims=True)
+    geom, distance, normal = cast(model, data, pose.pos_w, (ray / length).reshape(-1, 3), groups)
+    shape = ray.shape[:2]
+    return ray, geom.reshape(shape), distance.reshape(shape) / length[..., 0], normal.reshape(ray.shape)
+
+
+def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:
+    body = spec.worldbody.add_body(name="cut_walls")
+    for i, row in enumerate(walls):
+        top = min(row[2] + row[9], CUT_M)
+        body.add_geom(
+            name=f"cut_wall_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[row[0], row[1], top / 2],
+            quat=row[3:7],
+            size=[row[7], row[8], max(top / 2, 1e-3)],
+            group=CUT_WALLS,
+        )
+
+
+def world_poses(world: World, scene: int, qpos: np.ndarray) -> tuple[tuple[str, ...], int, np.ndarray, np.ndarray]:
+    """World poses of the robot's bodies and of a scene's movable objects.
+
+    Args:
+        world: for its models.
+        scene: index.
+        qpos: [T, nq]; a row that is not finite repeats the one before it.
+
+    Returns:
+        Names (B), how many of them are the robot's, positions [T, B, 3] and orientations [T, B, 4].
+    """
+    layout, model = world.layout, world.models[scene]
+    data = mujoco.MjData(model)
+    used = [slot for slot, name in enumerate(world.names[scene]) if name]
+    ids = np.concatenate([layout.robot_bodies, layout.slot_body[used]])
+    names = [model.body(int(b)).name for b in layout.robot_bodies] + [world.names[scene][slot] for slot in used]
+    pos, quat = np.zeros((len(qpos), len(ids), 3)), np.zeros((len(qpos), len(ids), 4))
+    for t, row in enumerate(qpos):
+        if np.isfinite(row).all():
+            data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        pos[t], quat[t] = data.xpos[ids], data.xquat[ids]
+    return tuple(names), len(layout.robot_bodies), pos, quat

@@ -1,0 +1,128 @@
+"""Names of sets of scenes in, scene folders out.
+
+A set is a file that lists scenes, their splits and the digests of their tasks: `OUT/set.json`, which
+`python -m converters generate-scenes OUT` writes, or a committed one of this package. Wherever scenes are listed,
+`SET` stands for all of its scenes and `SET/train` or `SET/test` for those of a split.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from interactive_nav_common.files import write_text
+from scenes_mjcf.schema import SPLITS, SceneError, known_keys
+
+FILE = "set.json"
+HERE = Path(__file__).parent
+COMMITTED = HERE / "sets"
+"""Folder of the package's own sets, `<name>.json`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Member:
+    """One scene of a set."""
+
+    split: str
+    seed: int
+    """Of the recipe."""
+    task_digest: str = ""
+    """Of map, walls and movables, rounded, so that it is the same on every machine; empty: not yet made."""
+    measures: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """What was measured of it, such as `furniture_share`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneSet:
+    """A named set of scenes."""
+
+    tier: str
+    """How full its homes are: sparse, furnished or cluttered."""
+    scenes: dict[str, Member]
+    """Name of a scene -> what it is; folders of these names lie beside the set's file, or in `folder`."""
+    folder: str = "."
+    """Where the scene folders lie, relative to the file."""
+
+
+def read_set(path: Path) -> SceneSet:
+    """Reads and checks a set's file.
+
+    Raises:
+        SceneError: it cannot be read, or breaks the schema.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise SceneError(f"{path}: not readable as JSON ({error}); make the set again") from None
+    data = dict(known_keys(data, SceneSet, str(path)))
+    members = {}
+    for name, raw in data["scenes"].items():
+        members[name] = Member(**known_keys(raw, Member, f"{path}: scenes: {name}"))
+        if members[name].split not in SPLITS:
+            raise SceneError(
+                f"{path}: scenes: {name}: split is {members[name].split!r}, expected one of {', '.join(SPLITS)}"
+            )
+    return SceneSet(data["tier"], members, data.get("folder", "."))
+
+
+def write_set(scenes: SceneSet, path: Path) -> None:
+    """Writes a set's file, whole or not at all."""
+    write_text(path, json.dumps(dataclasses.asdict(scenes), indent=1, sort_keys=True) + "\n")
+
+
+def _file_of(name: str) -> Path | None:
+    """The file that describes a set: in a folder of that name, or the package's."""
+    for path in (Path(name) / FILE, HERE / name / FILE, COMMITTED / f"{name}.json"):
+        if path.is_file():
+            return path
+    return None
+
+
+def _members(word: str) -> list[str] | None:
+    """Folders of a set or of a set's split; None where the word names neither."""
+    head, _, last = word.rstrip("/").rpartition("/")
+    for name, split in ((word.rstrip("/"), ""), (head, last)):
+        if not name or (split and split not in SPLITS):
+            continue
+        file = _file_of(name)
+        if file is None:
+            continue
+        scenes = read_set(file)
+        root = Path(os.path.normpath(file.parent / scenes.folder))
+        names = [n for n, member in scenes.scenes.items() if split in ("", member.split)]
+        missing = [n for n in names if not (root / n / "scene.json").is_file()]
+        what = f"the set has no scene to {split} in" if not names else None
+        if missing:
+            what = f"{len(missing)} of {len(names)} scenes are missing (the first is '{missing[0]}')"
+        if what:
+            raise SceneError(
+                f"{word}: {what}; make them with "
+                f"'python -m converters generate-scenes {os.path.relpath(root)} --tier {scenes.tier}'"
+            )
+        return [os.path.relpath(root / n) if Path.cwd() in (root / n).absolute().parents else str(root / n)
+                for n in names]  # fmt: skip
+    return None
+
+
+def scene_folders(words: Sequence[str | Path]) -> tuple[str, ...]:
+    """Scene folders in which names of sets are replaced by the sets' own.
+
+    Args:
+        words: scene folders, relative to the current folder; sets (`cluttered`, or a folder with a `set.json`); their
+            splits (`cluttered/train`).
+
+    Returns:
+        Scene folders, as written where a word names no set.
+
+    Raises:
+        SceneError: a set that cannot be read, whose scenes were not made, or that has none in the split.
+    """
+    found: list[str] = []
+    for word in map(str, words):
+        is_scene = (Path(word) / "scene.json").is_file()
+        found += [word] if is_scene else _members(word) or [word]
+    return tuple(found)

@@ -1,0 +1,57 @@
+"""MuJoCo's renderer against geometry by hand."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from interactive_nav.pictures import gl
+from interactive_nav.pictures.gl import SKY, GlPainter
+from interactive_nav_common.errors import UserError
+from tests.gl_program import drawn, need_gl
+
+BOX = """
+import mujoco, sys, numpy as np
+from interactive_nav.sensing.base import look_along
+from interactive_nav.pictures.gl import GlPainter
+spec = mujoco.MjSpec()
+box = mujoco.mjtGeom.mjGEOM_BOX
+spec.worldbody.add_geom(type=box, pos=[3.5, 0, 0], size=[0.5, 1.0, 1.0], rgba=[1, 0, 0, 1], group=2)
+spec.worldbody.add_geom(type=box, pos=[1.5, 0, 0], size=[0.1, 5, 5], group=4)
+spec.stat.extent = 1.0
+spec.visual.map.znear, spec.visual.map.zfar = 0.01, 100.0
+model = spec.compile()
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+painter = GlPainter(model, 80, 80)
+camera = look_along(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]))
+asked = data, camera, 90.0, [2]
+np.savez(sys.argv[1], depth=painter.draw(*asked, depth=True), colour=painter.draw(*asked))
+"""
+
+
+def test_a_box_is_as_far_and_as_large_as_by_hand(tmp_path):
+    need_gl()
+    made = drawn(BOX, tmp_path)
+    depth, colour = made["depth"][0], made["colour"][0]
+    # Its face is 3 m ahead and reaches 1 m to all sides: 1/3 of half the picture, 13.3 of 40 pixels.
+    shown = depth < 50.0
+    assert {shown.sum(0).max(), shown.sum(1).max()} <= {26, 27}
+    assert np.abs(depth[shown] - 3.0).max() < 0.01  # the nearer box, of another group, is not drawn
+    assert ((colour[..., 0] > 2 * colour[..., 1].astype(int)) == shown).all()
+    assert (colour[~shown] == SKY).all()
+
+
+def test_without_a_gl_it_says_what_to_install(monkeypatch):
+    def none():
+        raise ImportError("no library\nhere")
+
+    monkeypatch.setattr(gl, "_context_class", none)
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with pytest.raises(UserError, match=r"no library.*here.*install libegl1 and libgl1-mesa-dri"):
+        GlPainter(model, 64, 48)
+
+
+def test_pictures_larger_than_the_buffer_are_refused():
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with pytest.raises(UserError, match=r"got pictures of 641 x 480 pixels, expected at most 640 x 480"):
+        GlPainter(model, 641, 480)

@@ -1,0 +1,85 @@
+"""Sets of scenes: names in, folders out."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from interactive_nav.scenes.scene import load_scene
+from scenes_mjcf.schema import SceneError
+from scenes_mjcf.sets import COMMITTED, Member, SceneSet, read_set, scene_folders, write_set
+
+ROOT = Path(__file__).parents[1]
+TRAIN = ["alder", "birch", "cedar", "elm", "hazel", "juniper", "linden", "maple"]
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    for name in ("one", "two", "three"):
+        (tmp_path / "homes" / name).mkdir(parents=True)
+        (tmp_path / "homes" / name / "scene.json").write_text("{}")
+    members = {"one": Member("train", 1), "two": Member("test", 2), "three": Member("train", 3)}
+    write_set(SceneSet("furnished", members), tmp_path / "homes" / "set.json")
+    return tmp_path
+
+
+def test_the_sparse_set_is_the_ten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    assert scene_folders(["sparse/train"]) == tuple(f"scenes_mjcf/{name}" for name in TRAIN)
+    assert scene_folders(["sparse/test"]) == ("scenes_mjcf/rowan", "scenes_mjcf/willow")
+    assert len(scene_folders(["sparse"])) == 10
+
+
+def test_sets_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert scene_folders(["sparse/test"]) == tuple(str(ROOT / "scenes_mjcf" / name) for name in ("rowan", "willow"))
+
+
+def test_own_sets_and_scenes_stand_side_by_side(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(own)
+    assert scene_folders(["homes/train", "homes/two", "elsewhere"]) == (
+        "homes/one", "homes/three", "homes/two", "elsewhere",
+    )  # fmt: skip
+    assert scene_folders([own / "homes"]) == ("homes/one", "homes/three", "homes/two")
+
+
+def test_what_is_missing_is_named_with_the_command(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(own)
+    (own / "homes" / "three" / "scene.json").unlink()
+    with pytest.raises(SceneError, match="1 of 2 scenes .*'three'.*generate-scenes homes --tier furnished"):
+        scene_folders(["homes/train"])
+    assert scene_folders(["homes/test"]) == ("homes/two",)
+
+
+def test_a_set_without_scenes_of_a_split(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(own)
+    write_set(SceneSet("furnished", {"one": Member("train", 1)}), own / "homes" / "set.json")
+    with pytest.raises(SceneError, match="no scene to test"):
+        scene_folders(["homes/test"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tier": None}, "tier is null, expected a string"),
+        ({"scenes": {"one": {"split": "valid", "seed": 1}}}, "one: split is 'valid', expected one of train, test"),
+        ({"scenes": {"one": {"split": "train"}}}, "one: missing key 'seed'"),
+        ({"scene": {}}, "unknown key 'scene'; did you mean 'scenes'"),
+    ],
+)
+def test_a_broken_file_is_refused(own: Path, change: dict, message: str) -> None:
+    path = own / "homes" / "set.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(SceneError, match=message):
+        read_set(path)
+
+
+@pytest.mark.parametrize("path", sorted(COMMITTED.glob("*.json")), ids=lambda path: path.stem)
+def test_committed_sets_hold_the_scenes_that_are_there(path: Path) -> None:
+    """What was made by another machine is the same task."""
+    scenes = read_set(path)
+    there = [name for name in scenes.scenes if (path.parent / scenes.folder / name / "scene.json").is_file()]
+    assert there, "at least some scenes of every set are committed"
+    for name in there:
+        scene = load_scene(path.parent / scenes.folder / name)
+        assert (scene.split, scene.task_digest) == (scenes.scenes[name].split, scenes.scenes[name].task_digest), name

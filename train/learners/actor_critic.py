@@ -1,0 +1,164 @@
+"""What SAC and DDPG are alike in: a policy and critics, how they begin, and one step down both of their losses."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.envs import Env
+from brax.training import gradients, types
+from brax.training import networks as brax_networks
+
+from train.config import NetworkConfig, OffPolicyConfig
+from train.learners import networks
+
+
+@dataclasses.dataclass(frozen=True)
+class ActorCritic(abc.ABC):
+    """All that learning does not change; with what its algorithm adds, an `offpolicy.Agent`.
+
+    Its learner has `policy_params`, `policy_optimizer_state`, `q_params`, `q_optimizer_state`, `target_q_params`,
+    `normalizer_params` and `gradient_steps`.
+    """
+
+    config: OffPolicyConfig
+    networks: Any
+    """With `policy_network` and `q_network`, as Brax's `SACNetworks`."""
+    size: networks.ObservationSize
+    action_size: int
+    shared: bool
+    """The policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
+
+    @property
+    @abc.abstractmethod
+    def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+        """Of policy, of critics, and of what else the algorithm learns."""
+
+    def begun(self, key: jax.Array) -> dict[str, Any]:
+        """The fields of a learner that has learned nothing."""
+        key_policy, key_q = jax.random.split(key)
+        policy_params = self.networks.policy_network.init(key_policy)
+        policy_params = {"head": policy_params["head"]} if self.shared else policy_params
+        q_params = self.networks.q_network.init(key_q)
+        return {
+            "policy_optimizer_state": self.optimizers[0].init(policy_params),
+            "policy_params": policy_params,
+            "q_optimizer_state": self.optimizers[1].init(q_params),
+            "q_params": q_params,
+            "target_q_params": q_params,
+            "normalizer_params": networks.init_normalizer(self.size),
+            "gradient_steps": jnp.zeros((), jnp.int32),
+        }
+
+    def whole_policy(self, policy_params: Any, q_params: Any) -> Any:
+        """The parameters of the whole policy network.
+
+        Args:
+            policy_params: what the policy's optimiser moves.
+            q_params: whose encoder it looks through, if one is shared; the policy's loss does not move it.
+        """
+        return {**policy_params, "encoder": q_params["encoder"]} if self.shared else policy_params
+
+    def descended(
+        self,
+        learner: Any,
+        critic_loss: Callable[..., jax.Array],
+        seen_by_critic: tuple[Any, ...],
+        actor_loss: Callable[..., jax.Array],
+        seen_by_actor: tuple[Any, ...],
+        transitions: types.Transition,
+    ) -> tuple[dict[str, Any], dict[str, jax.Array]]:
+        """One step of critics and policy, each from the other's parameters before it.
+
+        Args:
+            learner: before it.
+            critic_loss: (q_params, *seen_by_critic) -> ().
+            seen_by_critic: see there.
+            actor_loss: (whole policy's parameters, normalizer_params, q_params, *seen_by_actor) -> ().
+            seen_by_actor: see there.
+            transitions: that are learned from.
+
+        Returns:
+            The learner's fields that change, its targets left out; scalar metrics, with the mean value that the critics
+            saw in what was done.
+        """
+
+        def own_loss(policy_params: Any, q_params: Any, *rest: Any) -> jax.Array:
+            whole = self.whole_policy(policy_params, q_params)
+            return actor_loss(whole, learner.normalizer_params, q_params, *rest)
+
+        critic_loss_value, q_params, q_optimizer_state = descend(critic_loss, self.optimizers[1])(
+            learner.q_params, *seen_by_critic, optimizer_state=learner.q_optimizer_state
+        )
+        actor_loss_value, policy_params, policy_optimizer_state = descend(own_loss, self.optimizers[0])(
+            learner.policy_params, learner.q_params, *seen_by_actor, optimizer_state=learner.policy_optimizer_state
+        )
+        values = self.networks.q_network.apply(
+            learner.normalizer_params, learner.q_params, transitions.observation, transitions.action
+        )
+        changed = {
+            "policy_optimizer_state": policy_optimizer_state,
+            "policy_params": policy_params,
+            "q_optimizer_state": q_optimizer_state,
+            "q_params": q_params,
+            "gradient_steps": learner.gradient_steps + 1,
+        }
+        metrics = {"critic_loss": critic_loss_value, "actor_loss": actor_loss_value, "q_mean": jnp.mean(values)}
+        return changed, metrics
+
+
+def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+    """A step down a loss: (params, *rest, optimizer_state=) -> (loss, params, optimizer_state)."""
+    # No axis to average gradients over: one device.
+    return gradients.gradient_update_fn(loss, optimizer, None)  # type: ignore[arg-type]
+
+
+def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
+    """Targets moved by `tau` towards the networks they follow, written as Brax writes it."""
+    return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)
+
+
+def make_networks(
+    env: Env, network: NetworkConfig, config: OffPolicyConfig, outputs: int, critics: int
+) -> tuple[brax_networks.FeedForwardNetwork, brax_networks.FeedForwardNetwork]:
+    """A policy and critics; with images the critics look through one encoder.
+
+    Args:
+        env: its observations and actions.
+        network: encoders; read where observations have images.
+        config: layers.
+        outputs: numbers that parametrise an action.
+        critics: how many.
+
+    Returns:
+        Observations to what parametrises actions [..., outputs]; observations and actions to values [..., critics].
+
+    Raises:
+        ValueError: images too small for the convolutions, or nothing for the critics to see.
+    """
+    size: Any = env.observation_size
+    prepare: Any = networks.preprocess(config.normalize_observations)
+    layers, q_layers = config.policy_hidden_layer_sizes, config.q_hidden_layer_sizes
+    if isinstance(size, Mapping):
+        images, head = network.critic_inputs == "all", networks.Head(layers, outputs)
+        q_head = networks.TwinHead(q_layers, network.action_features, critics, config.q_layer_norm)
+        policy = networks.make_split(network, size, True, prepare, head)
+        q = networks.make_split(network, size, images, prepare, q_head, env.action_size)
+        return policy.whole(), q.whole()
+    norm = config.q_layer_norm
+    return (
+        brax_networks.make_policy_network(outputs, size, preprocess_observations_fn=prepare, hidden_layer_sizes=layers),
+        brax_networks.make_q_network(
+            size, env.action_size, prepare, hidden_layer_sizes=q_layers, n_critics=critics, layer_norm=norm
+        ),
+    )
+
+
+def shares_encoder(network: NetworkConfig, size: networks.ObservationSize) -> bool:
+    """Whether the policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
+    return network.share_encoder and isinstance(size, Mapping)
