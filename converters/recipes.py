@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,11 @@ class SceneRecipe:
     split: str
     seed: int
     building: BuildingConfig | HomeConfig
+
+    @property
+    def tier(self) -> str:
+        """How full the building is."""
+        return self.building.tier if isinstance(self.building, HomeConfig) else SPARSE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,18 +215,48 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
     return [g.name for g in result.gates if not g.passed]
 
 
-def make_scenes(
-    recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False, jobs: int = 2,
-    report: Report | None = None, tell: Callable[[str], None] | None = None,
-) -> dict[str, list[str]]:  # fmt: skip
-    """Makes the scenes of a recipe file that are not there yet.
-
-    Interrupted, it goes on where it was: a scene is there whole or not at all, and one that is there is kept.
+def chosen(
+    recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False,
+    tell: Callable[[str], None] = lambda line: None,
+) -> tuple[SceneRecipe, ...]:  # fmt: skip
+    """The recipes whose scenes are to be made.
 
     Args:
-        recipes: what to make.
+        recipes: all of them.
         out: folder of scene folders.
-        names: scenes to make; empty: all.
+        names: of scenes; empty: all.
+        overwrite: those too that are there.
+        tell: told one line for each that is there and kept.
+
+    Raises:
+        GenerationError: an unknown name.
+    """
+    known = [r.name for r in recipes.scenes]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+            raise GenerationError(f"no recipe named '{name}'; {hint}")
+    wanted = tuple(r for r in recipes.scenes if not names or r.name in names)
+    todo = tuple(r for r in wanted if overwrite or not (out / r.name).exists())
+    for recipe in wanted:
+        if recipe not in todo:
+            tell(f"{recipe.name}: is there, kept")
+    return todo
+
+
+def make_scenes(
+    todo: Sequence[SceneRecipe], conversion: dict[str, Any], out: Path, overwrite: bool = False, jobs: int = 2,
+    report: Report = lambda stage, share: None, tell: Callable[[str], None] = lambda line: None,
+) -> dict[str, list[str]]:  # fmt: skip
+    """Makes scenes one after the other.
+
+    Interrupted, `chosen` names those that are left: a scene is there whole or not at all.
+
+    Args:
+        todo: what to make.
+        conversion: settings of `ConvertConfig`.
+        out: folder of scene folders.
         overwrite: make those again that are there.
         jobs: decompositions side by side.
         report: progress over all of them.
@@ -231,21 +266,9 @@ def make_scenes(
         Name -> gates that fail, of the scenes made now.
 
     Raises:
-        GenerationError: an unknown name, or a building that cannot be generated.
+        GenerationError: a building that cannot be generated.
         SceneRejected, StageFailed: a conversion failed.
     """
-    report, tell = report or (lambda stage, share: None), tell or (lambda line: None)
-    known = [r.name for r in recipes.scenes]
-    for name in names:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-            raise GenerationError(f"no recipe named '{name}'; {hint}")
-    wanted = [r for r in recipes.scenes if not names or r.name in names]
-    todo = [r for r in wanted if overwrite or not (out / r.name).exists()]
-    for recipe in wanted:
-        if recipe not in todo:
-            tell(f"{recipe.name}: is there, kept")
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}
     for k, recipe in enumerate(todo):
@@ -257,7 +280,7 @@ def make_scenes(
         if not overwrite and (out / recipe.name).exists():  # another generator's, made since
             tell(f"{recipe.name}: is there, kept")
             continue
-        failed[recipe.name] = make_scene(recipe, recipes.conversion, out / recipe.name, jobs, inner)
+        failed[recipe.name] = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
         verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
         tell(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")
     return failed
