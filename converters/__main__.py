@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import glob
 import os
 import signal
@@ -134,9 +135,12 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.generate import generate_building
+    from converters.recipes import MODELS, building_of, parse_settings
 
+    settings = parse_settings(arguments.settings)
+    config = building_of(arguments.tier, settings, MODELS[arguments.split], "settings")
     with stage_progress(console) as report:
-        generate_building(arguments.out, arguments.seed, report)
+        generate_building(arguments.out, arguments.seed, report, config)
     console.print(
         f"{arguments.out}: building of seed {arguments.seed}; convert it with "
         f"'python -m converters convert {arguments.out} SCENE_DIR'",
@@ -146,20 +150,12 @@ def _generate(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.recipes import load_recipes, make_scenes
+    from converters.sets import Wanted, generate_scenes
 
-    recipes = load_recipes(arguments.recipes or arguments.out / "recipes.yaml")
+    wanted = Wanted(**{f.name: getattr(arguments, f.name) for f in dataclasses.fields(Wanted)})
     with stage_progress(console) as report:
-        failed = make_scenes(
-            recipes,
-            arguments.out,
-            tuple(arguments.only),
-            arguments.overwrite,
-            arguments.jobs,
-            report,
-            lambda line: console.print(line, soft_wrap=True, highlight=False),
-        )
-    return 1 if any(failed.values()) else 0
+        failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
+    return 1 if failed else 0
 
 
 def _preview(arguments: argparse.Namespace, console: Console) -> int:
@@ -293,18 +289,34 @@ def _add_generate(commands: _Commands) -> None:
     command = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
     command.add_argument("out", type=Path, metavar="OUT", help="folder to make")
     command.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
+    command.add_argument("--tier", default="sparse", help="sparse (default), furnished or cluttered")
+    command.add_argument("--split", choices=("train", "test"), default="train", help="whose CAD models (default train)")
+    command.add_argument(
+        "settings", nargs="*", metavar="KEY=VALUE", help="of the tier's buildings, such as floor_area_m2=80"
+    )
     command.set_defaults(run=_generate, writes=("{}",))
 
 
 def _add_generate_scenes(commands: _Commands) -> None:
     command = commands.add_parser(
-        "generate-scenes", help="make the scenes of a recipe file: generate, convert, draw; goes on where it stopped"
+        "generate-scenes",
+        help="make the scenes of a recipe file, or so many homes of a tier: generate, convert, draw; goes on where it "
+        "stopped",
     )
     command.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
     command.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
+    command.add_argument("--tier", metavar="TIER", help="write OUT/recipes.yaml: sparse, furnished or cluttered homes")
+    command.add_argument("--count", type=_positive, default=10, metavar="N", help="how many of a tier (default 10)")
+    command.add_argument(
+        "--seed", type=int, default=100_000, metavar="N", help="of a tier's first home (default 100000)"
+    )
     command.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
     command.add_argument("--overwrite", action="store_true", help="make those again that are there")
-    command.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N")
+    command.add_argument(
+        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="scenes side by side; default: cores"
+    )
+    command.add_argument("--launcher", choices=("local", "ray"), default="local", help="where (default: local)")
+    command.add_argument("--ray-address", default="auto", metavar="HOST:PORT", help="of the cluster's head")
     command.set_defaults(run=_generate_scenes, writes=("{}/*",))
 
 
@@ -324,6 +336,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    """The command line's words; settings of `generate` may stand before and after its options."""
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    if rest and ("settings" not in arguments or any(word.startswith("-") for word in rest)):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        arguments.settings = [*arguments.settings, *rest]
+    return arguments
+
+
 def _standing(arguments: argparse.Namespace) -> dict[str, int]:
     """What stands where the command writes: path -> inode, another one once something was put in its place."""
     target = glob.escape(str(getattr(arguments, "out", None) or getattr(arguments, "output", "")))
@@ -336,7 +359,7 @@ def _standing(arguments: argparse.Namespace) -> dict[str, int]:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parse(argv)
     signal.signal(signal.SIGTERM, _on_sigterm)
     console = Console()
     before = _standing(arguments)

@@ -1,6 +1,6 @@
 """A recipe file in, scene folders out: every scene of a set generated, converted and drawn by one call.
 
-A recipe names a seed, a split and how the building departs from `BuildingConfig`'s defaults; the split decides
+A recipe names a seed, a split, a tier and how the building departs from the tier's defaults; the split decides
 which CAD models may be used. The same recipes give the same scenes, byte for byte.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import yaml
 from converters.check.preview import preview
 from converters.generate import generate_building
 from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
+from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_config, home_fields
 from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, convert
 from interactive_nav_common.files import part_folder, publish
@@ -25,6 +26,8 @@ MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
 """Split -> CAD models: held-out models are held out here."""
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 _FIXED = ("models",)
+SPARSE = "sparse"
+"""Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
 GENERATE, CONVERT, DRAW = 0.55, 0.35, 0.10
 """Shares of one scene's time, hulls cached: weights of the progress bar."""
 
@@ -39,7 +42,12 @@ class SceneRecipe:
     name: str
     split: str
     seed: int
-    building: BuildingConfig
+    building: BuildingConfig | HomeConfig
+
+    @property
+    def tier(self) -> str:
+        """How full the building is."""
+        return self.building.tier if isinstance(self.building, HomeConfig) else SPARSE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,39 +68,82 @@ def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> N
             raise GenerationError(f"{where}: unknown key '{key}'; {hint}")
 
 
-def _building(settings: dict[str, Any], split: str, where: str) -> BuildingConfig:
-    fields = {f.name: f.default for f in dataclasses.fields(BuildingConfig) if f.name not in _FIXED}
+def _value(key: str, value: Any, default: Any, where: str) -> Any:
+    """A setting as its field takes it: one number stands for a range of that number."""
+    if key in NAMES:
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
+        return tuple(value)
+    if value is None and key in OPTIONAL:
+        return None
+    if isinstance(default, tuple):
+        pair = value if isinstance(value, list) else [value, value]
+        if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
+            raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
+        return tuple(pair)
+    if not isinstance(value, int | float) or isinstance(value, bool) != isinstance(default, bool):
+        raise GenerationError(f"{where}: {key} is {value!r}, expected a {type(default).__name__}")
+    return value
+
+
+def building_of(
+    tier: str, settings: dict[str, Any], models: tuple[str, ...], where: str
+) -> BuildingConfig | HomeConfig:
+    """What to build, from a tier's name and settings as a recipe or a command line gives them.
+
+    Args:
+        tier: `sparse`, or one of `converters.generate.homes.config.TIERS`.
+        settings: by name: those of `BuildingConfig`, or of `HomeConfig` and its shell.
+        models: names of the CAD models that may be used.
+        where: named in errors.
+
+    Raises:
+        GenerationError: an unknown tier or setting, a wrong type, or values that are refused.
+    """
+    if tier not in (SPARSE, *TIERS):
+        raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
+    sparse = {f.name: f.default for f in dataclasses.fields(BuildingConfig) if f.name not in _FIXED}
+    fields = sparse if tier == SPARSE else home_fields()
     _refuse_unknown(settings, fields, where)
-    values: dict[str, Any] = {}
-    for key, value in settings.items():
-        if key in NAMES:
-            if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-                raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
-            value = tuple(value)
-        elif isinstance(fields[key], tuple):
-            pair = value if isinstance(value, list) else [value, value]
-            if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
-                raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
-            value = tuple(pair)
-        elif not isinstance(value, int | float) or isinstance(value, bool) != isinstance(fields[key], bool):
-            raise GenerationError(f"{where}: {key} is {value!r}, expected a {type(fields[key]).__name__}")
-        values[key] = value
+    values = {key: _value(key, value, fields[key], where) for key, value in settings.items()}
     try:
-        return BuildingConfig(**values, models=MODELS[split]).validate()
+        if tier == SPARSE:
+            return BuildingConfig(**values, models=models).validate()
+        return home_config(tier, values, models)
     except GenerationError as error:
         raise GenerationError(f"{where}: {error}") from error
+
+
+def parse_settings(words: Iterable[str]) -> dict[str, Any]:
+    """KEY=VALUE words of a command line -> settings, their values read as YAML.
+
+    Raises:
+        GenerationError: a word without '=', or with a value that is no YAML.
+    """
+    settings = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise GenerationError(f"got '{word}', expected KEY=VALUE, such as floor_area_m2=80")
+        try:
+            settings[key] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise GenerationError(
+                f"{key}: '{value}' is not readable as YAML; give a number or [lowest, highest]"
+            ) from error
+    return settings
 
 
 def parse_recipes(data: Any, where: str) -> Recipes:
     """Decoded YAML -> recipes.
 
     Args:
-        data: the decoded file: `scenes` {name: {split, seed, building}}, `conversion`, and `shared`, which only
+        data: the decoded file: `scenes` {name: {split, seed, tier, building}}, `conversion`, and `shared`, which only
             holds anchors.
         where: file named in errors.
 
     Raises:
-        GenerationError: an unknown or missing key, a wrong type, or a building that `BuildingConfig` refuses.
+        GenerationError: an unknown or missing key, a wrong type, or a building that is refused.
     """
     if not isinstance(data, dict) or not isinstance(data.get("scenes"), dict):
         raise GenerationError(f"{where}: expected a mapping with the key 'scenes', each a name and its recipe")
@@ -109,13 +160,14 @@ def parse_recipes(data: Any, where: str) -> Recipes:
         here = f"{where}: scenes: {name}"
         if not isinstance(recipe, dict):
             raise GenerationError(f"{here}: got {recipe!r}, expected a mapping with split, seed and building")
-        _refuse_unknown(recipe, ("split", "seed", "building"), here)
+        _refuse_unknown(recipe, ("split", "seed", "tier", "building"), here)
         if recipe.get("split") not in MODELS:
             raise GenerationError(f"{here}: split is {recipe.get('split')!r}, expected one of {', '.join(MODELS)}")
         seed = recipe.get("seed")
         if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
             raise GenerationError(f"{here}: seed is {seed!r}, expected a whole number of 0 or more")
-        building = _building(recipe.get("building") or {}, recipe["split"], f"{here}: building")
+        models, settings = MODELS[recipe["split"]], recipe.get("building") or {}
+        building = building_of(recipe.get("tier", SPARSE), settings, models, f"{here}: building")
         scenes.append(SceneRecipe(str(name), recipe["split"], seed, building))
     return Recipes(tuple(scenes), dict(conversion))
 
@@ -163,18 +215,48 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
     return [g.name for g in result.gates if not g.passed]
 
 
-def make_scenes(
-    recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False, jobs: int = 2,
-    report: Report | None = None, tell: Callable[[str], None] | None = None,
-) -> dict[str, list[str]]:  # fmt: skip
-    """Makes the scenes of a recipe file that are not there yet.
-
-    Interrupted, it goes on where it was: a scene is there whole or not at all, and one that is there is kept.
+def chosen(
+    recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False,
+    tell: Callable[[str], None] = lambda line: None,
+) -> tuple[SceneRecipe, ...]:  # fmt: skip
+    """The recipes whose scenes are to be made.
 
     Args:
-        recipes: what to make.
+        recipes: all of them.
         out: folder of scene folders.
-        names: scenes to make; empty: all.
+        names: of scenes; empty: all.
+        overwrite: those too that are there.
+        tell: told one line for each that is there and kept.
+
+    Raises:
+        GenerationError: an unknown name.
+    """
+    known = [r.name for r in recipes.scenes]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
+            raise GenerationError(f"no recipe named '{name}'; {hint}")
+    wanted = tuple(r for r in recipes.scenes if not names or r.name in names)
+    todo = tuple(r for r in wanted if overwrite or not (out / r.name).exists())
+    for recipe in wanted:
+        if recipe not in todo:
+            tell(f"{recipe.name}: is there, kept")
+    return todo
+
+
+def make_scenes(
+    todo: Sequence[SceneRecipe], conversion: dict[str, Any], out: Path, overwrite: bool = False, jobs: int = 2,
+    report: Report = lambda stage, share: None, tell: Callable[[str], None] = lambda line: None,
+) -> dict[str, list[str]]:  # fmt: skip
+    """Makes scenes one after the other.
+
+    Interrupted, `chosen` names those that are left: a scene is there whole or not at all.
+
+    Args:
+        todo: what to make.
+        conversion: settings of `ConvertConfig`.
+        out: folder of scene folders.
         overwrite: make those again that are there.
         jobs: decompositions side by side.
         report: progress over all of them.
@@ -184,21 +266,9 @@ def make_scenes(
         Name -> gates that fail, of the scenes made now.
 
     Raises:
-        GenerationError: an unknown name, or a building that cannot be generated.
+        GenerationError: a building that cannot be generated.
         SceneRejected, StageFailed: a conversion failed.
     """
-    report, tell = report or (lambda stage, share: None), tell or (lambda line: None)
-    known = [r.name for r in recipes.scenes]
-    for name in names:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-            raise GenerationError(f"no recipe named '{name}'; {hint}")
-    wanted = [r for r in recipes.scenes if not names or r.name in names]
-    todo = [r for r in wanted if overwrite or not (out / r.name).exists()]
-    for recipe in wanted:
-        if recipe not in todo:
-            tell(f"{recipe.name}: is there, kept")
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}
     for k, recipe in enumerate(todo):
@@ -210,7 +280,7 @@ def make_scenes(
         if not overwrite and (out / recipe.name).exists():  # another generator's, made since
             tell(f"{recipe.name}: is there, kept")
             continue
-        failed[recipe.name] = make_scene(recipe, recipes.conversion, out / recipe.name, jobs, inner)
+        failed[recipe.name] = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
         verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
         tell(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")
     return failed

@@ -8,14 +8,18 @@ A set is a file that lists scenes, their splits and the digests of their tasks: 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
 
 from interactive_nav_common.files import write_text
-from scenes_mjcf.schema import SPLITS, SceneError, known_keys
+from scenes_mjcf.schema import SPLITS, SceneError, known_keys, load_maps
 
 FILE = "set.json"
 HERE = Path(__file__).parent
@@ -30,8 +34,8 @@ class Member:
     split: str
     seed: int
     """Of the recipe."""
-    task_digest: str = ""
-    """Of map, walls and movables, rounded, so that it is the same on every machine; empty: not yet made."""
+    digest: str = ""
+    """`scene_digest` of the scene; empty: not yet made."""
     measures: dict[str, Any] = dataclasses.field(default_factory=dict)
     """What was measured of it, such as `furniture_share`."""
 
@@ -46,6 +50,32 @@ class SceneSet:
     """Name of a scene -> what it is; folders of these names lie beside the set's file, or in `folder`."""
     folder: str = "."
     """Where the scene folders lie, relative to the file."""
+
+
+def scene_digest(folder: Path) -> str:
+    """SHA-256 of what a scene is made of, the same on every machine that makes it: its map, and its bodies, joints and
+    geoms with numbers rounded to 0.1 mm (the last digits of fitted boxes differ between processors).
+
+    Raises:
+        SceneError: the folder's files cannot be read.
+    """
+    try:
+        tree = ElementTree.parse(folder / "scene.xml")
+    except (OSError, ElementTree.ParseError) as error:
+        raise SceneError(f"{folder / 'scene.xml'}: not readable ({error}); make the scene again") from None
+    maps = load_maps(folder)
+    parts: list[Any] = [maps.traversable.shape, np.packbits(maps.traversable).tobytes().hex()]
+    parts += [[element.tag, {k: _rounded(v) for k, v in sorted(element.attrib.items())}]
+              for body in tree.iter("worldbody") for element in body.iter()]  # fmt: skip
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _rounded(text: str) -> str:
+    """An attribute's numbers with four decimals; -0 is 0; other text as it is."""
+    try:
+        return " ".join(f"{round(float(word), 4) + 0.0:.4f}" for word in text.split())
+    except ValueError:
+        return text
 
 
 def read_set(path: Path) -> SceneSet:

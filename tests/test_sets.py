@@ -1,13 +1,14 @@
 """Sets of scenes: names in, folders out."""
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import pytest
 
-from interactive_nav.scenes.scene import load_scene
-from scenes_mjcf.schema import SceneError
-from scenes_mjcf.sets import COMMITTED, Member, SceneSet, read_set, scene_folders, write_set
+from scenes_mjcf.schema import SceneError, load_manifest
+from scenes_mjcf.sets import COMMITTED, Member, SceneSet, read_set, scene_digest, scene_folders, write_set
 
 ROOT = Path(__file__).parents[1]
 TRAIN = ["alder", "birch", "cedar", "elm", "hazel", "juniper", "linden", "maple"]
@@ -81,5 +82,21 @@ def test_committed_sets_hold_the_scenes_that_are_there(path: Path) -> None:
     there = [name for name in scenes.scenes if (path.parent / scenes.folder / name / "scene.json").is_file()]
     assert there, "at least some scenes of every set are committed"
     for name in there:
-        scene = load_scene(path.parent / scenes.folder / name)
-        assert (scene.split, scene.task_digest) == (scenes.scenes[name].split, scenes.scenes[name].task_digest), name
+        folder = path.parent / scenes.folder / name
+        assert (load_manifest(folder).split, scene_digest(folder)) == (
+            scenes.scenes[name].split,
+            scenes.scenes[name].digest,
+        )
+
+
+def test_a_digest_passes_over_rounding_but_not_over_a_millimetre(tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    shutil.copytree(ROOT / "scenes_mjcf" / "apartment_0", folder)
+    digest, text = scene_digest(folder), (folder / "scene.xml").read_text()
+    number = re.search(r'<body name="chair_0" pos="(-?\d+\.\d+) ', text)
+    assert number is not None
+    at = slice(number.start(1), number.end(1))
+    for change_m, same in ((1e-9, True), (1e-3, False)):
+        changed = text[: at.start] + f"{float(number[1]) + change_m:.12f}" + text[at.stop :]
+        (folder / "scene.xml").write_text(changed)
+        assert (scene_digest(folder) == digest) is same

@@ -5,21 +5,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.furnish import furnish_plan, no_place
+from converters.generate.design.furnish import Effort, furnish_plan, no_place
 from converters.generate.design.instance import Instance
 from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, make_plan
+from converters.generate.homes.config import HomeConfig
+from converters.generate.homes.design import design_home
 from converters.generate.surface.annotate import annotate_items
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
 from converters.generate.surface.write import LICENCE, write_cad, write_json, write_png, write_scan
 from interactive_nav_common.files import part_folder, publish
 
-__all__ = ["Building", "BuildingConfig", "GenerationError", "design_building", "generate_building"]
+__all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
 GENERATOR_VERSION = 2
 """Raised whenever the same seed would give other bytes."""
@@ -36,6 +39,10 @@ class Building:
     items: tuple[Instance, ...]
     floor_height_m: float
     """The floor in the scan's own frame."""
+    uses: tuple[str, ...] = ()
+    """What each room of a home is used as; empty: rooms are just rooms."""
+    measured: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """How full a home is, and how much of it is behind furniture."""
 
 
 def _streams(seed: int) -> list[np.random.Generator]:
@@ -43,13 +50,13 @@ def _streams(seed: int) -> list[np.random.Generator]:
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
 
 
-def design_building(seed: int, config: BuildingConfig | None = None, max_plans: int = 40) -> Building:
+def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None, max_plans: int = 40) -> Building:
     """Draws plan and furniture.
 
     Args:
         seed: 0 or more; the same seed gives the same building.
         config: what to build; default: a small apartment.
-        max_plans: plans tried before giving up.
+        max_plans: plans tried before giving up, of a building that is no home.
 
     Returns:
         The building.
@@ -61,13 +68,29 @@ def design_building(seed: int, config: BuildingConfig | None = None, max_plans: 
         raise GenerationError(f"seed is {seed}: expected a whole number of 0 or more")
     cfg = (config or BuildingConfig()).validate()
     rng = _streams(seed)[0]
+    if isinstance(cfg, HomeConfig):
+        return _design_home(seed, cfg, rng)
     floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
+    effort = Effort()
     for _ in range(max_plans):
         plan = make_plan(cfg, rng)
-        items = furnish_plan(plan, cfg, rng)
+        items = furnish_plan(plan, cfg, rng, effort)
         if items is not None:
             return Building(plan, tuple(items), floor_height_m)
+        if effort.places <= 0:
+            break
     raise no_place(cfg, seed)
+
+
+def _design_home(seed: int, cfg: HomeConfig, rng: np.random.Generator) -> Building:
+    floor_height_m = round(float(rng.uniform(*cfg.shell.floor_height_m)), 3)
+    try:
+        home = design_home(cfg, rng)
+    except GenerationError as error:
+        raise GenerationError(f"seed {seed}: {error}") from error
+    must_push = {robot: round(share, 4) for robot, share in home.must_push_share.items()}
+    measured = {"furniture_share": round(home.furniture_share, 4), "must_push_share": must_push}
+    return Building(home.plan, home.items, floor_height_m, home.uses, measured)
 
 
 def render_building(building: Building, seed: int, config: BuildingConfig, progress: Progress) -> tuple[Scan, Atlas]:
@@ -81,7 +104,7 @@ def render_building(building: Building, seed: int, config: BuildingConfig, progr
 
 
 def generate_building(
-    out_dir: Path, seed: int, progress: Progress | None = None, config: BuildingConfig | None = None
+    out_dir: Path, seed: int, progress: Progress | None = None, config: BuildingConfig | HomeConfig | None = None
 ) -> None:
     """Writes a raw building folder.
 
@@ -108,22 +131,25 @@ def generate_building(
     with part_folder(out_dir, overwrite=True) as work:
         tell("drawing the plan", 0.0)
         building = design_building(seed, cfg)
-        scan, atlas = render_building(building, seed, cfg, tell)
+        scan, atlas = render_building(building, seed, cfg.shell if isinstance(cfg, HomeConfig) else cfg, tell)
         tell("writing", 0.85)
         _write(work, building, scan, atlas, seed, cfg)
         publish({work: out_dir}, overwrite=False)
     tell("done", 1.0)
 
 
-def _write(folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: BuildingConfig) -> None:
+def _write(
+    folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: BuildingConfig | HomeConfig
+) -> None:
     write_scan(folder, scan, atlas, building.floor_height_m)
     (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
     obstacles, traversable = floor_maps(building.plan)
     write_png(folder / "floor_0.png", obstacles)
     write_png(folder / "floor_trav_0.png", traversable)
     items = list(building.items)
+    shell = cfg.shell if isinstance(cfg, HomeConfig) else cfg
     rng = _streams(seed)[3]
-    write_json(folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, cfg, seed, rng))
+    write_json(folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, shell, seed, rng))
     for model in {item.model.name: item.model for item in items}.values():
         write_cad(folder / "cad", model)
     about = {
@@ -132,5 +158,7 @@ def _write(folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int
         "seed": seed,
         "config": dataclasses.asdict(cfg),
     }
+    if building.uses:
+        about |= {"rooms": list(building.uses), "measured": building.measured}
     write_json(folder / "generator.json", about)
     (folder / "LICENCE").write_text(LICENCE, encoding="ascii")

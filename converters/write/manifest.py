@@ -34,10 +34,11 @@ def make_manifest(
     gates: tuple[Gate, ...],
     decompose: DecomposeConfig,
     fallbacks: dict[str, str] | None = None,
+    measures: dict[str, Any] | None = None,
 ) -> SceneManifest:
     """Collects what a scene is, where it came from and which gates it passed; all paths are relative.
 
-    `fallbacks` names the models whose one convex hull stands for them, and why.
+    `fallbacks` names the models whose one convex hull stands for them, and why; `measures` tells how full the scene is.
     """
     fell = fallbacks or {}
     objects = tuple(
@@ -65,6 +66,7 @@ def make_manifest(
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),
+        measures=measures or {},
         warnings=(
             *raw.warnings,
             *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items())),

@@ -21,7 +21,7 @@ from converters.generate.design.furnish import SIDE_WALL_M
 from converters.generate.design.maps import clearance
 from converters.generate.design.space import GRID_M, passes, room_mask, static_grid, without
 from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
-from converters.recipes import load_recipes, make_scenes, parse_recipes
+from converters.recipes import chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.errors import FileError
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
@@ -93,13 +93,14 @@ def test_scenes_are_made_kept_and_made_again_with_the_same_bytes(tmp_path, hull_
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
     (tmp_path / "recipes.yaml").write_text(TINY)
     tiny, lines, shares = load_recipes(tmp_path / "recipes.yaml"), [], []
-    failed = make_scenes(tiny, tmp_path, ("hut",), report=lambda _, s: shares.append(s), tell=lines.append)
+    hut = chosen(tiny, tmp_path, ("hut",))
+    failed = make_scenes(hut, tiny.conversion, tmp_path, report=lambda _, s: shares.append(s), tell=lines.append)
     assert set(failed) == {"hut"} and shares[-1] == pytest.approx(1.0) and shares == sorted(shares)
     assert (tmp_path / "hut" / "preview.png").is_file() and not (tmp_path / "shed").exists()
     first = digest(tmp_path / "hut")
-    assert make_scenes(tiny, tmp_path, ("hut",), tell=lines.append) == {}
+    assert chosen(tiny, tmp_path, ("hut",), tell=lines.append) == ()
     assert lines[-1] == "hut: is there, kept"
-    make_scenes(tiny, tmp_path, ("hut",), overwrite=True)
+    make_scenes(chosen(tiny, tmp_path, ("hut",), overwrite=True), tiny.conversion, tmp_path, overwrite=True)
     assert digest(tmp_path / "hut") == first
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
 
@@ -114,7 +115,8 @@ def test_an_interruption_leaves_the_old_scene_and_no_litter(tmp_path, monkeypatc
 
     monkeypatch.setattr(recipes, "convert", stop)
     with pytest.raises(KeyboardInterrupt):
-        make_scenes(load_recipes(tmp_path / "recipes.yaml"), tmp_path, ("hut",), overwrite=True)
+        tiny = load_recipes(tmp_path / "recipes.yaml")
+        make_scenes(chosen(tiny, tmp_path, ("hut",), overwrite=True), tiny.conversion, tmp_path, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
     assert (tmp_path / "hut" / "scene.json").read_text() == "old"
 
@@ -150,7 +152,7 @@ def test_a_scene_that_cannot_be_put_in_place_leaves_the_old_one(tmp_path, quick,
 
     monkeypatch.setattr(Path, "rename", full)
     with pytest.raises(FileError, match="hut: cannot be written .No space left"):
-        make_scenes(quick, tmp_path, ("hut",), overwrite=True)
+        make_scenes(chosen(quick, tmp_path, ("hut",), overwrite=True), {}, tmp_path, overwrite=True)
     assert (tmp_path / "hut" / "scene.json").read_text() == "old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
 
@@ -159,7 +161,7 @@ def test_what_a_killed_generator_left_goes_with_the_next(tmp_path, quick):
     left = tmp_path / ".hut.part-7-01234567"
     left.mkdir()
     os.utime(left, (0, 0))
-    make_scenes(quick, tmp_path, ("hut",))
+    make_scenes(chosen(quick, tmp_path, ("hut",)), {}, tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
 
 
@@ -187,7 +189,7 @@ def test_the_last_word_names_what_was_written(
     monkeypatch.setattr(recipes, "convert", fail)
     for name in old[-1:]:
         (tmp_path / name).mkdir()
-    assert main(["generate-scenes", str(tmp_path), *old[:-1]]) == code
+    assert main(["generate-scenes", str(tmp_path), "--jobs", "1", *old[:-1]]) == code
     told = f"written before: {tmp_path / written}" if written else "nothing was written"
     assert capsys.readouterr().err.endswith(f"{words}{told}\n")
 
@@ -199,7 +201,7 @@ def test_a_scene_that_another_generator_made_meanwhile_is_kept(tmp_path, quick):
         lines.append(line)
         (tmp_path / "shed").mkdir(exist_ok=True)  # while the first is made
 
-    assert set(make_scenes(quick, tmp_path, tell=tell)) == {"hut"}
+    assert set(make_scenes(chosen(quick, tmp_path), {}, tmp_path, tell=tell)) == {"hut"}
     assert lines[-1] == "shed: is there, kept" and list((tmp_path / "shed").iterdir()) == []
 
 

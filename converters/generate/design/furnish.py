@@ -25,11 +25,28 @@ SIDE_WALL_M = 0.35
 """A side wall this close behind the hinge leaves no way through behind an open leaf."""
 
 
+class Effort:
+    """Work left, counted in places tried: the same on every machine, where seconds are not."""
+
+    def __init__(self, places: int = 30_000):
+        self.places = places
+
+    def spend(self, places: int) -> bool:
+        """Takes from what is left; False where nothing is."""
+        self.places -= places
+        return self.places > 0
+
+
+CHECK_PLACES = 25
+"""A look at where a disc gets on the grid takes as long as trying so many places."""
+
+
 class _Room:
     """What is taken so far: mutable, private to one furnishing attempt."""
 
-    def __init__(self, plan: Plan):
+    def __init__(self, plan: Plan, effort: Effort):
         self.plan = plan
+        self.effort = effort
         self.rooms = [shapely.box(r.x0, r.y0, r.x1, r.y1) for r in plan.rooms]
         self.taken = [shapely.box(f.rect.x0, f.rect.y0, f.rect.x1, f.rect.y1) for f in plan.fixtures]
         self.kept_free = [_poly(doorway_zone(d, 0.75)) for d in plan.doorways]
@@ -50,6 +67,8 @@ class _Room:
 
     def fits(self, item: Instance, room: int, gap_m: float = 0.06, zones: bool = True) -> bool:
         shape = item.footprint
+        if not self.effort.spend(1):
+            return False
         if not self.rooms[room].buffer(-0.03).contains(shape):
             return False
         grown = shape.buffer(gap_m)
@@ -143,6 +162,8 @@ def _narrow(
         d = plan.doorways[k]
         masks = [room_mask(before, plan.rooms[i]) for i in d.rooms]
         here = masks[0] | masks[1] | room_mask(before, d.rect) if local else np.ones_like(before)
+        if not state.effort.spend(CHECK_PLACES):
+            return None
         if int(k) in used or not passes(clearance(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
             continue
         model, scale = state.draw_model("chair", cfg, rng, cfg.passage_chairs)
@@ -156,6 +177,7 @@ def _narrow(
             sweeps = state.kept_free[len(plan.doorways) :]
             if not state.fits(item, d.rooms[side], zones=False) or any(item.footprint.intersects(s) for s in sweeps):
                 continue
+            state.effort.spend(CHECK_PLACES)
             room_m = clearance(without(before, [item]) & here, GRID_M)
             if passes(room_m, masks, low) and not passes(room_m, masks, high):
                 used.add(int(k))
@@ -189,18 +211,40 @@ def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generat
     return None
 
 
-def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Instance], list[Instance]] | None:
+def _hang_leaves(state: _Room, count: int, cfg: BuildingConfig, rng: np.random.Generator) -> bool:
+    """Hangs leaves into doorways; False where fewer than `count` fit."""
+    leaves = 0
+    for k in rng.permutation(len(state.plan.doorways)):
+        if leaves == count:
+            break
+        if state.plan.doorways[k].width_m <= 1.1:
+            leaves += _hang_leaf(state, int(k), cfg, rng) is not None
+    return leaves == count
+
+
+def hang_doors(
+    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator
+) -> tuple[list[tuple[Instance, int]], list[shapely.Polygon]] | None:
+    """Hangs `cfg.n_doors` leaves, or as many of these as a plan has doorways for.
+
+    Returns:
+        Each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.
+    """
+    state = _Room(plan, Effort())
+    low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
+    if not _hang_leaves(state, int(rng.integers(low, high + 1)), cfg, rng) and len(state.placed) < low:
+        return None
+    return list(zip(state.placed, state.room_of, strict=True)), state.kept_free[len(plan.doorways) :]
+
+
+def _attempt(
+    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, effort: Effort
+) -> tuple[list[Instance], list[Instance]] | None:
     """One try: all furniture, and the blockers among it."""
-    state = _Room(plan)
+    state = _Room(plan, effort)
     ranges = {c: getattr(cfg, f"n_{c}s") for c in ("chair", "table", "desk", "sofa", "door")}
     count = {c: int(rng.integers(low, high + 1)) for c, (low, high) in ranges.items()}
-    leaves = 0
-    for k in rng.permutation(len(plan.doorways)):
-        if leaves == count["door"]:
-            break
-        if plan.doorways[k].width_m <= 1.1:
-            leaves += _hang_leaf(state, int(k), cfg, rng) is not None
-    if leaves < count["door"]:
+    if not _hang_leaves(state, count["door"], cfg, rng):
         return None
     roomy = [i for i in range(len(plan.rooms)) if i != plan.corridor]
     hosts: list[tuple[Instance, int]] = []
@@ -249,7 +293,7 @@ def _attempt(plan: Plan, cfg: BuildingConfig, rng: np.random.Generator) -> tuple
 
 
 def furnish_plan(
-    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 10
+    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, effort: Effort, max_tries: int = 10
 ) -> list[Instance] | None:
     """Places the furniture.
 
@@ -257,13 +301,16 @@ def furnish_plan(
         plan: the floor plan.
         cfg: how many of what.
         rng: random stream.
+        effort: work left, spent in place; without any, nothing is found.
         max_tries: attempts.
 
     Returns:
         Doors, sofas, desks, tables, chairs; None where this plan cannot take them.
     """
     for _ in range(max_tries):
-        found = _attempt(plan, cfg, rng)
+        found = _attempt(plan, cfg, rng, effort)
+        if effort.places <= 0:
+            return None
         if found is None:
             continue
         items, blockers = found

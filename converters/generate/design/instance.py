@@ -57,6 +57,12 @@ class Instance:
         (x0, _, z0), (x1, _, z1) = self.model.bounds
         return shapely.Polygon(self.to_floor(np.array([[x0, 0, z0], [x1, 0, z0], [x1, 0, z1], [x0, 0, z1]]))[:, :2])
 
+    def outlines(self, band_m: tuple[float, float] = (-math.inf, math.inf)) -> list[shapely.Geometry]:
+        """What is seen of each of its convex parts from above, of those that reach into a band of heights."""
+        placed = [self.to_floor(part.vertices) for part in self.model.parts]
+        inside = [p for p in placed if p[:, 2].min() < band_m[1] and p[:, 2].max() > band_m[0]]
+        return [shapely.MultiPoint(p[:, :2]).convex_hull for p in inside]
+
 
 def place(model: CadModel, scale: np.ndarray, xy: np.ndarray, facing_rad: float, lift_m: float = 0.0) -> Instance:
     """Stands a model on the floor: centre of the footprint at `xy`, front towards `facing_rad` (from +x)."""

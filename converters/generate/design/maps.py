@@ -10,6 +10,7 @@ nothing static, 0 elsewhere.
 from __future__ import annotations
 
 import numpy as np
+import shapely
 from scipy import ndimage
 
 from converters.generate.design.plan import CM, Plan, Rect
@@ -52,6 +53,15 @@ def floor_maps(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
         if box.low[2] < BAND_M[1] and box.high[2] > BAND_M[0]:
             fill(obstacles, box.rect, 0)
             fill(traversable, box.rect, 0)
+    half = size // 2
+    for item in plan.built_in:
+        for outline in item.outlines(BAND_M):
+            x0, y0, x1, y1 = outline.bounds
+            c0, r0, c1, r1 = (int(np.floor(v / CM)) + half + k for v, k in ((x0, 0), (y0, 0), (x1, 1), (y1, 1)))
+            xs, ys = np.meshgrid((np.arange(c0, c1) - half + 0.5) * CM, (np.arange(r0, r1) - half + 0.5) * CM)
+            inside = shapely.contains_xy(outline, xs, ys)
+            obstacles[r0:r1, c0:c1][inside] = 0
+            traversable[r0:r1, c0:c1][inside] = 0
     return obstacles, traversable
 
 

@@ -14,6 +14,7 @@ import networkx as nx
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.design.instance import Instance
 
 CM = 0.01
 DOORWAY_MARGIN_M = 0.12
@@ -95,6 +96,31 @@ class Plan:
     """Index of the corridor in `rooms`."""
     wall_height_m: float
     door_height_m: float
+    built_in: tuple[Instance, ...] = dataclasses.field(default=(), compare=False)
+    """Furniture that stays: part of the static structure as the fixtures are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    """How a rectangle is shared among rooms."""
+
+    weights: tuple[float, ...]
+    """Area of each room against the others', in the order in which they lie."""
+    spread: float = 0.1
+    """A cut is up to this share of the side away from where the weights have it."""
+
+    @classmethod
+    def even(cls, n: int) -> Parts:
+        """n rooms of one size."""
+        return cls((1.0,) * n)
+
+    def share(self, n_low: int) -> float:
+        """Of the first `n_low` rooms."""
+        return sum(self.weights[:n_low]) / sum(self.weights)
+
+    def cut(self, n_low: int) -> tuple[Parts, Parts]:
+        """The first `n_low` rooms and the others."""
+        return Parts(self.weights[:n_low], self.spread), Parts(self.weights[n_low:], self.spread)
 
 
 def snap(value: float) -> float:
@@ -124,25 +150,29 @@ def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, _Wall, R
     )
 
 
-def _split(rect: Rect, n: int, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Rect], list[_Wall]]:
-    """Cuts a rectangle into n rooms, always across its longer side (mostly)."""
+def _split(rect: Rect, parts: Parts, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Rect], list[_Wall]]:
+    """Cuts a rectangle into rooms, always across its longer side (mostly)."""
+    n = len(parts.weights)
     if n == 1:
         return [rect], []
     width, depth = rect.size
     axis = int(depth > width) if rng.random() < 0.85 else int(rng.random() < 0.5)
     n_low = n // 2 if rng.random() < 0.5 else n - n // 2
-    share = n_low / n + rng.uniform(-0.1, 0.1)
+    few, many = parts.cut(n_low)
+    share = parts.share(n_low) + rng.uniform(-parts.spread, parts.spread)
     low_edge = (rect.x0, rect.y0)[axis]
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
     low, wall, high = _cut(rect, axis, snap(low_edge + share * rect.size[axis] - thick / 2), thick)
-    rooms_low, walls_low = _split(low, n_low, cfg, rng)
-    rooms_high, walls_high = _split(high, n - n_low, cfg, rng)
+    rooms_low, walls_low = _split(low, few, cfg, rng)
+    rooms_high, walls_high = _split(high, many, cfg, rng)
     return rooms_low + rooms_high, [wall, *walls_low, *walls_high]
 
 
-def _layout(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Rect, list[Rect], list[_Wall], int | None]:
+def _layout(
+    cfg: BuildingConfig, rng: np.random.Generator, parts: Parts | None
+) -> tuple[Rect, list[Rect], list[_Wall], int | None]:
     """One try at rooms and inner walls; raises nothing, the caller checks the rooms."""
-    n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
+    n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1)) if parts is None else len(parts.weights)
     area = rng.uniform(*cfg.floor_area_m2)
     aspect = rng.uniform(1.0, 1.6)
     width, depth = snap(np.sqrt(area * aspect)), snap(np.sqrt(area / aspect))
@@ -151,18 +181,21 @@ def _layout(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Rect, list[R
     x0, y0 = snap(-width / 2 + rng.uniform(-0.7, 0.7)), snap(-depth / 2 + rng.uniform(-0.7, 0.7))
     inside = Rect(x0, y0, snap(x0 + width), snap(y0 + depth))
     if n < cfg.corridor_from_rooms:
-        rooms, walls = _split(inside, n, cfg, rng)
+        rooms, walls = _split(inside, parts or Parts.even(n), cfg, rng)
         return inside, rooms, walls, None
+    parts = Parts(parts.weights[1:], parts.spread) if parts is not None else Parts.even(n - 1)
     across = int(width >= depth)
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
     clear = snap(cfg.corridor_width_m)
     n_low = (n - 1) // 2
     span = inside.size[across] - clear - 2 * thick
-    at = snap((inside.x0, inside.y0)[across] + span * (n_low / (n - 1) + rng.uniform(-0.05, 0.05)))
+    few, many = parts.cut(n_low)
+    share = parts.share(n_low) + rng.uniform(-parts.spread / 2, parts.spread / 2)
+    at = snap((inside.x0, inside.y0)[across] + span * share)
     low, wall_low, rest = _cut(inside, across, at, thick)
     corridor, wall_high, high = _cut(rest, across, snap(at + thick + clear), thick)
-    rooms_low, walls_low = _split(low, n_low, cfg, rng)
-    rooms_high, walls_high = _split(high, n - 1 - n_low, cfg, rng)
+    rooms_low, walls_low = _split(low, few, cfg, rng)
+    rooms_high, walls_high = _split(high, many, cfg, rng)
     return inside, [corridor, *rooms_low, *rooms_high], [wall_low, wall_high, *walls_low, *walls_high], 0
 
 
@@ -324,13 +357,15 @@ def _windows(
     return boxes
 
 
-def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000) -> Plan:
+def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000, parts: Parts | None = None) -> Plan:
     """Draws a plan.
 
     Args:
         cfg: what to build.
         rng: random stream.
         max_tries: layouts drawn before giving up.
+        parts: how large each room is against the others, the corridor's weight (if there is to be one) first, which
+            does not count; default: as many as `cfg` says, about equal.
 
     Returns:
         A plan whose rooms are all joined by doorways.
@@ -339,7 +374,7 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
         GenerationError: no layout of that many rooms fits into that area.
     """
     for _ in range(max_tries):
-        inside, rooms, walls, corridor = _layout(cfg, rng)
+        inside, rooms, walls, corridor = _layout(cfg, rng, parts)
         plain = [r for i, r in enumerate(rooms) if i != corridor]
         if min(min(r.size) for r in plain) < cfg.min_room_side_m or max(max(r.size) / min(r.size) for r in plain) > 2.3:
             continue

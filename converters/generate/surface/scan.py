@@ -20,8 +20,10 @@ from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
+from converters.records.raw import FLOOR, WALL
+from scenes_mjcf.categories import TABLE
 
-NYU40 = {"wall": 1, "floor": 2, "cabinet": 3, "chair": 5, "sofa": 6, "table": 7, "door": 8, "desk": 14}
+NYU40 = {"wall": WALL, "floor": FLOOR, "cabinet": 3} | {c.name: c.labels[0] for c in TABLE if c.labels}
 """Class name -> NYU40 id."""
 
 RANGE_M = 5.0
@@ -51,11 +53,11 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
     solids = [solid_from_box((o.x0, o.y0, -0.3), (o.x1, o.y1, 0.0), NYU40["floor"], "floor")]
     solids += [solid_from_box(w.low, w.high, NYU40["wall"], "paint") for w in plan.walls]
     solids += [solid_from_box(f.low, f.high, NYU40["cabinet"], "cabinet") for f in plan.fixtures]
-    for k, item in enumerate(items):
+    for owner, item in [(-1, i) for i in plan.built_in] + list(enumerate(items)):
         label = NYU40[item.model.category]
         for part in item.model.parts:
             mesh = item.to_floor(part.vertices), part.faces
-            solids.append(solid_from_mesh(*mesh, label, part.material, k))
+            solids.append(solid_from_mesh(*mesh, label, part.material, owner))
     return solids
 
 

@@ -1,0 +1,124 @@
+"""A finished scene's movables, maps and surfaces in; how full it is and how hard to get through, for scene.json, out.
+
+Two of the measures are those by which Gibson describes its buildings (Xia et al., "Gibson Env: Real-World Perception
+for Embodied Agents", CVPR 2018): specific surface area, the mesh's area over the volume of its convex hull, and
+navigation complexity, the largest ratio of the shortest way between two places to the straight line between them.
+Gibson's buildings have ceilings and their furniture is part of the mesh; here it stands where it stands at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import ConvexHull
+
+from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.density import ROBOT_RADIUS_M, clearance_m, must_push_shares, regions
+from converters.geometry.faces import face_areas
+from scenes_mjcf.schema import SceneMaps
+
+NAVIGATION_CELL_M = 0.1
+STARTS = 32
+"""Places from which ways to all others are looked at."""
+LEAST_APART_M = 1.0
+"""Two places closer than this are no pair: a thin wall between them makes the ratio as large as one likes."""
+
+
+def shadow(objects: Sequence[PlacedObject], maps: SceneMaps) -> np.ndarray:
+    """[rows, columns] bool: cells of the map whose middle lies below a hull of a movable."""
+    out = np.zeros_like(maps.traversable)
+    rows, columns = out.shape
+    step, (x, y) = maps.resolution_m, maps.origin_w
+    for placed in objects:
+        for hull in placed.hulls_b:
+            outline = shapely.MultiPoint(to_world(placed, hull.vertices)[:, :2]).convex_hull
+            x0, y0, x1, y1 = outline.bounds
+            c = slice(max(int((x0 - x) / step), 0), min(int((x1 - x) / step) + 1, columns))
+            r = slice(max(int((y0 - y) / step), 0), min(int((y1 - y) / step) + 1, rows))
+            xs, ys = np.arange(c.start, c.stop), np.arange(r.start, r.stop)
+            grid = np.meshgrid(x + (xs + 0.5) * step, y + (ys + 0.5) * step)
+            out[r, c] |= shapely.contains_xy(outline, *grid)
+    return out
+
+
+def specific_surface_1_m(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Area of meshes over the volume of the convex hull of all of them, 1/m.
+
+    Args:
+        surfaces: vertices (n, 3) in the world and faces (m, 3) of each.
+    """
+    area_m2 = sum(float(face_areas(vertices, faces).sum()) for vertices, faces in surfaces)
+    return area_m2 / float(ConvexHull(np.vstack([vertices for vertices, _ in surfaces])).volume)
+
+
+def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float, seed: int = 0) -> float:
+    """Largest ratio of the shortest way between two places to the straight line, of pairs a metre or more apart.
+
+    Ways lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
+    region that a disc's middle may be in.
+
+    Args:
+        free: [rows, columns] bool, True where nothing stands.
+        cell_m: its cells' side.
+        radius_m: of the disc.
+        seed: chooses the places to start from.
+
+    Returns:
+        1 where there is no such pair.
+    """
+    step = max(round(NAVIGATION_CELL_M / cell_m), 1)
+    region = regions((clearance_m(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])
+    if not region.any():
+        return 1.0
+    mask = region == 1 + np.bincount(region.ravel())[1:].argmax()
+    height, width = mask.shape
+    number = np.full((height, width), -1)
+    number[mask] = np.arange(mask.sum())
+    rows, columns, lengths = [], [], []
+    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = number[: height - dr, max(-dc, 0) : width - max(dc, 0)]
+        b = number[dr:, max(dc, 0) : width + min(dc, 0)]
+        both = (a >= 0) & (b >= 0)
+        rows.append(a[both])
+        columns.append(b[both])
+        lengths.append(np.full(int(both.sum()), np.hypot(dr, dc) * step * cell_m))
+    edges = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
+    graph = sparse.coo_matrix(edges, (int(mask.sum()),) * 2).tocsr()
+    starts = np.random.default_rng(seed).permutation(int(mask.sum()))[:STARTS]
+    way_m = np.asarray(csgraph.dijkstra(graph, directed=False, indices=starts))
+    places = np.argwhere(mask) * step * cell_m
+    line_m = np.linalg.norm(places[starts][:, None] - places[None], axis=2)
+    far = line_m >= LEAST_APART_M
+    return float((way_m[far] / line_m[far]).max()) if far.any() else 1.0
+
+
+def measure_scene(
+    objects: Sequence[PlacedObject], maps: SceneMaps, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> dict[str, Any]:
+    """Measures a scene.
+
+    Args:
+        objects: movables at rest, in the world.
+        maps: of the scene.
+        surfaces: vertices in the world and faces of everything that is seen.
+
+    Returns:
+        `movable_share`: share of the traversable floor below movables (built-in furniture is not part of that floor);
+        `must_push_share`: robot -> `converters.geometry.density.Ways.must_push_share`; `specific_surface_1_m` and
+        `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
+    """
+    below = shadow(objects, maps)
+    free = maps.traversable & ~below
+    must_push = must_push_shares(maps.traversable, free, maps.resolution_m)
+    complexity = navigation_complexity(free, maps.resolution_m, min(ROBOT_RADIUS_M.values()))
+    return {
+        "movable_share": round(float(below[maps.traversable].mean()), 4),
+        "must_push_share": {robot: round(share, 4) for robot, share in must_push.items()},
+        "specific_surface_1_m": round(specific_surface_1_m(surfaces), 4),
+        "navigation_complexity": round(complexity, 3),
+    }

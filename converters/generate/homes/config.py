@@ -1,0 +1,123 @@
+"""Settings in, a checked `HomeConfig` out: what a furnished home is like besides its seed."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.models.cad import TRAIN_MODELS
+
+Range = tuple[float, float]
+SHARE_TOLERANCE = 0.02
+"""`furniture_share` is met to within this."""
+SHELL = BuildingConfig(
+    floor_area_m2=(60.0, 110.0), n_rooms=(5, 7), min_room_side_m=1.5, corridor_width_m=1.4,
+    doorway_width_m=(0.92, 1.04), corner_doorways=0.7, corner_margin_m=0.28, leaf_wall_gap_m=0.16, leaf_proud_m=0.02,
+    leaves_at_walls=True, n_windows=(5, 9), n_doors=(1, 4), voxel_m=0.03, faces_per_m2=600.0, texels_per_m=40.0,
+    n_static=(0, 0), n_chairs=(0, 0), n_tables=(0, 0), n_desks=(0, 0), n_sofas=(0, 0), n_bottlenecks=0,
+)  # fmt: skip
+"""Rooms, walls, doorways and scan of a home; it counts no furniture."""
+COUNTED = (
+    *("n_static", "n_chairs", "n_tables", "n_desks", "n_sofas", "n_bottlenecks", "n_blockers", "bottleneck_gap_m"),
+    *("blocker_gap_m", "passage_chairs"),
+)
+"""Settings of `BuildingConfig` that say how much of what stands where: a home's rooms and shares say it instead."""
+
+
+OPTIONAL = ("must_push_turtlebot", "must_push_fetch")
+"""Settings that may be None."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HomeConfig:
+    """What kind of home. Pairs are inclusive ranges."""
+
+    shell: BuildingConfig = SHELL
+    """Rooms, walls, doors and the scan of them; its counts of furniture are not looked at."""
+    tier: str = "furnished"
+    """Key of `TIERS`."""
+    furniture_share: float = 0.30
+    """Footprint of all furniture, built-in and movable, over the floor inside of the walls; met to within 0.02."""
+    clutter_per_10_m2: Range = (1.0, 2.0)
+    """Boxes, bags, bins, stools and the like, for each ten square metres of floor, before more is added to meet
+    `furniture_share`."""
+    must_push_turtlebot: Range | None = (0.0, 0.10)
+    """Share of the pairs of places between which a disc of the TurtleBot's radius finds no way round the movables
+    although there is one with them away; None: any."""
+    must_push_fetch: Range | None = (0.0, 0.40)
+    """The same for Fetch's."""
+
+    @property
+    def floor_area_m2(self) -> Range:
+        """Inside area of the home."""
+        return self.shell.floor_area_m2
+
+    @property
+    def must_push(self) -> dict[str, Range]:
+        """Robot -> range asked for, of those that are asked for."""
+        asked = {"turtlebot": self.must_push_turtlebot, "fetch": self.must_push_fetch}
+        return {robot: wanted for robot, wanted in asked.items() if wanted is not None}
+
+    def validate(self) -> HomeConfig:
+        """Returns itself, or raises.
+
+        Raises:
+            GenerationError: an unknown tier, a share that is none, a range upside down, or a shell that
+                `BuildingConfig` refuses.
+        """
+        if self.tier not in TIERS:
+            raise GenerationError(f"tier is '{self.tier}': expected one of {', '.join(TIERS)}")
+        self.shell.validate()
+        if not 0.0 <= self.furniture_share <= MOST_SHARE:
+            raise GenerationError(
+                f"furniture_share is {self.furniture_share}: expected 0 to {MOST_SHARE}, more leaves no way to go"
+            )
+        low, high = self.clutter_per_10_m2
+        if not 0 <= low <= high:
+            raise GenerationError(f"clutter_per_10_m2 is {self.clutter_per_10_m2}: expected 0 <= lowest <= highest")
+        for robot, (low, high) in self.must_push.items():
+            if not 0 <= low <= high <= 1:
+                raise GenerationError(f"must_push_{robot} is {(low, high)}: expected 0 <= lowest <= highest <= 1")
+        return self
+
+
+MOST_SHARE = 0.5
+"""Largest `furniture_share` that is tried."""
+TIERS: dict[str, dict[str, Any]] = {
+    "furnished": {},
+    "cluttered": {
+        "furniture_share": 0.33,
+        "clutter_per_10_m2": (4.0, 5.0),
+        "must_push_turtlebot": (0.40, 0.55),
+        "must_push_fetch": (0.50, 0.75),
+    },
+}
+"""Tier -> how it departs from the defaults. Shares that must be pushed: so that planners that never push arrive in the
+other episodes."""
+
+
+def home_fields() -> dict[str, Any]:
+    """Every setting of a home by name, with its default: its own and those of its shell, but for the CAD models."""
+    own = {f.name: f.default for f in dataclasses.fields(HomeConfig) if f.name not in ("shell", "tier")}
+    shell = {f.name: getattr(SHELL, f.name) for f in dataclasses.fields(BuildingConfig)}
+    return own | {name: value for name, value in shell.items() if name not in ("models", *COUNTED)}
+
+
+def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = TRAIN_MODELS) -> HomeConfig:
+    """A tier's home with some settings changed.
+
+    Args:
+        tier: key of `TIERS`.
+        settings: by name, of `home_fields`.
+        models: names of the CAD models that may be used.
+
+    Raises:
+        GenerationError: an unknown tier, or settings that `HomeConfig.validate` refuses.
+    """
+    if tier not in TIERS:
+        raise GenerationError(f"tier is '{tier}': expected one of {', '.join(TIERS)}")
+    own = {f.name for f in dataclasses.fields(HomeConfig)}
+    shell = {name: value for name, value in settings.items() if name not in own}
+    chosen = TIERS[tier] | {name: value for name, value in settings.items() if name in own}
+    return HomeConfig(dataclasses.replace(SHELL, models=models, **shell), tier, **chosen).validate()

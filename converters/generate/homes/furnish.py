@@ -1,0 +1,268 @@
+"""A home's plan in, its floor with furniture out: what each room's use asks for, then more until it is full enough."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+
+import numpy as np
+
+from converters.generate.design.config import GenerationError
+from converters.generate.design.furnish import hang_doors
+from converters.generate.design.plan import Plan, Rect
+from converters.generate.homes.arrange import Arrangement, Showroom, arrange, on_floor, stand
+from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
+from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
+from converters.generate.homes.groups import ALIKE, GROUPS, ROOM_SETS, RoomSet
+from converters.geometry.density import ROBOT_RADIUS_M
+
+LOOKS = 8
+"""Best places of a group whose way round is looked at before it is left out."""
+REDRAWS = 3
+"""Times that a group is drawn anew, with other models, before it is left out; rows get shorter too."""
+FEWEST = 4
+"""Pieces that a row may do without."""
+MOST_ADDED = 500
+"""Times that something is added to meet a share."""
+WIDE_M = max(ROBOT_RADIUS_M.values()) + 0.02
+"""Disc that gets past what a room's use asks for; past what is added, the disc of the settings does."""
+
+
+@dataclasses.dataclass
+class Home:
+    """A home while it is furnished. Mutable, private to one attempt."""
+
+    cfg: HomeConfig
+    plan: Plan
+    uses: list[str]
+    floor: Floor
+    show: Showroom
+    rng: np.random.Generator
+
+    @property
+    def narrow_m(self) -> float:
+        """Radius of the disc that gets to every room with the furniture as it stands."""
+        return self.cfg.shell.robot_radius_m + 0.02
+
+    def count(self, group: str, room: int) -> int:
+        """How many anchors of a group stand in a room."""
+        return sum(s.group == group and s.room == room for s in self.floor.standing)
+
+
+def _preference(
+    arrangement: Arrangement, places: Places, floor: Floor, room: int, rng: np.random.Generator
+) -> np.ndarray:
+    """(n,) how much a group likes each place."""
+    liking = rng.uniform(0.0, 0.6, len(places.side))
+    at, half = arrangement.group.at, arrangement.pieces[0].half_m[0]
+    if at == "corner":
+        return liking - 6.0 * np.minimum(places.ends.min(axis=1) - half, 0.5)
+    if at == "window":
+        before = floor.before_window(arrangement, places, room) > 0.7
+        return np.where(before, liking + 2.0, -np.inf if arrangement.pieces[0].built_in else liking)
+    if at == "free":
+        return liking + 0.8 * np.minimum(places.ends.min(axis=1), 1.5)
+    if at == "anywhere":  # most things lie near walls, some in the way
+        return liking - (0.5 if rng.random() < 0.6 else 0.0) * places.ends.min(axis=1)
+    # Flush with a corner, or well away from it: slits gather dust.
+    slit = places.ends.min(axis=1) - half
+    return liking - 0.5 * ((slit > 0.06) & (slit < 0.5))
+
+
+def _on_floor(corners: tuple[float, float, float, float], origin: np.ndarray, side: int) -> Rect:
+    """A rectangle u0, v0, u1, v1 of a group's frame, on the floor."""
+    a, b = (on_floor(origin, side * math.pi / 2, *corner) for corner in (corners[:2], corners[2:]))
+    (x0, y0), (x1, y1) = np.minimum(a, b), np.maximum(a, b)
+    return Rect(x0, y0, x1, y1)
+
+
+def _boxes(arrangement: Arrangement, fits: np.ndarray, origin: np.ndarray, side: int) -> list[Rect]:
+    """Bounding rectangles of the pieces that fit."""
+    there = [piece for piece, here in zip(arrangement.pieces, fits, strict=True) if here]
+    return [_on_floor(piece.corners_m, origin, side) for piece in there]
+
+
+def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m: float) -> bool:
+    """Finds the place that a group likes best of those where it fits and the disc still gets round it.
+
+    Returns:
+        True where it stands now.
+    """
+    floor, rng = home.floor, home.rng
+    ranked = []
+    for way in (arrangement, arrangement.mirrored()):
+        places = floor.places(way, room, rng)
+        fits = floor.fitting(way, room, places)
+        needed = np.array([k == 0 or p.needed for k, p in enumerate(way.pieces)])
+        possible = np.flatnonzero(fits[:, needed].all(axis=1))
+        liking = _preference(way, places, floor, room, rng)[possible] + 0.7 * fits[possible].sum(axis=1)
+        possible, liking = possible[liking > -np.inf], liking[liking > -np.inf]
+        best = possible[np.argsort(-liking, kind="stable")[:LOOKS]]
+        ranked += [(liking[possible == i][0], way, places.origin[i], int(places.side[i]), fits[i]) for i in best]
+    ranked.sort(key=lambda r: -r[0])
+    joined, stranded_m2 = floor.reach(room, radius_m)
+    for _, way, origin, side, fits in ranked[:LOOKS]:
+        boxes = _boxes(way, fits, origin, side)
+        still, cut_off_m2 = floor.reach(room, radius_m, boxes)
+        if (still or not joined) and cut_off_m2 <= stranded_m2 + STRANDED_M2:
+            _stand_group(home, name, way, origin, side, fits, room)
+            return True
+    return False
+
+
+def _stand_group(
+    home: Home, name: str, way: Arrangement, origin: np.ndarray, side: int, fits: np.ndarray, room: int
+) -> None:
+    """Stands the pieces that fit, and keeps the floor before the anchor free."""
+    floor = home.floor
+    facing = side * math.pi / 2
+    for k, piece in enumerate(way.pieces):
+        if fits[k]:
+            floor.add(stand(piece, origin, facing), room, name if k == 0 else f"{name}: {piece.model.category}")
+    if way.front is not None:
+        floor.front[floor.cells(_on_floor(way.front, origin, side))] = True
+
+
+def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
+    """Tries to stand a group in a room, with several models and shorter rows.
+
+    Returns:
+        False where it does not fit, or is more than the share asked for.
+    """
+    rows = any(s.relation == "next" for s in GROUPS[name].satellites) if name in GROUPS else False
+    most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
+    for fewer in range(FEWEST + 1 if rows else REDRAWS if name in GROUPS else 1):
+        arrangement = arrange(name, home.show, home.rng, fewer if rows else 0)
+        if arrangement is None:
+            return False
+        area_m2 = sum(p.size_m[0] * p.size_m[2] for p in arrangement.pieces)
+        more = area_m2 / (home.floor.floor_cells * CELL_M**2)
+        if home.floor.share + more <= most and settle(home, name, arrangement, room, radius_m):
+            return True
+    return False
+
+
+def _room_set(home: Home, room: int) -> RoomSet:
+    """What a room has; the living room has the table where there is no dining room and the kitchen is small."""
+    use = home.uses[room]
+    chosen = ROOM_SETS[use]
+    if use == "living" and "dining" not in home.uses:
+        return dataclasses.replace(chosen, base=(chosen.base[0], ("dining table", 0.7), *chosen.base[1:]))
+    if use == "living" and len(home.uses) <= 2:
+        return dataclasses.replace(chosen, base=(("bed", 1.0), *chosen.base))
+    return chosen
+
+
+def stand_base(home: Home) -> None:
+    """Stands what each room's use asks for, the most important pieces of all rooms first."""
+    rng = home.rng
+    sets = [_room_set(home, k) for k in range(len(home.uses))]
+    for level in range(max(len(s.base) for s in sets)):
+        for room in rng.permutation(len(sets)):
+            if level < len(sets[room].base):
+                name, share = sets[room].base[level]
+                if rng.random() < share:
+                    _ = try_group(home, name, int(room), WIDE_M) or try_group(home, name, int(room), home.narrow_m)
+    for _ in home.plan.windows:
+        for room in range(len(sets)):
+            if home.count("radiator", room) < sum(_at_window(home.plan, room)):
+                try_group(home, "radiator", room, home.narrow_m)
+
+
+def _at_window(plan: Plan, room: int) -> list[bool]:
+    r = plan.rooms[room]
+    return [
+        w.rect.x0 < r.x1 + 0.3 and r.x0 < w.rect.x1 + 0.3 and w.rect.y0 < r.y1 + 0.3 and r.y0 < w.rect.y1 + 0.3
+        for w in plan.windows
+    ]
+
+
+def stand_clutter(home: Home) -> None:
+    """Lays small things about, so many for each ten square metres."""
+    rng, cfg = home.rng, home.cfg
+    areas = np.array([r.area_m2 for r in home.plan.rooms])
+    count = int(round(rng.uniform(*cfg.clutter_per_10_m2) * areas.sum() / 10))
+    for room in rng.choice(len(areas), size=count, p=areas / areas.sum()):
+        _clutter(home, int(room))
+
+
+def clutter_category(home: Home, room: int) -> str | None:
+    """A category of what lies about in a room; None where there are no models of any."""
+    here = Counter(s.item.model.category for s in home.floor.standing if s.room == room)
+    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c) and here[c] < ALIKE.get(c, 4)]
+    if not odds:
+        return None
+    weights = np.array([w for _, w in odds])
+    return odds[home.rng.choice(len(odds), p=weights / weights.sum())][0]
+
+
+def _clutter(home: Home, room: int) -> bool:
+    name = clutter_category(home, room)
+    return name is not None and try_group(home, name, room, home.narrow_m)
+
+
+def grow(home: Home) -> None:
+    """Adds furniture to the rooms that are emptiest for their use until the share is met.
+
+    Raises:
+        GenerationError: nothing more fits.
+    """
+    rng, cfg, floor = home.rng, home.cfg, home.floor
+    tired: set[tuple[int, str]] = set()
+    for _ in range(MOST_ADDED):
+        if floor.share >= cfg.furniture_share - SHARE_TOLERANCE / 2:
+            return
+        hungry = {k: floor.room_share(k) / ROOM_SETS[use].appetite for k, use in enumerate(home.uses)}
+        for room in sorted(hungry, key=lambda k: hungry[k]):
+            chosen = _room_set(home, room)
+            groups = [(g, w) for g, w in (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
+                      if (room, g) not in tired and home.count(g, room) < GROUPS[g].most]  # fmt: skip
+            if not groups and (room, "clutter") in tired:
+                continue
+            if not groups or (rng.random() < 0.3 and (room, "clutter") not in tired):
+                if not any(_clutter(home, room) for _ in range(4)):
+                    tired.add((room, "clutter"))
+                break
+            weights = np.array([w for _, w in groups])
+            name = groups[rng.choice(len(groups), p=weights / weights.sum())][0]
+            if not try_group(home, name, room, home.narrow_m):
+                tired.add((room, name))
+            break
+        else:
+            break
+    if abs(floor.share - cfg.furniture_share) > SHARE_TOLERANCE:
+        fullest = min(range(len(home.uses)), key=lambda k: floor.room_share(k) / ROOM_SETS[home.uses[k]].appetite)
+        raise GenerationError(
+            f"furniture_share is {cfg.furniture_share}: nothing more fits at {floor.share:.2f} (the emptiest room, "
+            f"{home.uses[fullest]} of {home.plan.rooms[fullest].area_m2:.1f} m2, at {floor.room_share(fullest):.2f}); "
+            "ask for less, or for more area or fewer rooms"
+        )
+
+
+def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Generator) -> Home:
+    """Furnishes a home.
+
+    Args:
+        plan: the floor plan.
+        uses: of its rooms.
+        cfg: how full it is.
+        rng: random stream.
+
+    Returns:
+        The home, its furniture on its floor.
+
+    Raises:
+        GenerationError: too few doors hang, or the share is not met.
+    """
+    doors = hang_doors(plan, cfg.shell, rng)
+    if doors is None:
+        raise GenerationError(f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at")
+    leaves, sweeps = doors
+    home = Home(cfg, plan, uses, Floor(plan, sweeps), Showroom(cfg.shell.models, cfg.shell.scale_jitter), rng)
+    for leaf, room in leaves:
+        home.floor.add(leaf, room, "door")
+    stand_base(home)
+    stand_clutter(home)
+    grow(home)
+    return home

@@ -1,0 +1,217 @@
+"""A furnished home in; the same home with passages narrowed or cleared until as much must be pushed as asked for, out.
+
+A bounded search: one light piece is taken from where it stands and put into a passage or out of the way, what is then
+reached is measured, and the piece stays there where that is nearer to the ranges asked for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from converters.generate.design.config import GenerationError
+from converters.generate.design.instance import place
+from converters.generate.homes.arrange import Arrangement, Piece
+from converters.generate.homes.config import SHARE_TOLERANCE, Range
+from converters.generate.homes.floor import CELL_M, Standing
+from converters.generate.homes.furnish import Home, clutter_category, settle
+from converters.generate.homes.groups import LIGHT, Group
+from converters.geometry.density import ROBOT_RADIUS_M, Ways, clearance_m, must_push_shares
+
+MOST_MOVES = 240
+"""Moves tried."""
+BEFORE_M = (0.15, 0.85)
+"""From a doorway's middle to a piece that narrows it, along the way through."""
+PASSAGE_M = (0.15, 0.60)
+"""Clearance in the middle of what is taken for a passage."""
+
+
+DOUBT_M = 0.02
+"""Radii this much smaller and larger are measured too: walls, hulls and maps come out a centimetre or two off."""
+ROUND_M = 0.02
+"""Between a piece put into a passage and what stands there."""
+LEAST_GAIN = 1e-4
+"""A move that brings less is none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shares:
+    """Shares of pairs between which a robot must push, for a disc a little smaller than it and one a little larger."""
+
+    least: float
+    most: float
+
+    def miss(self, wanted: Range) -> float:
+        """How far they lie from a range: gaps that are nearly as wide as the robot count for neither side."""
+        return max(wanted[0] - self.least, self.most - wanted[1], 0.0)
+
+
+class Passages:
+    """A home's floor as robots see it. Mutable, private to one search."""
+
+    def __init__(self, home: Home):
+        self.home = home
+        floor = home.floor
+        static = floor.inside & ~floor.fixed
+        self.ways = {
+            robot: [Ways.of(static, CELL_M, radius + more) for more in (-DOUBT_M, DOUBT_M)]
+            for robot, radius in ROBOT_RADIUS_M.items()
+        }
+        self.shares = self.measure()
+
+    def measure(self) -> dict[str, Shares]:
+        """Robot -> shares of pairs between which it must push, as the furniture stands now."""
+        room_m = self.room_m()
+        return {robot: Shares(*(way.must_push_share(room_m) for way in ways)) for robot, ways in self.ways.items()}
+
+    def room_m(self) -> np.ndarray:
+        """Clearance of the floor as the furniture stands now."""
+        floor = self.home.floor
+        return clearance_m(floor.inside & (floor.covered == 0), CELL_M)
+
+    def miss(self, shares: dict[str, Shares] | None = None) -> float:
+        """How far shares (those measured last) lie from what is asked for, summed."""
+        shares = shares or self.shares
+        return sum(shares[robot].miss(wanted) for robot, wanted in self.home.cfg.must_push.items())
+
+    def light(self) -> list[Standing]:
+        """What can be moved: light pieces, seats round tables among them."""
+        return [s for s in self.home.floor.standing if s.item.model.category in LIGHT]
+
+    def trial(self, change: Callable[[], bool]) -> bool:
+        """Keeps a change of what stands where that is nearer to what is asked for; undoes it otherwise.
+
+        Args:
+            change: changes the home; False where it could not.
+        """
+        floor, cfg = self.home.floor, self.home.cfg
+        shares, standing = self.shares, floor.standing
+        if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
+            self.shares = self.measure()
+            if self.miss() < self.miss(shares) - LEAST_GAIN:
+                return True
+        for piece in floor.standing:
+            if not any(piece is old for old in standing):
+                floor.cover(piece, -1)
+        for piece in standing:
+            if not any(piece is new for new in floor.standing):
+                floor.cover(piece, 1)
+        floor.standing, self.shares = standing, shares
+        return False
+
+    def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
+        """A random place in a passage, half of the time before a doorway, and its room."""
+        floor, plan = self.home.floor, self.home.plan
+        if rng.random() < 0.5:
+            d = plan.doorways[rng.integers(len(plan.doorways))]
+            side = int(rng.integers(2))
+            xy = np.array(d.rect.centre)
+            xy[d.axis] += (1 if side else -1) * (d.rect.size[d.axis] / 2 + rng.uniform(*BEFORE_M))
+            xy[1 - d.axis] += rng.uniform(-0.5, 0.5)
+            return xy, d.rooms[side]
+        room_m = self.room_m()
+        # The ridge of the clearance: as far from what stands left as from what stands right.
+        ridge = (room_m > PASSAGE_M[0]) & (room_m < PASSAGE_M[1]) & (floor.room >= 0)
+        ridge &= _ridge(room_m)
+        cells = np.argwhere(ridge)
+        if not len(cells):
+            return None
+        row, column = cells[rng.integers(len(cells))]
+        xy = floor.low + (np.array([column, row]) + 0.5) * CELL_M + rng.uniform(-0.1, 0.1, 2)
+        return xy, int(floor.room[row, column])
+
+
+def _ridge(room_m: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: cells that are at least as clear as both neighbours across, along rows or columns."""
+    out = np.zeros(room_m.shape, bool)
+    for axis in (0, 1):
+        out |= (room_m >= np.roll(room_m, 1, axis)) & (room_m >= np.roll(room_m, -1, axis))
+    return out
+
+
+def adjust(home: Home) -> dict[str, float]:
+    """Moves light pieces until the shares that must be pushed lie in the ranges asked for.
+
+    Args:
+        home: changed in place; how full it is stays as it is, within its tolerance.
+
+    Returns:
+        Robot -> share of pairs between which it must push.
+
+    Raises:
+        GenerationError: the ranges are not reached.
+    """
+    rng, passages = home.rng, Passages(home)
+    wanted = home.cfg.must_push
+    for _ in range(MOST_MOVES):
+        if passages.miss() < LEAST_GAIN:
+            break
+        shares = passages.shares
+        too_low = any(shares[robot].least < low for robot, (low, _) in wanted.items())
+        too_high = any(shares[robot].most > high for robot, (_, high) in wanted.items())
+        if too_low and (not too_high or rng.random() < 0.5):
+            _narrow(home, passages)
+        else:
+            _clear(home, passages)
+    floor = home.floor
+    told = must_push_shares(floor.inside & ~floor.fixed, floor.inside & (floor.covered == 0), CELL_M)
+    if passages.miss() < LEAST_GAIN and all(low <= told[robot] <= high for robot, (low, high) in wanted.items()):
+        return told
+    got = ", ".join(f"must_push_{robot} is {list(wanted[robot])}, got {told[robot]:.2f}" for robot in wanted)
+    raise GenerationError(f"{got} after {MOST_MOVES} moves: ask for a wider range or another furniture_share")
+
+
+def _narrow(home: Home, passages: Passages) -> None:
+    """Tries one light piece in a passage."""
+    rng, floor = home.rng, home.floor
+    place_at = passages.narrowing(rng)
+    if place_at is None:
+        return
+    xy, room = place_at
+    alone = [s for s in passages.light() if ":" not in s.group]
+    piece, category = None, clutter_category(home, room)
+    if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
+        piece = alone[rng.integers(len(alone))]
+        model, scale = piece.item.model, piece.item.scale
+    elif category in LIGHT and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
+        model, scale = home.show.draw(category, rng)
+    else:
+        return
+    item = place(model, scale, xy, float(rng.uniform(-math.pi, math.pi)))
+
+    def change() -> bool:
+        if piece is not None:
+            floor.remove(piece)
+        window, shadow = floor.raster([item.footprint.buffer(ROUND_M)])
+        free = floor.inside[window] & (floor.covered[window] == 0) & ~floor.swept[window]
+        if not (free | ~shadow).all():
+            return False
+        floor.add(item, room, model.category)
+        return True
+
+    passages.trial(change)
+
+
+def _clear(home: Home, passages: Passages) -> None:
+    """Tries to put one light piece that bars a way to where its room, or another, has place for it."""
+    rng, floor = home.rng, home.floor
+    light = passages.light()
+    if not light:
+        return
+    piece = light[rng.integers(len(light))]
+    model, scale = piece.item.model, piece.item.scale
+    group = Group(model.category, "anywhere")
+    alone = Arrangement(group, (Piece(model, scale, 0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),), None)
+    rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
+
+    def change() -> bool:
+        floor.remove(piece)
+        if passages.miss(passages.measure()) >= passages.miss() - LEAST_GAIN:
+            return False
+        any(settle(home, model.category, alone, room, home.narrow_m) for room in rooms)
+        return True
+
+    passages.trial(change)

@@ -1,0 +1,150 @@
+"""A floor plan in, what each of its rooms is used as out; and plans whose rooms have the sizes that homes' have.
+
+How often homes have which rooms, and how large they are against each other, follows the room specifications of
+ProcTHOR (github.com/allenai/procthor, Apache-2.0): kitchen to living room 3:2 to 1:2, bedroom to bathroom 2:1.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+
+from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.design.plan import Parts, Plan, Rect, make_plan
+
+
+@dataclasses.dataclass(frozen=True)
+class RoomUse:
+    """What a room of one use is like."""
+
+    weight: float
+    """Area against that of the other rooms."""
+    least_side_m: float
+    """What its furniture needs."""
+    beside: tuple[str, ...] = ()
+    """It lies next to one of these, where the home has one."""
+    most: int = 1
+    """Rooms of this use in one home."""
+    extra: float = 0.0
+    """How often it is one of the rooms beyond the first four, against the others."""
+
+
+USES = {
+    "living": RoomUse(2.1, 2.8),
+    "bedroom": RoomUse(1.25, 2.3, most=4, extra=4.0),
+    "bathroom": RoomUse(0.55, 1.5, most=2, extra=0.7),
+    "kitchen": RoomUse(1.0, 1.8, ("living", "dining")),
+    "dining": RoomUse(1.1, 2.2, ("living", "kitchen"), extra=2.0),
+    "office": RoomUse(0.85, 2.0, extra=2.0),
+    "storage": RoomUse(0.45, 1.5, extra=1.0),
+    "hall": RoomUse(0.5, 1.1),
+}
+"""Use -> what it is like. A corridor is a hall."""
+FIRST = ("living", "bedroom", "bathroom", "kitchen")
+ORDER = ("kitchen", "dining", "living", "office", "hall", "storage", "bathroom", "bedroom")
+"""Uses as they follow one another through a home, so that neighbours lie next to each other."""
+PLANS = 6
+"""Plans drawn, of which the one is taken whose rooms suit their uses best."""
+PROGRAMMES, LAYOUTS = 40, 150
+"""Sets of uses tried until there are so many, and layouts for each."""
+EVENER = 0.75
+"""Power of the weights: rooms cut from one rectangle cannot differ as much as they should."""
+
+
+def programme(n_rooms: int, rng: np.random.Generator) -> list[str]:
+    """The uses of so many rooms, corridor not counted, in the order in which they lie."""
+    uses: list[str] = list(FIRST[:n_rooms])
+    if n_rooms == 3 and rng.random() < 0.5:
+        uses[2] = "kitchen"
+    while len(uses) < n_rooms:
+        left = [u for u, use in USES.items() if use.extra and uses.count(u) < use.most]
+        odds = np.array([USES[u].extra / (1 + uses.count(u)) for u in left])
+        uses.append(left[rng.choice(len(left), p=odds / odds.sum())] if left else "bedroom")
+    uses.sort(key=ORDER.index)
+    return uses[::-1] if rng.random() < 0.5 else uses
+
+
+def touching(a: Rect, b: Rect) -> bool:
+    """True where two rooms share a stretch of wall wide enough for a doorway."""
+    gap_x, gap_y = max(a.x0 - b.x1, b.x0 - a.x1), max(a.y0 - b.y1, b.y0 - a.y1)
+    return (gap_x < 0.3 and gap_y < -0.8) or (gap_y < 0.3 and gap_x < -0.8)
+
+
+def _misfit(rooms: list[Rect], uses: list[str], near: np.ndarray) -> float:
+    """How badly uses suit rooms: areas off by a factor, sides too short, no neighbour of the right use."""
+    total, weight = sum(r.area_m2 for r in rooms), sum(USES[u].weight for u in uses)
+    cost = 0.0
+    for k, (room, name) in enumerate(zip(rooms, uses, strict=True)):
+        use = USES[name]
+        cost += math.log(room.area_m2 / total * weight / use.weight) ** 2
+        cost += 4.0 * max(0.0, use.least_side_m - min(room.size))
+        wanted = [j for j, other in enumerate(uses) if other in use.beside]
+        cost += 0.6 * (bool(wanted) and not any(near[k, j] for j in wanted))
+    largest = max(range(len(rooms)), key=lambda k: rooms[k].area_m2)
+    return cost + 3.0 * ("living" in uses and uses[largest] != "living")
+
+
+def assign_uses(plan: Plan, wanted: list[str]) -> tuple[list[str], float]:
+    """Says what each room of a plan is used as.
+
+    Args:
+        plan: the floor plan; its corridor is a hall.
+        wanted: uses of its other rooms, as many as there are.
+
+    Returns:
+        The use of each room, key of `USES`, and how badly it suits, 0 being perfect.
+    """
+    plain = [k for k in range(len(plan.rooms)) if k != plan.corridor]
+    rooms, uses = [plan.rooms[k] for k in plain], list(wanted)
+    near = np.array([[touching(a, b) for b in rooms] for a in rooms])
+    best = _misfit(rooms, uses, near)
+    better = True
+    while better:  # ends: the misfit falls with each exchange, and there are finitely many orders
+        better = False
+        for i, j in itertools.combinations(range(len(uses)), 2):
+            changed = list(uses)
+            changed[i], changed[j] = uses[j], uses[i]
+            cost = _misfit(rooms, changed, near)
+            if cost < best - 1e-9:
+                uses, best, better = changed, cost, True
+    found = dict(zip(plain, uses, strict=True))
+    return [found.get(k, "hall") for k in range(len(plan.rooms))], best
+
+
+def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list[str]]:
+    """Draws the plan of a home.
+
+    Args:
+        cfg: areas, rooms, walls and doorways.
+        rng: random stream.
+
+    Returns:
+        The plan, and the use of each of its rooms.
+
+    Raises:
+        GenerationError: that many rooms do not fit into that area.
+    """
+    found, refused = [], None
+    for k in range(PROGRAMMES):
+        n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
+        corridor = n >= cfg.corridor_from_rooms
+        wanted = programme(n - corridor, rng)
+        lying = [wanted[i] for i in rng.permutation(len(wanted))] if k % 2 else wanted
+        weights = (*([1.0] * corridor), *(USES[use].weight ** EVENER for use in lying))
+        try:
+            plan = make_plan(cfg, rng, LAYOUTS, Parts(weights, 0.06))
+        except GenerationError as error:
+            refused = error
+            continue
+        uses, misfit = assign_uses(plan, lying)
+        found.append((misfit, k, plan, uses))
+        if len(found) == PLANS:
+            break
+    if not found:
+        assert refused is not None
+        raise refused
+    _, _, plan, uses = min(found, key=lambda f: f[:2])
+    return plan, uses

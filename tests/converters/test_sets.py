@@ -1,0 +1,109 @@
+"""Sets of homes: a tier and a number in, recipes, scene folders and a list of them out."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from converters import sets
+from converters.__main__ import main
+from converters.generate.design.config import GenerationError
+from converters.recipes import load_recipes
+from scenes_mjcf.sets import read_set, scene_digest, scene_folders
+
+SCENES = Path(__file__).parents[2] / "scenes_mjcf"
+
+
+class Copier:
+    """A runner whose command copies a scene; `shed` fails a gate, `barn` cannot be made."""
+
+    def __init__(self, out: Path):
+        self.out, self.commands, self.closed = out, [], 0
+
+    def run(self, command: list[str]) -> tuple[int, str]:
+        name = command[-1]
+        self.commands.append(command)
+        if name.endswith("002"):
+            return 2, f"converters generate-scenes: {name}: no room\n"
+        shutil.copytree(SCENES / "apartment_0", self.out / name)
+        return 0, f"{name}: train, seed 1, every gate passes\n"
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_a_tiers_recipes_name_seeds_and_splits(tmp_path: Path) -> None:
+    sets.begin_set(tmp_path / "homes", "furnished", 10, 500)
+    recipes = load_recipes(tmp_path / "homes" / "recipes.yaml")
+    assert [(r.name, r.seed, r.split, r.tier) for r in recipes.scenes][7:9] == [
+        ("furnished_007", 507, "train", "furnished"),
+        ("furnished_008", 508, "test", "furnished"),
+    ]
+    assert [r.split for r in recipes.scenes].count("test") == 2
+    sets.begin_set(tmp_path / "homes", "furnished", 10, 500)  # the same again is no error
+    with pytest.raises(GenerationError, match="holds other recipes than 11 of tier furnished from seed 500"):
+        sets.begin_set(tmp_path / "homes", "furnished", 11, 500)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--tier", "messy"], "tier is 'messy', expected one of sparse, furnished, cluttered"),
+        (["--tier", "furnished", "--seed", "-1"], "seed is -1, expected a whole number"),
+        ([], "recipes.yaml: no such file"),
+    ],
+)
+def test_wrong_words_are_one_line_and_leave_nothing(tmp_path: Path, capsys, words: list[str], message: str) -> None:
+    assert main(["generate-scenes", str(tmp_path / "homes"), *words]) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+    assert not (tmp_path / "homes").exists()
+
+
+def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, monkeypatch) -> None:
+    out, lines, shares = tmp_path / "homes", [], []
+    sets.begin_set(out, "furnished", 5)
+    runner = Copier(out)
+    monkeypatch.setattr(sets, "LocalRunner", lambda: runner)
+    wanted = sets.Wanted(out, None, None, 10, 0, (), False, 2, "local", "auto")
+    assert sets.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append) == ["furnished_002"]
+    assert runner.closed == 1 and len(runner.commands) == 5 and shares[-1] == 1.0
+    assert runner.commands[0][:4] == [sys.executable, "-m", "converters", "generate-scenes"]
+    assert "converters generate-scenes: furnished_002: no room" in lines
+    assert not (out / "set.json").exists()
+
+    wanted = sets.Wanted(out, None, "furnished", 5, sets.SEEDS, (), False, 1, "local", "auto")
+    monkeypatch.setattr(sets, "make_scenes", lambda todo, *_: {recipe.name: ["drift_boxes"] for recipe in todo})
+    assert sets.generate_scenes(wanted, lambda _, share: None, lines.append) == ["furnished_002"]
+    assert lines[-4:] == [f"furnished_00{k}: is there, kept" for k in (0, 1, 3, 4)]
+    members = read_set(out / "set.json").scenes
+    assert members["furnished_000"].digest == scene_digest(SCENES / "apartment_0")
+    assert members["furnished_002"].digest == ""
+    monkeypatch.chdir(tmp_path)
+    assert scene_folders(["homes/test"]) == ("homes/furnished_004",)
+
+
+def test_a_scene_that_differs_from_the_list_is_told(tmp_path: Path) -> None:
+    (tmp_path / "recipes.yaml").write_text(
+        yaml.safe_dump({"scenes": {name: {"split": "train", "seed": 4} for name in ("one", "two")}})
+    )
+    for name, source in (("one", "apartment_0"), ("two", "alder")):
+        shutil.copytree(SCENES / source, tmp_path / name)
+    recipes, lines = load_recipes(tmp_path / "recipes.yaml"), []
+    first = sets.list_set(recipes, tmp_path, lines.append)
+    assert first.tier == "sparse" and lines == []
+    shutil.rmtree(tmp_path / "two")
+    shutil.copytree(SCENES / "birch", tmp_path / "two")
+    assert sets.list_set(recipes, tmp_path, lines.append) == first
+    assert lines == [f"two: not the scene that {tmp_path / 'set.json'} lists"]
+
+
+def test_processes_that_still_run_are_ended() -> None:
+    runner = sets.LocalRunner()
+    assert runner.run([sys.executable, "-c", "print('made'); raise SystemExit(3)"]) == (3, "made\n")
+    runner.close()
+    assert runner.run([sys.executable, "-c", "print('late')"]) == (-1, "stopped")
