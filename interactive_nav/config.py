@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
@@ -31,7 +32,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "scene_choice": ("episode", "slot"),
     "renderer": ("auto", "warp", "rays"),
     "image_dtype": ("float32", "float16", "uint8"),
-    "segmentation_classes": (4, 5),
+    "segmentation_classes": (4, 5, "all"),
 }
 """Settings that are one of a few values."""
 _BOUNDS: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
@@ -193,8 +194,9 @@ class NavConfig:
     """Of images: float32 or float16 in [0, 1], or uint8, 255 times that."""
     depth_range_m: float = 5.0
     """Depth is cut off here and divided by it."""
-    segmentation_classes: int = 4
-    """Furniture classes: 4 as in the original's code (desk and table are one), or the paper's 5."""
+    segmentation_classes: MaskClasses = 4
+    """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all: every category
+    has an id of its own."""
     depth_dropout: float = 0.0
     """Share of depth pixels that read 0, drawn anew each step."""
     depth_noise: float = 0.0

@@ -183,10 +183,11 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
             return None
         return _convert(value, arguments[0], where)
     if origin is Literal:
-        if value not in arguments:
-            near = nearest(str(value), arguments)
-            raise ConfigError(f"{where}: got {_shown(value)}, expected one of {', '.join(arguments)}{near}")
-        return value
+        names = [str(argument) for argument in arguments]
+        if str(value) not in names:
+            near = nearest(str(value), names)
+            raise ConfigError(f"{where}: got {_shown(value)}, expected one of {', '.join(names)}{near}")
+        return arguments[names.index(str(value))]
     if origin is tuple:
         items = [item for item in value.split(",") if item] if isinstance(value, str) else value
         items = items if isinstance(items, (list, tuple)) else [items]

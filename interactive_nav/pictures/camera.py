@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.physics import resolve_backend
-from interactive_nav.pictures.shading import BACKGROUND, PALETTE, lambert
+from interactive_nav.pictures.shading import BACKGROUND_COLOUR, lambert
 from interactive_nav.pictures.visual import ROBOT_GROUP, VISUAL_GROUP, VisualModel, build_visual
 from interactive_nav.sensing.base import FAR_M, CameraPose, Lens
 
@@ -91,7 +91,7 @@ class Camera:
             )
         scene = int(state.info["nav"].scene_index)
         if scene not in self._visual:
-            self._visual[scene] = build_visual(self._env.world, scene, self._env.sensors.five_classes)
+            self._visual[scene] = build_visual(self._env.world, scene, self._env.sensors.boxes.classes)
         visual = self._visual[scene]
         data = visual.pose(qpos)
         pose, fov = self._pose(visual, data, qpos, scene, view, width / height)
@@ -218,6 +218,6 @@ def _by_rays(visual: VisualModel, data, pose: _Pose, lens: Lens, groups, streams
         faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
         forward, right_w, up_w = pose.axes_w.T
         out["normals"] = np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32)
-        base = np.where(met[..., None], visual.colour[geom], PALETTE[BACKGROUND])
+        base = np.where(met[..., None], visual.colour[geom], np.array(BACKGROUND_COLOUR, np.float32))
         out["rgb"] = lambert(base, faces, forward, met, np)
     return {name: out[name] for name in streams}

@@ -23,7 +23,7 @@ from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
-from scenes_mjcf.categories import CLASS_COLOURS, CLASSES, TABLE, class_id
+from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses, class_id
 
 COLOURS = {category.name: category.colour for category in TABLE}
 """RGB in [0, 1] by category, in colour and mask pictures alike."""
@@ -76,7 +76,7 @@ class Image:
     depth_m: np.ndarray
     """[rows, columns] f32 along the optical axis; infinite where there is nothing."""
     classes: np.ndarray
-    """[rows, columns] u8 segmentation ids, as the observation's: index into `CLASSES`; or `NOTHING`."""
+    """[rows, columns] u8 segmentation ids, as the observation's; or `NOTHING`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,20 +93,20 @@ class FloorPaint:
 class SceneView:
     """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
 
-    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], segmentation_classes: int = 4):
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
         """Compiles the model to look at.
 
         Args:
             robot: its collision shapes are drawn, or its visual ones where it has any.
             scene: its visual meshes are drawn.
             small: the small objects.
-            segmentation_classes: as in `NavConfig`.
+            classes: the setting `segmentation_classes`.
         """
         self.robot = robot
         self.model = _compile(robot, scene, small)
         self.data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self.data)
-        self._class, kinds = _geom_classes(self.model, robot, scene, small, segmentation_classes == 5)
+        self._class, kinds = _geom_classes(self.model, robot, scene, small, classes)
         self._colour = np.array([COLOURS[kind] for kind in kinds])
         # Things of one kind differ a little, so that two chairs can be told apart.
         for g in range(self.model.ngeom):
@@ -255,11 +255,11 @@ def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:
     return np.repeat((255 * near**2).astype(np.uint8)[..., None], 3, -1)
 
 
-def mask_picture(classes: np.ndarray) -> np.ndarray:
-    """[rows, columns] classes to [rows, columns, 3] u8 in `CLASS_COLOURS`; nothing is black."""
-    table = np.zeros((256, 3), np.uint8)
-    table[: len(CLASSES)] = np.array(CLASS_COLOURS) * 255
-    return table[classes]
+def mask_picture(mask: np.ndarray, classes: MaskClasses = 4) -> np.ndarray:
+    """[rows, columns] ids to [rows, columns, 3] u8 in the classes' colours; nothing is black."""
+    table, colours = np.zeros((256, 3), np.uint8), np.array(SEGMENTATIONS[classes].colours)
+    table[: len(colours)] = colours * 255
+    return table[mask]
 
 
 def _varied(colour: np.ndarray, index: int) -> np.ndarray:
@@ -331,13 +331,13 @@ def _compile(robot: RobotSpec, scene: Scene, small: Sequence[SmallObject]) -> mu
 
 
 def _geom_classes(
-    model: mujoco.MjModel, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], five: bool
+    model: mujoco.MjModel, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses
 ) -> tuple[np.ndarray, list[str]]:
     """[ngeom] segmentation ids, and each geom's category."""
-    known = {m.name: (class_id(m.category, five), m.category) for m in scene.movables}
-    known |= {f"{o.category}_small_{i}": (o.segmentation_id, o.category) for i, o in enumerate(small)}
+    known = {m.name: (class_id(m.category, classes), m.category) for m in scene.movables}
+    known |= {f"{o.category}_small_{i}": (o.mask_id(classes), o.category) for i, o in enumerate(small)}
     base = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.base_body)
-    robot_row, structure = ((class_id(kind), kind) for kind in ("robot", "structure"))
+    robot_row, structure = ((class_id(kind, classes), kind) for kind in ("robot", "structure"))
     rows = []
     for body in model.geom_bodyid:
         own = model.body_rootid[body] == base

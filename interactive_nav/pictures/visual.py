@@ -7,10 +7,10 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTE
+from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTES
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.world import World
-from scenes_mjcf.categories import CATEGORIES, class_id
+from scenes_mjcf.categories import CATEGORIES, MaskClasses, class_id
 
 VISUAL_GROUP, ROBOT_GROUP = 2, 5
 """Geom groups: what is always drawn, and the robot, which is not in its own view."""
@@ -40,18 +40,18 @@ class VisualModel:
         return data
 
 
-def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
+def build_visual(world: World, scene: int, classes: MaskClasses = 4) -> VisualModel:
     """Compiles a scene's own `scene.xml` with the robot and the small objects added.
 
     Args:
         world: of the environment.
         scene: index of the scene.
-        five: desks have a segmentation id of their own, as with `segmentation_classes=5`.
+        classes: the setting `segmentation_classes`.
     """
-    ids_of = {m.name: class_id(m.category, five) for m in world.scenes[scene].movables}
-    ids_of |= {f"{o.category}_small_{i}": o.segmentation_id for i, o in enumerate(world.small_objects)}
+    ids_of = {m.name: class_id(m.category, classes) for m in world.scenes[scene].movables}
+    ids_of |= {f"{o.category}_small_{i}": o.mask_id(classes) for i, o in enumerate(world.small_objects)}
     spec = mujoco.MjSpec.from_file(str(world.scenes[scene].path / "scene.xml"))
-    _show_furniture(spec, ids_of)
+    _show_furniture(spec, ids_of, PALETTES[classes])
     before = {b.name for b in spec.bodies}
     world.robot.add_to(spec)
     for body in spec.bodies:
@@ -59,7 +59,7 @@ def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
             for geom in body.geoms:
                 geom.group, geom.rgba = ROBOT_GROUP, [*CATEGORIES["robot"].colour, 1.0]
     for i, obj in enumerate(world.small_objects):
-        _add_small(spec, f"{obj.category}_small_{i}", obj)
+        _add_small(spec, f"{obj.category}_small_{i}", obj, PALETTES[classes][obj.mask_id(classes)])
     spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
     for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
         spec.delete(camera)
@@ -89,7 +89,7 @@ def build_visual(world: World, scene: int, five: bool = False) -> VisualModel:
     return VisualModel(model, np.concatenate(targets), np.concatenate(sources), ids, colour)
 
 
-def _show_furniture(spec: mujoco.MjSpec, ids_of: dict[str, int]) -> None:
+def _show_furniture(spec: mujoco.MjSpec, ids_of: dict[str, int], palette: np.ndarray) -> None:
     """Puts what is drawn of a scene into the visual group and all else out of sight."""
     with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
     for geom in list(spec.geoms):
@@ -100,10 +100,10 @@ def _show_furniture(spec: mujoco.MjSpec, ids_of: dict[str, int]) -> None:
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
             geom.rgba = [*FLOOR_COLOUR, 1.0]
         elif bare and geom.group == VISUAL_GROUP:
-            geom.rgba = [*PALETTE[ids_of.get(geom.parent.name, 0)], 1.0]
+            geom.rgba = [*palette[ids_of.get(geom.parent.name, 0)], 1.0]
 
 
-def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject) -> None:
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, colour: np.ndarray) -> None:
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint(name=f"{name}_joint")
     for box in obj.boxes:
@@ -113,7 +113,7 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject) -> None:
             quat=box.quat,
             size=box.half_m,
             group=VISUAL_GROUP,
-            rgba=[*PALETTE[obj.segmentation_id], 1.0],
+            rgba=[*colour, 1.0],
         )
 
 

@@ -17,10 +17,7 @@ from interactive_nav.scenes.scene import Movable
 from interactive_nav.scenes.spec import sorted_movables
 from interactive_nav.scenes.world import World
 from interactive_nav_common.rotations import matrix_from_quat
-from scenes_mjcf.categories import TABLE, class_id
-
-NUM_CLASSES = max(number for category in TABLE for number in category.segmentation_ids) + 1
-"""Divides a class id into the observation's [0, 1], as the original does (11): desks apart (`five`) are 1."""
+from scenes_mjcf.categories import MaskClasses, class_id
 
 
 @flax.struct.dataclass
@@ -49,6 +46,8 @@ class BoxTables:
     """[S, M, 3] f32."""
     hinge_anchor_b: jax.Array
     """[S, M, 3] f32, m."""
+    classes: MaskClasses = flax.struct.field(pytree_node=False, default=4)
+    """How `class_id` tells categories apart: the setting `segmentation_classes`."""
 
     @property
     def num_boxes(self) -> int:
@@ -56,12 +55,12 @@ class BoxTables:
         return len(self.body)
 
 
-def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
+def build_boxes(world: World, classes: MaskClasses = 4) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
     Args:
         world: with its scenes.
-        five_categories: desks get an id of their own.
+        classes: the setting `segmentation_classes`.
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
@@ -72,11 +71,11 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
         column: list[tuple[np.ndarray, int, Movable | None]] = []
         for i, kind in enumerate(layout.slot_kind):
             if kind == "small":
-                column.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id, None))
+                column.append((world.small_objects[i].rows, world.small_objects[i].mask_id(classes), None))
                 continue
             movable = next(own[kind], None)
             boxes = np.zeros((0, 10)) if movable is None else movable.boxes
-            column.append((boxes, 0 if movable is None else class_id(movable.category, five_categories), movable))
+            column.append((boxes, 0 if movable is None else class_id(movable.category, classes), movable))
         column.append((scene.walls, 0, None))
         columns.append(column)
     counts = [max(len(column[m][0]) for column in columns) for m in range(slots + 1)]
@@ -113,6 +112,7 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
         hinge_axes_w=jnp.asarray(hinge_axes, f32),
         hinge_axis_b=jnp.asarray(hinge_axis, f32),
         hinge_anchor_b=jnp.asarray(anchor, f32),
+        classes=classes,
     )
 
 
@@ -182,7 +182,7 @@ def with_robot(tables: BoxTables, world: World) -> BoxTables:
         pos_b=add(tables.pos_b, [0.0, 0.0, half_height], tables.num_boxes),
         axes_b=add(tables.axes_b, eye, tables.num_boxes),
         half_m=add(tables.half_m, [0.8 * radius, 0.8 * radius, half_height], tables.num_boxes),
-        class_id=add(tables.class_id, class_id("robot"), tables.num_boxes),
+        class_id=add(tables.class_id, class_id("robot", tables.classes), tables.num_boxes),
         hinge_pos_w=add(tables.hinge_pos_w, [0.0] * 3, slots),
         hinge_axes_w=add(tables.hinge_axes_w, eye, slots),
         hinge_axis_b=add(tables.hinge_axis_b, [0.0] * 3, slots),

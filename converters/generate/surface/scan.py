@@ -20,8 +20,10 @@ from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
+from converters.records.raw import FLOOR, WALL
+from scenes_mjcf.categories import TABLE
 
-NYU40 = {"wall": 1, "floor": 2, "cabinet": 3, "chair": 5, "sofa": 6, "table": 7, "door": 8, "desk": 14}
+NYU40 = {"wall": WALL, "floor": FLOOR, "cabinet": 3} | {c.name: c.labels[0] for c in TABLE if c.labels}
 """Class name -> NYU40 id."""
 
 RANGE_M = 5.0
