@@ -1,4 +1,4 @@
-"""Names of CAD models in, one picture of all of them out: each from the front, the right and above, with name and size."""
+"""Names of CAD models in, one picture of them out: each from the front, the right and above, with name and size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LAMP = np.array([-0.45, 0.6, 0.66])
 
 
 def camera_axes() -> np.ndarray:
-    """Rows, in the frame of a model that faces +z, y up: what runs to the right, what runs up, what looks at the reader."""
+    """Rows: what runs to the right, what runs up, what looks at the reader; the model faces +z, y is up."""
     (sin_a, cos_a), (sin_e, cos_e) = [(np.sin(a), np.cos(a)) for a in (AZIMUTH_RAD, ELEVATION_RAD)]
     toward = np.array([sin_a * cos_e, sin_e, cos_a * cos_e])
     right = np.array([cos_a, 0.0, -sin_a])

@@ -110,8 +110,8 @@ def shower_cabin(side=0.9, height=2.0, glass="glass", metal="chrome") -> list[Pa
         block((h - 0.015, 0, -h + 0.015), (0.03, height, 0.03), metal),
         block((0, height - 0.03, h - 0.015), (side, 0.03, 0.03), metal),
     ]
-    return [*parts, block((h - 0.015, height - 0.03, 0), (0.03, 0.03, side), metal), bar((0.06, 0.9, h + 0.01), (0.06, 1.2, h + 0.01), 0.01, metal, 6),
-            *mixer(-0.1, -h + 0.04)]  # fmt: skip
+    parts += [block((h - 0.015, height - 0.03, 0), (0.03, 0.03, side), metal)]
+    return [*parts, bar((0.06, 0.9, h + 0.01), (0.06, 1.2, h + 0.01), 0.01, metal, 6), *mixer(-0.1, -h + 0.04)]
 
 
 def shower_quadrant(side=0.9, height=2.0, glass="glass", metal="chrome") -> list[Part]:

@@ -65,6 +65,15 @@ def counter_tall(width=0.6, paint="sage", top="oak", wall=0.7) -> list[Part]:
     return parts + fronts((-width / 2, y), (width / 2, y + wall), -DEPTH_M / 2 + 0.35, 1, 1, paint, "pull")
 
 
+def sink_unit(width, paint, handle) -> list[Part]:
+    """A base unit with two doors and room for a basin: below it a carcass, round it sides and a back."""
+    parts = base_unit(width, paint, 2, 1, handle)
+    y, high = TOP_M - 0.24, 0.22
+    parts[1] = block((0, 0.1, -0.015), (width, y - 0.09, DEPTH_M - 0.03), paint)
+    parts += [block((sx * (width / 2 - 0.01), y, -0.015), (0.02, high, DEPTH_M - 0.03), paint) for sx in (-1, 1)]
+    return [*parts, block((0, y, -DEPTH_M / 2 + 0.01), (width, high, 0.02), paint)]
+
+
 # -- sinks: the worktop is built round the basin -----------------------
 
 
@@ -102,20 +111,16 @@ def tap(x, y, z, reach=0.16, height=0.25, metal="chrome") -> list[Part]:
     ]
 
 
-def sink_bowls(width=0.8, paint="white", top="oak", bowls=1, metal="steel", columns=2) -> list[Part]:
+def sink_bowls(width=0.8, paint="white", top="oak", bowls=1, metal="steel") -> list[Part]:
     hole = 0.4 if bowls == 1 else 0.74
-    low_unit = base_unit(width, paint, columns, 1, "pull")
-    low_unit[1] = block((0, 0.1, -0.015), (width, TOP_M - 0.32, DEPTH_M - 0.03), paint)
-    parts = low_unit + framed(width, 0, 0.03, hole, 0.4, top)
+    parts = sink_unit(width, paint, "pull") + framed(width, 0, 0.03, hole, 0.4, top)
     for k in range(bowls):
         parts += basin(hole * ((k + 0.5) / bowls - 0.5), 0.03, hole / bowls, 0.4, 0.19, metal)
-    parts.append(block((0, 0.6, -DEPTH_M / 2 + 0.02), (width, TOP_M - 0.62, 0.02), paint))
     return parts + tap(0, TOP_M - 0.005, -0.22)
 
 
 def sink_drainer(width=1.0, paint="birch", metal="steel") -> list[Part]:
-    parts = base_unit(width, paint, 2, 1, "bar")
-    parts[1] = block((0, 0.1, -0.015), (width, TOP_M - 0.32, DEPTH_M - 0.03), paint)
+    parts = sink_unit(width, paint, "bar")
     parts += framed(width, -0.24, 0.02, 0.38, 0.42, metal) + basin(-0.24, 0.02, 0.38, 0.42, 0.18, metal)
     parts += [block((0.24, TOP_M - 0.002, -0.18 + 0.07 * k), (0.4, 0.012, 0.02), metal) for k in range(6)]
     parts += [block((x, TOP_M, 0.08), (0.012, 0.2, 0.2), "ceramic") for x in (0.14, 0.2, 0.26)]
@@ -123,12 +128,9 @@ def sink_drainer(width=1.0, paint="birch", metal="steel") -> list[Part]:
 
 
 def sink_farmhouse(width=0.9, paint="navy", top="marble", bowl="ceramic") -> list[Part]:
-    parts = base_unit(width, paint, 2, 1, "knob")
-    parts[1] = block((0, 0.1, -0.015), (width, 0.5, DEPTH_M - 0.03), paint)
-    for k in range(2, len(parts)):  # its apron takes the upper part of the doors' place
-        low = parts[k].vertices.copy()
-        low[:, 1] = 0.11 + (low[:, 1] - 0.11) * 0.68
-        parts[k] = Part(low, parts[k].faces, parts[k].material)
+    """Its apron takes the upper part of the doors' place."""
+    parts = [*base_unit(width, paint, 2, 1)[:1], block((0, 0.1, -0.015), (width, 0.5, DEPTH_M - 0.03), paint)]
+    parts += fronts((-width / 2, 0.11), (width / 2, 0.6), DEPTH_M / 2 - 0.03, 2, 1, paint, "knob")
     parts += shell(rectangle(0, 0.03, 0.76, 0.5), TOP_M - 0.27, TOP_M, 0.035, bowl)
     parts += [block((0, TOP_M - 0.27, 0.03), (0.74, 0.05, 0.48), bowl)]
     parts += [block((sx * 0.415, 0.6, 0), (0.07, TOP_M - 0.6, DEPTH_M - 0.02), paint) for sx in (-1, 1)]

@@ -20,6 +20,7 @@ from converters.generate.models.parts import (
     pillar,
     plate,
     rail,
+    rectangle,
     shell,
     turned,
 )  # fmt: skip
@@ -153,7 +154,7 @@ def stool_saddle(height=0.62, wood="walnut", cloth="leather") -> list[Part]:
 def pouf_cube(size=0.42, cloth="blush", band="cream") -> list[Part]:
     return [
         cushion((0, 0.21, 0), (size, 0.42, size), cloth, 0.04),
-        block((0, 0.3, 0), (size + 0.012, 0.025, size + 0.012), band),
+        plate(rectangle(0, 0, size + 0.012, size + 0.012, 0.045), 0.3, 0.325, band),
         cushion((0, 0.43, 0), (0.1, 0.03, 0.1), band, 0.014),
     ]
 

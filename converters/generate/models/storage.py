@@ -66,8 +66,7 @@ def bench_tv_shelf(width=1.4, height=0.42, depth=0.4, wood="black", metal="steel
 def bench_tv_corner(width=1.2, height=0.5, depth=0.5, wood="cherry") -> list[Part]:
     """Its back is narrower, so that it stands in corners."""
     outline = rectangle(0, 0, width, depth)
-    outline[2:] *= [0.6, 1.0]
-    outline = outline[:, :] * [1, -1]
+    outline[[0, 3]] *= [0.6, 1.0]
     parts = [plate(outline * 0.94, 0, 0.06, "charcoal"), plate(outline, 0.05, height - 0.02, wood)]
     parts.append(plate(outline * 1.03, height - 0.03, height, wood))
     z = depth / 2 - 0.005
@@ -152,11 +151,10 @@ def bookcase_steps(width=1.2, depth=0.3, wood="birch") -> list[Part]:
     parts = []
     for k, height in enumerate((0.75, 1.1, 1.45)):
         x = width * (k - 1) / 3
-        parts.append(block((x + width / 6 - 0.012, 0, 0), (0.024, height, depth), wood))
+        parts.append(block((x - width / 6, 0, 0), (0.024, height, depth), wood))
         parts += [block((x, y, 0), (width / 3, 0.024, depth), wood) for y in (0.0, 0.35, 0.7, 1.05, 1.42) if y < height]
         parts += books(x - 0.15, x + 0.12, 0.374, 0, depth, k + 1)
-    parts.append(block((-width / 2 + 0.012, 0, 0), (0.024, 0.75, depth), wood))
-    return parts
+    return [*parts, block((width / 2, 0, 0), (0.024, 1.45, depth), wood)]
 
 
 def shelf_unit(width=1.6, height=2.2, depth=0.34, wood="pine", metal="pine", levels=5, goods=True) -> list[Part]:

@@ -1,4 +1,4 @@
-"""Sizes and materials in, what lies and rolls about homes out, of convex parts: boxes, bags, bins, suitcases, carts."""
+"""Sizes and materials in, what lies about homes out, of convex parts: boxes, bags, bins, suitcases."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from converters.generate.models.parts import (
     Part,
     ball,
     bar,
-    beam,
     block,
     box,
     corners,
@@ -293,105 +292,6 @@ def suitcase_trunk(width=0.7, height=0.42, depth=0.42, body="navy", metal="brass
     ]
 
 
-# -- carts -------------------------------------------------------------
-
-
-def castors(x, z, radius=0.035) -> list[Part]:
-    """Wheels under the corners."""
-    return [bar((x - 0.012, radius, z), (x + 0.012, radius, z), radius, "black", 12) for x, z in corners(x, z)]
-
-
-def cart_trays(width=0.44, depth=0.34, height=0.8, paint="teal") -> list[Part]:
-    parts = castors(width / 2 - 0.02, depth / 2 - 0.03)
-    parts += [
-        pillar((x, 0.06, z), height - 0.06, 0.011, paint, 6) for x, z in corners(width / 2 - 0.02, depth / 2 - 0.03)
-    ]
-    for y in (0.1, 0.4, 0.7):
-        parts += [
-            block((0, y, 0), (width, 0.012, depth), paint),
-            *shell(rectangle(0, 0, width, depth), y, y + 0.08, 0.01, paint),
-        ]
-    parts += [
-        pillar((-0.1 + 0.1 * k, 0.41 + 0.3 * (k % 2), 0.02), 0.17, (0.03, 0.025), ("moss", "rust", "cream")[k], 10)
-        for k in range(3)
-    ]
-    return parts
-
-
-def cart_tea(radius=0.3, height=0.72, metal="brass", top="glass") -> list[Part]:
-    parts = [pillar((0, y, 0), 0.02, radius, top, 20) for y in (0.2, height - 0.14)]
-    for k in range(4):
-        a = math.pi / 2 * (k + 0.5)
-        x, z = 0.97 * radius * math.cos(a), 0.97 * radius * math.sin(a)
-        parts += [
-            pillar((x, 0.05, z), height - 0.14 - 0.03, 0.014, metal, 8),
-            bar((x - 0.012, 0.035, z), (x + 0.012, 0.035, z), 0.035, "black", 12),
-        ]
-    parts += shell(oval(0, 0, radius + 0.01, radius + 0.01, 10), height - 0.1, height - 0.07, 0.015, metal)
-    return [
-        *parts,
-        *(
-            pillar(
-                (-0.1 + 0.1 * k, height - 0.12, 0.04 * k),
-                0.12 + 0.06 * (k % 2),
-                (0.035, 0.02),
-                ("glass", "moss", "glass")[k],
-                10,
-            )
-            for k in range(3)
-        ),
-    ]
-
-
-def cart_butcher(width=0.75, depth=0.46, height=0.88, wood="oak", paint="white") -> list[Part]:
-    parts = castors(width / 2 - 0.05, depth / 2 - 0.05, 0.04)
-    parts += [
-        block((x, 0.07, z), (0.05, height - 0.1, 0.05), paint) for x, z in corners(width / 2 - 0.05, depth / 2 - 0.05)
-    ]
-    parts += [
-        block((0, height - 0.04, 0), (width, 0.04, depth), wood),
-        block((0, height - 0.2, 0), (width - 0.08, 0.16, depth - 0.08), paint),
-    ]
-    parts += [block((0, y, 0.08 * (k - 2)), (width - 0.08, 0.018, 0.06), wood) for y in (0.16, 0.42) for k in range(5)]
-    parts += [box((sx * 0.17, height - 0.12, depth / 2 - 0.03), (0.3, 0.13, 0.02), paint) for sx in (-1, 1)] + [
-        box((sx * 0.17, height - 0.12, depth / 2 - 0.01), (0.1, 0.02, 0.02), "black") for sx in (-1, 1)
-    ]
-    return [
-        *parts,
-        beam(width / 2 + 0.04, height - 0.07, 0.16, 0.012, "steel", 8),
-        block((width / 2 + 0.02, height - 0.08, 0), (0.05, 0.02, 0.34), "steel"),
-    ]
-
-
-def cart_bar(width=0.7, depth=0.4, height=0.82, wood="walnut", metal="brass") -> list[Part]:
-    """Two large wheels behind, two feet before, a handle to pull it by."""
-    parts = [
-        bar((-0.24, 0.15, sz * (depth / 2)), (-0.24, 0.15, sz * (depth / 2 + 0.02)), 0.15, metal, 18) for sz in (-1, 1)
-    ]
-    parts += [block((0, y, 0), (width, 0.025, depth - 0.03), wood) for y in (0.2, height - 0.16)]
-    for sz in (-1, 1):
-        z = sz * (depth / 2 - 0.03)
-        parts += [
-            pillar((0.3, 0, z), height - 0.1, 0.014, metal, 8),
-            pillar((-0.3, 0.15, z), height - 0.2, 0.014, metal, 8),
-            bar((-width / 2, height - 0.09, z), (width / 2 + 0.02, height - 0.09, z), 0.011, metal, 6),
-        ]
-    parts += [beam(width / 2 + 0.02, height - 0.09, 0.17, 0.014, metal, 8)]
-    return [
-        *parts,
-        *(
-            pillar(
-                (-0.2 + 0.13 * k, (0.22, height - 0.14)[k % 2], 0.02),
-                0.24,
-                (0.04, 0.028),
-                ("moss", "leather", "glass", "red")[k],
-                10,
-            )
-            for k in range(4)
-        ),
-    ]
-
-
 _f = functools.partial
 DRAWINGS = {
     "box_closed": Drawing("box", box_closed, "__SYM_ROTATE_UP_2"),
@@ -412,9 +312,5 @@ DRAWINGS = {
     "suitcase_vintage": Drawing("suitcase", suitcase_vintage),
     "suitcase_soft": Drawing("suitcase", suitcase_soft, held_out=True),
     "suitcase_trunk": Drawing("suitcase", suitcase_trunk, held_out=True),
-    "cart_trays": Drawing("cart", cart_trays),
-    "cart_butcher": Drawing("cart", cart_butcher),
-    "cart_tea": Drawing("cart", cart_tea, held_out=True),
-    "cart_bar": Drawing("cart", cart_bar, held_out=True),
 }
 """Model name -> how it is drawn."""
