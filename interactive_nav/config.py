@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from interactive_nav_common.config import AtLeastOne, Bounds, Natural, NotNegative, Positive, Settings, Share, flat
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
@@ -201,8 +202,9 @@ class SensorConfig(Settings):
     """Of images: float32 or float16 in [0, 1], or uint8, 255 times that."""
     depth_range_m: Positive = 5.0
     """Depth is cut off here and divided by it."""
-    segmentation_classes: Literal[4, 5] = 4
-    """Furniture classes: 4 as in the original's code (desk and table are one), or the paper's 5."""
+    segmentation_classes: MaskClasses = 4
+    """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all: every category
+    has an id of its own."""
     depth_dropout: Share = 0.0
     """Share of depth pixels that read 0, drawn anew each step."""
     depth_noise: NotNegative = 0.0

@@ -91,7 +91,7 @@ class Compositor:
         side = height // 3
         colour = self._view.look(robot_camera(self._view, side, side), INSIDE).colour
         seen = self._view.look(robot_camera(self._view, CAMERA_PIXELS, CAMERA_PIXELS), INSIDE)
-        small = [depth_picture(seen.depth_m), mask_picture(seen.classes)]
+        small = [depth_picture(seen.depth_m), mask_picture(seen.classes, replay.segmentation_classes)]
         column = [
             colour,
             *(np.asarray(Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST)) for x in small),

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 import interactive_nav
 from interactive_nav.pictures.camera import ENGINES, STREAMS, VIEWS, Camera
-from interactive_nav.pictures.shading import PALETTE
+from interactive_nav.pictures.shading import PALETTES
 
 __path__: list[str] = []  # `interactive_nav.rendering.camera` still imports: `interactive_nav.__init__`
 _GAP_PX, _LABEL_PX = 8, 22
@@ -32,7 +32,7 @@ def as_rgb(stream: str, image: np.ndarray, depth_range_m: float = 5.0) -> np.nda
     if stream == "depth":
         grey = np.where(image > 0, 1 - 0.9 * np.clip(image / depth_range_m, 0, 1), 1.0)
         return np.repeat((255 * grey).astype(np.uint8)[..., None], 3, -1)
-    return (255 * PALETTE[image]).astype(np.uint8)
+    return (255 * PALETTES[4][image]).astype(np.uint8)
 
 
 def main(argv: list[str] | None = None) -> int:

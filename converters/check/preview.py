@@ -6,7 +6,7 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import matplotlib
@@ -40,6 +40,8 @@ SURFACE_PIXELS = 480
 """Longer side of a surface's picture; a panel is about as large on the page."""
 DPI = 100
 SURFACE_COLOURS = 64
+ALWAYS_IN_PALETTE = 10
+"""Categories, from the first: pictures of scenes without others stay the same bytes."""
 TRAVERSABLE = (0.85, 0.94, 0.85)
 WALL = (0.75, 0.75, 0.75)
 
@@ -76,16 +78,23 @@ def _coloured_points(folder: Path, stem: str, spacing_m: float) -> tuple[np.ndar
     return cloud.points, cloud.colours.astype(np.uint8)
 
 
-def _palette(views: list[np.ndarray]) -> Image.Image:
-    """A palette image: the views' own commonest colours beside those that the panels draw with."""
-    surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
-    own = surface.quantize(SURFACE_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette() or []
-    ground, flat = np.array(TRAVERSABLE), np.array([CATEGORIES[c].preview_colour for c in OBJECT_CATEGORIES])
+def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:
+    """A palette image: the views' own commonest colours beside those that the panels draw with.
+
+    Args:
+        views: pictures in colour.
+        shown: the scene's categories; a palette has no room for all that there are.
+    """
+    drawn_in = [c for i, c in enumerate(OBJECT_CATEGORIES) if i < ALWAYS_IN_PALETTE or c in shown]
+    ground, flat = np.array(TRAVERSABLE), np.array([CATEGORIES[c].preview_colour for c in drawn_in])
     drawn = [np.outer(np.linspace(0, 1, 12), np.ones(3)), ground[None], np.array(WALL)[None]]
     drawn += [flat * light for light in (0.55, 0.75, 1.0)] + [ground + (flat - ground) * a for a in (0.3, 0.51, 0.66)]
     chart = np.rint(255 * np.vstack(drawn)).astype(int).ravel().tolist()
+    count = min(SURFACE_COLOURS, 256 - len(chart) // 3)
+    surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
+    own = surface.quantize(count, method=Image.Quantize.MEDIANCUT).getpalette() or []
     image = Image.new("P", (1, 1))
-    image.putpalette((own[: 3 * SURFACE_COLOURS] + chart)[: 3 * 256])
+    image.putpalette(own[: 3 * count] + chart)
     return image
 
 
@@ -275,10 +284,11 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     shown = sorted({o.category for o in scene.manifest.objects})
     handles = [Patch(facecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
     handles += [Patch(facecolor=TRAVERSABLE, label="traversable"), Patch(facecolor=WALL, label="wall")]
-    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=len(handles), frameon=False)
+    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=min(len(handles), 12), frameon=False)
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     figure.tight_layout(rect=(0, 0.03, 1, 0.985))
-    return figure, _palette([view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3])
+    views = [view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3]
+    return figure, _palette(views, shown)
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:

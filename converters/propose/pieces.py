@@ -19,9 +19,10 @@ STACKED_SHARE = 0.5
 """Components of one class are one thing when their footprints share this much of the smaller."""
 SAME_BOX_SHARE = 0.5
 """Instances of two classes are one thing when their boxes share this much of the smaller."""
-LABEL_CATEGORIES = {c.labels[0]: c.name for c in sorted(TABLE, key=lambda c: c.labels) if c.labels}
-"""NYU40 id -> category."""
 SIZES_M = {c.name: c.sizes_m for c in TABLE if c.sizes_m is not None}
+"""Of the categories that are looked for."""
+LABEL_CATEGORIES = {c.labels[0]: c.name for c in sorted(TABLE, key=lambda c: c.labels) if c.name in SIZES_M}
+"""NYU40 id -> category."""
 LONGEST = {c.name: c.longest for c in TABLE if c.longest is not None}
 FLAT = ("door",)
 """Seen from above a line, whose breadth says nothing."""

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
 from converters.bodies.placement import PoseDifference, pose_difference, upright
+from converters.propose.pieces import SIZES_M
 from converters.propose.proposals import Proposal, bounds, box_iou
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder
@@ -60,7 +61,7 @@ class Retrieval:
 
 
 def read_library(root: Path) -> dict[str, CadModel]:
-    """Every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a known class, by id.
+    """Every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
 
     Raises:
         SceneRejected: no model there, or a damaged one.
@@ -70,7 +71,7 @@ def read_library(root: Path) -> dict[str, CadModel]:
     library = {}
     for path in found:
         synset, cad_id = path.parts[-4], path.parts[-3]
-        if synset in SYNSETS:
+        if SYNSETS.get(synset) in SIZES_M:
             library[cad_id] = read_cad(source, synset, cad_id)
     if not library:
         raise SceneRejected(

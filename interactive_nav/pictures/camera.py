@@ -19,7 +19,7 @@ import numpy as np
 from interactive_nav.physics import resolve_backend
 from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
-from interactive_nav.pictures.shading import BACKGROUND, PALETTE, lambert
+from interactive_nav.pictures.shading import SKY_COLOUR, lambert
 from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
 from interactive_nav_common.errors import UserError
 
@@ -162,7 +162,7 @@ class _PictureModel(SceneModel):
 
     def __init__(self, env: Any, scene: int):
         world = env.world
-        super().__init__(world.robot, world.scenes[scene], world.small_objects, 5 if env.sensors.five_classes else 4)
+        super().__init__(world.robot, world.scenes[scene], world.small_objects, env.sensors.boxes.classes)
         self.colour = np.array([_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
         """[ngeom, 3] in [0, 1]: of the geom, or its texture's mean."""
 
@@ -192,6 +192,6 @@ def _by_rays(
         faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
         forward, right_w, up_w = pose.axes_w.T
         out["normals"] = np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32)
-        base = np.where(met[..., None], model.colour[geom], PALETTE[BACKGROUND])
+        base = np.where(met[..., None], model.colour[geom], np.array(SKY_COLOUR, np.float32))
         out["rgb"] = lambert(base, faces, forward, met, np)
     return {name: out[name] for name in streams}

@@ -24,6 +24,7 @@ from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
+from scenes_mjcf.categories import MaskClasses
 
 FORMAT = 1
 _CHUNK_STEPS = 50
@@ -82,7 +83,7 @@ class Replay:
     """Whose models the small objects are; this and what follows is not in older files."""
     objects: tuple[str, ...] = ()
     """Their folders, absolute, where they are not the built-in ones."""
-    segmentation_classes: int = 4
+    segmentation_classes: MaskClasses = 4
     """As in `NavConfig`."""
     success_distance_m: float | None = None
     """Of the goal; None, in older files: not known, taken for the robot's width."""

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTE
+from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTES
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav_common.rotations import matrix_from_quat
-from scenes_mjcf.categories import CATEGORIES, class_id
+from scenes_mjcf.categories import CATEGORIES, MaskClasses, class_id
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
@@ -57,6 +57,7 @@ def picture_spec(
     robot: RobotSpec | None = None,
     small: Sequence[SmallObject] = (),
     class_of: dict[str, int] | None = None,
+    classes: MaskClasses = 4,
 ) -> mujoco.MjSpec:
     """`furnished_spec` in the groups of pictures, with a lamp, and with one camera named `view` instead of its own.
 
@@ -65,6 +66,7 @@ def picture_spec(
         robot: or None.
         small: the small objects.
         class_of: body name -> class id, by which boxes are coloured; None: as they are stored.
+        classes: the setting `segmentation_classes` that the ids are of.
     """
     spec = furnished_spec(scene, robot, small, cut_walls=robot is not None)
     own = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
@@ -84,7 +86,7 @@ def picture_spec(
         if plane:
             geom.rgba = [*FLOOR_COLOUR, 1.0]
         elif bare and class_of is not None:
-            geom.rgba = [*PALETTE[class_of.get(name, 0)], 1.0]
+            geom.rgba = [*PALETTES[classes][class_of.get(name, 0)], 1.0]
         if not (plane or bare or geom.group == VISUAL_GROUP):
             geom.group = HIDDEN
         else:
@@ -102,19 +104,19 @@ def picture_spec(
 class SceneModel:
     """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
 
-    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], segmentation_classes: int = 4):
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
         """Compiles the model to look at.
 
         Args:
             robot: its collision shapes are drawn, or its visual ones where it has any.
             scene: its visual meshes are drawn.
             small: the small objects.
-            segmentation_classes: as in `NavConfig`.
+            classes: the setting `segmentation_classes`.
         """
         self.robot = robot
-        known = {m.name: (class_id(m.category, segmentation_classes == 5), m.category) for m in scene.movables}
-        known |= {n: (o.segmentation_id, o.category) for n, o in zip(body_names(small), small, strict=True)}
-        spec = picture_spec(scene, robot, small, {name: number for name, (number, _) in known.items()})
+        known = {m.name: (class_id(m.category, classes), m.category) for m in scene.movables}
+        known |= {n: (o.mask_id(classes), o.category) for n, o in zip(body_names(small), small, strict=True)}
+        spec = picture_spec(scene, robot, small, {name: number for name, (number, _) in known.items()}, classes)
         spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -125,7 +127,7 @@ class SceneModel:
         mujoco.mj_camlight(self.model, self.data)
         self._inertial_axes_b = matrix_from_quat(self.model.body_iquat)
         self._geom_axes_b = matrix_from_quat(self.model.geom_quat)
-        mine, rest = ((class_id(kind), kind) for kind in ("robot", "structure"))
+        mine, rest = ((class_id(kind, classes), kind) for kind in ("robot", "structure"))
         robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
         names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
         rows = [mine if own else known.get(name, rest) for own, name in zip(robots, names, strict=True)]

@@ -10,12 +10,14 @@ import numpy as np
 
 from interactive_nav.sensing.base import SKY_COLOUR, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate
-from scenes_mjcf.categories import CLASS_COLOURS
+from scenes_mjcf.categories import SEGMENTATIONS
 
 FLOOR_COLOUR = (0.56, 0.50, 0.43)
-PALETTE = np.array([*CLASS_COLOURS, FLOOR_COLOUR, SKY_COLOUR], np.float32)
-"""Colours by class id, then the floor's and the background's."""
-FLOOR, BACKGROUND = len(CLASS_COLOURS), len(CLASS_COLOURS) + 1
+PALETTES = {
+    classes: np.array([*masks.colours, FLOOR_COLOUR, SKY_COLOUR], np.float32)
+    for classes, masks in SEGMENTATIONS.items()
+}
+"""The setting `segmentation_classes` -> colours by class id, then the floor's and the background's."""
 _LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
 
 
@@ -80,9 +82,11 @@ def colours(tables: BoxTables, scene: jax.Array, camera: CameraPose, normal_w: j
     """
     n, boxes = len(scene), tables.num_boxes
     ids = tables.class_id[scene].astype(jnp.int32)
-    ids = jnp.concatenate([ids, jnp.full((n, 1), FLOOR), jnp.full((n, 1), BACKGROUND)], 1)
+    palette = jnp.asarray(PALETTES[tables.classes])
+    floor, background = len(palette) - 2, len(palette) - 1
+    ids = jnp.concatenate([ids, jnp.full((n, 1), floor), jnp.full((n, 1), background)], 1)
     place = jnp.where(index < 0, boxes + 1, index).reshape(n, -1)
-    base = jnp.asarray(PALETTE)[jnp.take_along_axis(ids, place, 1)].reshape(*index.shape, 3)
+    base = palette[jnp.take_along_axis(ids, place, 1)].reshape(*index.shape, 3)
     return lambert(base, normal_w, camera.axes_w[:, None, None, :, 0], index >= 0, jnp)
 
 

@@ -24,7 +24,7 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav.sensing.base import SKY_COLOUR, CameraPose, Lens, look_along
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.rotations import yaw_from_quat
-from scenes_mjcf.categories import CLASS_COLOURS, CLASSES, TABLE
+from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses
 
 COLOURS = {category.name: category.colour for category in TABLE}
 """RGB in [0, 1] by category, in colour and mask pictures alike."""
@@ -77,7 +77,7 @@ class Image:
     depth_m: np.ndarray
     """[rows, columns] f32 along the optical axis; infinite where there is nothing."""
     classes: np.ndarray
-    """[rows, columns] u8 segmentation ids, as the observation's: index into `CLASSES`; or `NOTHING`."""
+    """[rows, columns] u8 segmentation ids, as the observation's; or `NOTHING`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,9 +94,9 @@ class FloorPaint:
 class SceneView(SceneModel):
     """One scene with a robot and small objects, whose bodies are put where a caller wants them, to be looked at."""
 
-    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], segmentation_classes: int = 4):
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
         """Compiles the model to look at; see `SceneModel`."""
-        super().__init__(robot, scene, small, segmentation_classes)
+        super().__init__(robot, scene, small, classes)
         self._floor = self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self._colour = np.array([COLOURS[category] for category in self.category])
         # Things of one kind differ a little, so that two chairs can be told apart.
@@ -194,11 +194,11 @@ def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:
     return np.repeat((255 * near**2).astype(np.uint8)[..., None], 3, -1)
 
 
-def mask_picture(classes: np.ndarray) -> np.ndarray:
-    """[rows, columns] classes to [rows, columns, 3] u8 in `CLASS_COLOURS`; nothing is black."""
-    table = np.zeros((256, 3), np.uint8)
-    table[: len(CLASSES)] = np.array(CLASS_COLOURS) * 255
-    return table[classes]
+def mask_picture(mask: np.ndarray, classes: MaskClasses = 4) -> np.ndarray:
+    """[rows, columns] ids to [rows, columns, 3] u8 in the classes' colours; nothing is black."""
+    table, colours = np.zeros((256, 3), np.uint8), np.array(SEGMENTATIONS[classes].colours)
+    table[: len(colours)] = colours * 255
+    return table[mask]
 
 
 def _varied(colour: np.ndarray, index: int) -> np.ndarray:

@@ -15,6 +15,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from scenes_mjcf.categories import MaskClasses, class_id
+
 Rgba = tuple[float, float, float, float]
 SPLITS = ("train", "test")
 KINDS = ("basket", "shoe", "pot", "toy", "shoe", "basket", "toy", "pot")
@@ -77,6 +79,10 @@ class SmallObject:
     rgba: Rgba
     """Its main colour."""
     shapes: tuple[Shape, ...]
+
+    def mask_id(self, classes: MaskClasses) -> int:
+        """Its class where the setting `segmentation_classes` is this: its own model's, or its category's."""
+        return class_id(self.category, classes) if classes == "all" else self.segmentation_id
 
     @property
     def radius_m(self) -> float:

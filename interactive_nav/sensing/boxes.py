@@ -15,10 +15,7 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import sorted_movables
 from interactive_nav.scenes.world import World
 from interactive_nav_common.rotations import Array, matrix_from_quat
-from scenes_mjcf.categories import TABLE, class_id
-
-NUM_CLASSES = max(number for category in TABLE for number in category.segmentation_ids) + 1
-"""Divides a class id into the observation's [0, 1], as the original does (11): desks apart (`five`) are 1."""
+from scenes_mjcf.categories import MaskClasses, class_id
 
 
 @flax.struct.dataclass
@@ -47,6 +44,8 @@ class BoxTables:
     """[S, M, 3] f32."""
     hinge_anchor_b: jax.Array
     """[S, M, 3] f32, m."""
+    classes: MaskClasses = flax.struct.field(pytree_node=False, default=4)
+    """How `class_id` tells categories apart: the setting `segmentation_classes`."""
 
     @property
     def num_boxes(self) -> int:
@@ -54,30 +53,30 @@ class BoxTables:
         return len(self.body)
 
 
-def _boxes_of_slots(world: World, scene: Scene, five_categories: bool) -> list[tuple[np.ndarray, int]]:
+def _boxes_of_slots(world: World, scene: Scene, classes: MaskClasses) -> list[tuple[np.ndarray, int]]:
     """Boxes [n, 10] and class id of what is in each slot of a scene, then of its walls."""
     free, hinged = sorted_movables(scene)
     own, out = {"free": iter(free), "hinge": iter(hinged)}, []
     for i, kind in enumerate(world.layout.slot_kind):
         if kind == "small":
-            out.append((world.small_objects[i].rows, world.small_objects[i].segmentation_id))
+            out.append((world.small_objects[i].rows, world.small_objects[i].mask_id(classes)))
             continue
         movable = next(own[kind], None)
         boxes = np.zeros((0, 10)) if movable is None else movable.boxes
-        out.append((boxes, 0 if movable is None else class_id(movable.category, five_categories)))
+        out.append((boxes, 0 if movable is None else class_id(movable.category, classes)))
     return [*out, (scene.walls, 0)]
 
 
-def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
+def build_boxes(world: World, classes: MaskClasses = 4) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
     Args:
         world: with its scenes.
-        five_categories: desks get an id of their own.
+        classes: the setting `segmentation_classes`.
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
-    columns = [_boxes_of_slots(world, scene, five_categories) for scene in scenes]
+    columns = [_boxes_of_slots(world, scene, classes) for scene in scenes]
     counts = [max(len(column[m][0]) for column in columns) for m in range(slots + 1)]
     body = np.repeat(np.arange(slots + 1), counts)
     first = np.concatenate([[0], np.cumsum(counts)])
@@ -106,6 +105,7 @@ def build_boxes(world: World, five_categories: bool = False) -> BoxTables:
         axes_b=jnp.asarray(axes, f32),
         half_m=jnp.asarray(half, f32),
         class_id=jnp.asarray(ids),
+        classes=classes,
         hinge_pos_w=jnp.asarray(hinge_pos, f32),
         hinge_axes_w=jnp.asarray(hinge_axes, f32),
         hinge_axis_b=jnp.asarray(hinge_axis, f32),

@@ -7,7 +7,7 @@ its keys named as Brax's networks for pixels want them:
 |---|---|
 | `state` | the vector (left out if no part of it is asked for) |
 | `pixels/depth` | (H, W, 1): distance along the optical axis over `depth_range_m`, cut at 1; 0 where nothing is met |
-| `pixels/segmentation` | (H, W, 1): class id over 11, see `interactive_nav.sensing.boxes` |
+| `pixels/segmentation` | (H, W, 1): class id over 11, or over their number (`scenes_mjcf.categories.SEGMENTATIONS`) |
 
 Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded. Noise is as in iGibson: a share of the readings
 drops out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It depends on the episode's key
@@ -27,12 +27,13 @@ from interactive_nav.config import IMAGES, NavConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
-from interactive_nav.sensing.boxes import NUM_CLASSES, rotate
+from interactive_nav.sensing.boxes import rotate
 from interactive_nav.sensing.mount import make_mount
 from interactive_nav.sensing.observation import task_parts
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.types import NavInfo
 from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
+from scenes_mjcf.categories import SEGMENTATIONS
 
 LIDAR_NEAR_M = 0.05
 """Beams begin this far from the scanner (iGibson)."""
@@ -65,8 +66,7 @@ class Sensors:
         model = world.models[0]
         self._joints = _own_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
-        self.five_classes = config.segmentation_classes == 5
-        self.boxes = build_boxes(world, self.five_classes)
+        self.boxes = build_boxes(world, config.segmentation_classes)
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
         self.renderer = make_renderer(self.boxes, self.lens, config.renderer, backend) if self._images else None
@@ -111,7 +111,7 @@ class Sensors:
         depth_m, ids = self.render(physics, nav)
         images = {
             "depth": self._noisy_depth(jnp.clip(depth_m / self._config.depth_range_m, 0.0, 1.0), nav, rng),
-            "segmentation": ids.astype(jnp.float32) / NUM_CLASSES,
+            "segmentation": ids.astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor,
         }
         dtype = jnp.dtype(self._config.image_dtype)
         for name in self._images:

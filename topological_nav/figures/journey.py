@@ -179,7 +179,9 @@ def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
 
 def film(driven: Driven, path: Path) -> int:
     """Writes a film, the plan beside the camera's images; returns the number of frames."""
-    plan, pixels = plan_picture(driven.venue.space, driven.map, driven.venue.contest.config.navigator.passable, FILM_HEIGHT)
+    plan, pixels = plan_picture(
+        driven.venue.space, driven.map, driven.venue.contest.config.navigator.passable, FILM_HEIGHT
+    )
     every = (
         max(1, round(FILM_EVERY_S / max(driven.time_s[1] - driven.time_s[0], 1e-3))) if len(driven.time_s) > 1 else 1
     )

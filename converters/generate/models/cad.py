@@ -10,25 +10,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable
 
 import numpy as np
 
-from converters.generate.models import furniture
-from converters.generate.models.parts import Part
+from converters.generate.models import bathroom, beds, decor, furniture, kitchen, laundry, seats, storage, things
+from converters.generate.models.parts import Drawing, Part, on_floor
 from scenes_mjcf.categories import CATEGORIES
-
-
-@dataclasses.dataclass(frozen=True)
-class Drawing:
-    """How a model is drawn: a function of no argument that gives parts in metres, base at y = 0, front +z."""
-
-    category: str
-    draw: Callable[[], list[Part]]
-    sym: str = "__SYM_NONE"
-    """Scan2CAD's symmetry class."""
-    front: int = 1
-    """+1: the model faces +z; -1: it faces -z, as some ShapeNet models do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +51,7 @@ class CadModel:
 
 
 _f = functools.partial
-LIBRARY: dict[str, Drawing] = {
+_SPARSE: dict[str, Drawing] = {
     "chair_slat": Drawing("chair", furniture.chair_slat),
     "chair_panel": Drawing("chair", furniture.chair_panel, front=-1),
     "chair_arm": Drawing("chair", furniture.chair_arm),
@@ -99,15 +86,27 @@ LIBRARY: dict[str, Drawing] = {
     "sofa_chaise": Drawing("sofa", furniture.sofa_chaise),
     "door_battens": Drawing("door", furniture.door_battens),
 }
+"""What sparse homes have. They draw models by their place among these names: a new one would change each home."""
+_ROOMS = (seats, beds, storage, kitchen, bathroom, laundry, things, decor)
+LIBRARY: dict[str, Drawing] = {
+    **_SPARSE,
+    **{name: drawing for room in _ROOMS for name, drawing in room.DRAWINGS.items()},
+}
 """Model name -> how it is drawn."""
 
 TEST_MODELS = (
     "chair_ladder", "chair_shell", "chair_spindle", "table_trestle", "table_panel", "table_tripod", "desk_hutch",
     "desk_pedestals", "sofa_club", "sofa_chaise", "door_dark", "door_battens",
 )  # fmt: skip
-"""Held out: no training building uses them."""
+"""Held out: no sparse training building uses them."""
 
-TRAIN_MODELS = tuple(name for name in LIBRARY if name not in TEST_MODELS)
+TRAIN_MODELS = tuple(name for name in _SPARSE if name not in TEST_MODELS)
+"""All others of sparse buildings."""
+
+HOME_TEST_MODELS = tuple(name for name, drawing in LIBRARY.items() if drawing.held_out or name in TEST_MODELS)
+"""Held out: no furnished training home uses them."""
+
+HOME_TRAIN_MODELS = tuple(name for name in LIBRARY if name not in HOME_TEST_MODELS)
 """All others."""
 
 
@@ -125,7 +124,7 @@ def cad_model(name: str) -> CadModel:
         The model in its CAD frame: bounding box diagonal 1, y up.
     """
     drawing = LIBRARY[name]
-    parts = drawing.draw()
+    parts = drawing.draw() if name in _SPARSE else on_floor(drawing.draw())
     if drawing.front < 0:
         flip = np.diag([-1.0, 1.0, -1.0])
         parts = [dataclasses.replace(p, vertices=p.vertices @ flip) for p in parts]

@@ -1,8 +1,9 @@
-"""Sizes in, convex pieces of furniture out: boxes, cushions, bars and legs, in metres, y up."""
+"""Sizes in, convex pieces of furniture out: boxes, cushions, bars, plates, shells and leaves, in metres, y up."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import trimesh
@@ -13,6 +14,16 @@ MATERIALS: dict[str, tuple[float, float, float]] = {
     "black": (0.13, 0.13, 0.14), "steel": (0.60, 0.61, 0.63), "navy": (0.18, 0.24, 0.40),
     "moss": (0.34, 0.42, 0.27), "rust": (0.62, 0.31, 0.19), "linen": (0.78, 0.73, 0.64),
     "slate": (0.36, 0.40, 0.44),
+    "pine": (0.84, 0.70, 0.49), "birch": (0.88, 0.80, 0.66), "cherry": (0.56, 0.32, 0.20),
+    "cream": (0.90, 0.85, 0.74), "charcoal": (0.24, 0.25, 0.27), "grey": (0.62, 0.62, 0.61),
+    "teal": (0.17, 0.43, 0.45), "mustard": (0.79, 0.62, 0.22), "blush": (0.80, 0.58, 0.55),
+    "denim": (0.33, 0.44, 0.60), "sage": (0.56, 0.64, 0.51), "red": (0.68, 0.16, 0.15),
+    "leather": (0.45, 0.28, 0.18), "mattress": (0.94, 0.93, 0.89), "lampshade": (0.95, 0.88, 0.70),
+    "ceramic": (0.95, 0.95, 0.94), "enamel": (0.91, 0.92, 0.93), "glass": (0.66, 0.78, 0.80),
+    "chrome": (0.78, 0.79, 0.81), "brass": (0.76, 0.61, 0.31), "granite": (0.27, 0.27, 0.29),
+    "marble": (0.86, 0.85, 0.83), "leaf": (0.20, 0.43, 0.19), "fern": (0.36, 0.56, 0.26),
+    "bark": (0.40, 0.30, 0.21), "soil": (0.24, 0.17, 0.12), "terracotta": (0.74, 0.43, 0.30),
+    "cardboard": (0.74, 0.58, 0.40), "tape": (0.84, 0.76, 0.60), "wicker": (0.70, 0.55, 0.36),
 }  # fmt: skip
 """Material name -> diffuse RGB in 0..1."""
 
@@ -31,12 +42,38 @@ class Part:
     """Written without its underside."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """How a model is drawn: a function of no argument that gives parts in metres, base at y = 0, front +z."""
+
+    category: str
+    draw: Callable[[], list[Part]]
+    sym: str = "__SYM_NONE"
+    """Scan2CAD's symmetry class."""
+    front: int = 1
+    """+1: the model faces +z; -1: it faces -z, as some ShapeNet models do."""
+    held_out: bool = False
+    """Only homes to test in have it."""
+
+
 def box(center, size, material, tilt_rad=0.0, open=False) -> Part:
     """A box; `tilt_rad` turns it about x (positive: the top leans back, towards -z)."""
     mesh = trimesh.creation.box(extents=size)
     turn = Rotation.from_euler("x", -tilt_rad).as_matrix()
     vertices = np.asarray(mesh.vertices) @ turn.T + np.asarray(center, float)
     return Part(vertices, np.asarray(mesh.faces), material, open)
+
+
+def block(base, size, material, open=False) -> Part:
+    """A box whose underside has its middle at `base`."""
+    x, y, z = base
+    return box((x, y + size[1] / 2, z), size, material, open=open)
+
+
+def hull(points, material) -> Part:
+    """The convex hull of points."""
+    mesh = trimesh.convex.convex_hull(np.asarray(points, float))
+    return Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material)
 
 
 def cushion(center, size, material, chamfer=0.03, tilt_rad=0.0) -> Part:
@@ -72,6 +109,95 @@ def bar(start, end, radius, material, sides=8) -> Part:
     return Part(vertices, np.concatenate([around, low, high]), material)
 
 
+def corners(x, z) -> list[tuple[float, float]]:
+    """The four (x, z) at these distances from the middle."""
+    return [(sx * x, sz * z) for sx in (-1, 1) for sz in (-1, 1)]
+
+
+def rail(reach, y, z, radius, material, sides=8) -> Part:
+    """A level bar from left to right."""
+    return bar((-reach, y, z), (reach, y, z), radius, material, sides)
+
+
+def beam(x, y, reach, radius, material, sides=8) -> Part:
+    """A level bar from the back to the front."""
+    return bar((x, y, -reach), (x, y, reach), radius, material, sides)
+
+
+def pillar(base, height, radius, material, sides=12) -> Part:
+    """An upright bar that stands at `base`."""
+    x, y, z = base
+    return bar((x, y, z), (x, y + height, z), radius, material, sides)
+
+
+def turned(base, profile, material, sides=12) -> list[Part]:
+    """What a lathe makes: pieces between the (radius, height) pairs of a profile, from below."""
+    x, y, z = base
+    return [
+        bar((x, y + y0, z), (x, y + y1, z), (r0, r1), material, sides)
+        for (r0, y0), (r1, y1) in zip(profile, profile[1:], strict=False)
+    ]
+
+
+def oval(x, z, rx, rz, sides=16) -> np.ndarray:
+    """(sides, 2) outline of an ellipse in the plane of the floor."""
+    angles = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+    return np.stack([x + rx * np.cos(angles), z + rz * np.sin(angles)], axis=1)
+
+
+def rectangle(x, z, width, depth, cut=0.0) -> np.ndarray:
+    """(4 or 8, 2) outline of a rectangle in the plane of the floor, its corners cut by `cut`, anticlockwise."""
+    w, d = width / 2, depth / 2
+    if not cut:
+        return np.array([(w, -d), (w, d), (-w, d), (-w, -d)]) + [x, z]
+    corners = [(w, -d + cut), (w, d - cut), (w - cut, d), (-w + cut, d)]
+    corners += [(-w, d - cut), (-w, -d + cut), (-w + cut, -d), (w - cut, -d)]
+    return np.array(corners) + [x, z]
+
+
+def _at(outline, y) -> np.ndarray:
+    return np.column_stack([outline[:, 0], np.full(len(outline), y), outline[:, 1]])
+
+
+def plate(outline, y0, y1, material, top=None) -> Part:
+    """A convex outline drawn up from y0 to y1, where it has the outline `top` if that is given."""
+    return hull(np.concatenate([_at(outline, y0), _at(outline if top is None else top, y1)]), material)
+
+
+def shell(outline, y0, y1, thick, material, top=None) -> list[Part]:
+    """The wall along an outline, one piece a side; its underside is open, its inside `thick` further in."""
+    above = outline if top is None else top
+    pieces = []
+    for k in range(len(outline)):
+        sides = [ring[[k, (k + 1) % len(ring)]] for ring in (outline, above)]
+        inner = [
+            side - thick * (side - ring.mean(axis=0)) / np.linalg.norm(side - ring.mean(axis=0), axis=1, keepdims=True)
+            for side, ring in zip(sides, (outline, above), strict=True)
+        ]
+        points = [_at(side, y) for pair in (sides, inner) for side, y in zip(pair, (y0, y1), strict=True)]
+        pieces.append(hull(np.concatenate(points), material))
+    return pieces
+
+
+def ball(center, radii, material, sides=8) -> Part:
+    """An ellipsoid."""
+    rings = [(np.cos(a), np.sin(a)) for a in np.pi * np.array([-0.5, -0.3, -0.1, 0.1, 0.3, 0.5])]
+    points = [_at(oval(0, 0, max(r, 0.02), max(r, 0.02), sides), y) for r, y in rings]
+    return hull(np.concatenate(points) * np.asarray(radii, float) + np.asarray(center, float), material)
+
+
+def leaf(base, tip, width, material, thick=0.008) -> Part:
+    """A pointed leaf from base to tip, broadest past its middle, lying as flat as its direction allows."""
+    p0, p1 = np.asarray(base, float), np.asarray(tip, float)
+    along = p1 - p0
+    across = np.cross(along, [0.0, 1.0, 0.0])
+    across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    up = np.cross(across, along) / np.linalg.norm(along)
+    middle = p0 + 0.55 * along
+    rim = [p0, p1, middle + across * width / 2, middle - across * width / 2]
+    return hull([p + s * thick / 2 * up for p in rim for s in (-1, 1)], material)
+
+
 def four_legs(width, depth, height, thick, material, splay=0.0, square=True) -> list[Part]:
     """Legs under the corners of a `width` x `depth` top whose underside is at `height`."""
     legs = []
@@ -82,3 +208,52 @@ def four_legs(width, depth, height, thick, material, splay=0.0, square=True) -> 
             sides, radius = (4, thick * 0.7) if square else (10, (thick * 0.4, thick * 0.6))
             legs.append(bar(foot, (x, height, z), radius, material, sides))
     return legs
+
+
+def on_floor(parts) -> list[Part]:
+    """The same, with what leaning bars reach below the floor cut off."""
+    low = [part.vertices[:, 1].min() for part in parts]
+    return [
+        dataclasses.replace(hull(np.maximum(part.vertices, [-np.inf, 0.0, -np.inf]), part.material), open=part.open)
+        if y < 0
+        else part
+        for part, y in zip(parts, low, strict=True)
+    ]
+
+
+def feet(width, depth, height, radius, material) -> list[Part]:
+    """Short round feet under the corners of a `width` x `depth` underside at `height`."""
+    x, z = width / 2 - radius, depth / 2 - radius
+    return [
+        pillar((sx * x, 0, sz * z), height, (0.8 * radius, radius), material, 8) for sx in (-1, 1) for sz in (-1, 1)
+    ]
+
+
+def fronts(low, high, z, columns, rows, material, handle="bar", metal="steel") -> list[Part]:
+    """Doors or drawers before a carcass, with handles: a grid of slabs from `low` to `high` (x, y), their backs at z.
+
+    Args:
+        low: corner on the left below.
+        high: corner on the right above.
+        z: of the carcass's face.
+        columns: side by side.
+        rows: one over another.
+        material: of the slabs.
+        handle: bar (level), pull (upright, beside the gap between a pair), knob, or empty.
+        metal: of the handles.
+    """
+    parts = []
+    width, height = (high[0] - low[0]) / columns, (high[1] - low[1]) / rows
+    for k in range(columns * rows):
+        column, row = k % columns, k // columns
+        x, y = low[0] + width * (column + 0.5), low[1] + height * (row + 0.5)
+        parts.append(box((x, y, z + 0.008), (width - 0.012, height - 0.012, 0.02), material))
+        if handle == "bar":
+            parts.append(box((x, y + 0.2 * height, z + 0.028), (0.35 * width, 0.018, 0.024), metal))
+        elif handle == "knob":
+            parts.append(cushion((x, y, z + 0.03), (0.034, 0.034, 0.03), metal, 0.01))
+        elif handle == "pull":
+            side = 1 if column % 2 == 0 and columns > 1 else -1
+            place = (x + side * (width / 2 - 0.05), y, z + 0.028)
+            parts.append(box(place, (0.018, min(0.3, 0.4 * height), 0.024), metal))
+    return parts

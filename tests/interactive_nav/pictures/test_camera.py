@@ -10,8 +10,8 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.pictures.camera import STREAMS, Camera
-from interactive_nav.pictures.shading import FLOOR, PALETTE, colours, normals
-from interactive_nav.pictures.views import CLASSES, SceneView
+from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTES, colours, normals
+from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
@@ -19,7 +19,7 @@ from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav.sensing.rays import RayRenderer
 from interactive_nav.sensing.sensors import Sensors
-from scenes_mjcf.categories import CLASS_COLOURS
+from scenes_mjcf.categories import CLASSES, SEGMENTATIONS
 from tests.toys import write_room
 
 
@@ -66,9 +66,9 @@ def test_the_robots_own_view_is_the_sensors_view(scene_and_state):
     assert np.mean(frame["segmentation"] == ids[0]) > 0.99
 
 
-@pytest.mark.parametrize("classes", [4, 5])
-def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes):
-    """The second basket is 8 to both, and a desk 4 or, apart from tables, 11."""
+@pytest.mark.parametrize(("classes", "own"), [(4, {4, 6, 8}), (5, {11, 6, 8}), ("all", {3, 7, 8, 9, 10})])
+def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes, own):
+    """The second basket is 8 to both, and a desk 4 or, apart from tables, 11; or each category has one id."""
     room = write_room(tmp_path / "room", blocks=(("desk", 0.7, 0.5, 9.0, 0.5),))
     config = NavConfig.of(num_objects=6, segmentation_classes=classes)
     world = build_world(get_robot("turtlebot"), (load_scene(room),), config)
@@ -83,11 +83,12 @@ def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes):
     )
     seen = set(np.unique(Camera(env, "rays").frame(state, 160, 120, ("segmentation",), view="top")["segmentation"]))
     observed = set(np.unique(env.sensors.boxes.class_id[0]))
-    assert seen == observed | {1} and {6, 8, 4 if classes == 4 else 11} <= seen
+    assert seen == observed | {1} and own <= seen
     view = SceneView(get_robot("turtlebot"), world.scenes[0], pick(6), classes)
     assert set(np.unique(view.class_id)) == seen
     assert CLASSES[8] == "basket" and CLASSES[7] == "pot" and CLASSES[10] == "shoe"
-    np.testing.assert_allclose(PALETTE[: len(CLASS_COLOURS)], CLASS_COLOURS, atol=1e-6)
+    colours = SEGMENTATIONS[classes].colours
+    np.testing.assert_allclose(PALETTES[classes][: len(colours)], colours, atol=1e-6)
 
 
 def test_the_follower_sees_the_robot(scene_and_state):
@@ -123,7 +124,7 @@ def test_normals_and_colours_of_boxes(world, boxes):
     rgb = np.asarray(colours(boxes, scene, camera, jnp.asarray(normal)[None], index))[0]
     # The floor is lit fully by the sun (0.9 / |l| of 0.4) and not by the lamp.
     sun = 0.9 / np.linalg.norm([0.35, 0.25, 0.9])
-    np.testing.assert_allclose(rgb[-1, 20], 255 * PALETTE[FLOOR] * (0.45 + 0.4 * sun), atol=1)
+    np.testing.assert_allclose(rgb[-1, 20], 255 * np.array(FLOOR_COLOUR) * (0.45 + 0.4 * sun), atol=1)
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ from interactive_nav.interop import gym_env
 from interactive_nav.pictures import replay
 from interactive_nav.pictures.replay import Player, ReplayError
 from interactive_nav.pictures.views import (
-    CLASSES,
     GOAL_COLOUR,
     INSIDE,
     NOTHING,
@@ -36,6 +35,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.rotations import yaw_from_quat
+from scenes_mjcf.categories import CATEGORIES, CLASSES, class_id
 
 STEPS = 60
 
@@ -234,6 +234,8 @@ def test_pictures_of_depth_and_classes():
     assert depth[0, :, 0].tolist() == [255, 63, 0, 0]  # (1 - d / 5)^2
     mask = mask_picture(np.array([[NOTHING, CLASSES.index("shoe")]], np.uint8))
     assert mask[0, 0].tolist() == [0, 0, 0] and mask[0, 1].tolist() == [204, 71, 76]
+    bed = mask_picture(np.array([[class_id("bed", "all")]], np.uint8), "all")[0, 0]
+    assert bed.tolist() == [int(255 * value) for value in CATEGORIES["bed"].colour]
 
 
 @pytest.fixture(scope="module")

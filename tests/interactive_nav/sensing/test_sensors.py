@@ -183,7 +183,7 @@ def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
     [
         ({"observations": ("dept",)}, "observations is .*dept.*, expected a choice from .*depth"),
         ({"image_dtype": "int8"}, "image_dtype is 'int8', expected one of float32, float16, uint8"),
-        ({"segmentation_classes": 6}, "segmentation_classes is 6, expected one of 4, 5"),
+        ({"segmentation_classes": 6}, "segmentation_classes is 6, expected one of 4, 5, all"),
         ({"depth_dropout": 1.5}, "depth_dropout is 1.5, expected between 0 and 1"),
         ({"lidar_pos_m": (0.0, 0.1)}, "lidar_pos_m is .*, expected three numbers"),
         ({"image_fov_deg": 180.0}, "image_fov_deg is 180.0"),
