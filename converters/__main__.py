@@ -135,10 +135,10 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.generate import generate_building
-    from converters.recipes import MODELS, building_of, parse_settings
+    from converters.recipes import building_of, parse_settings
 
     settings = parse_settings(arguments.settings)
-    config = building_of(arguments.tier, settings, MODELS[arguments.split], "settings")
+    config = building_of(arguments.tier, settings, arguments.split, "settings")
     with stage_progress(console) as report:
         generate_building(arguments.out, arguments.seed, report, config)
     console.print(

@@ -18,12 +18,14 @@ from converters.check.preview import preview
 from converters.generate import generate_building
 from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
 from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_config, home_fields
-from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
+from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, convert
 from interactive_nav_common.files import part_folder, publish
 
 MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
-"""Split -> CAD models: held-out models are held out here."""
+"""Split -> CAD models of sparse buildings: held-out models are held out here."""
+HOME_MODELS = {"train": HOME_TRAIN_MODELS, "test": HOME_TEST_MODELS}
+"""Split -> CAD models of homes."""
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 _FIXED = ("models",)
 SPARSE = "sparse"
@@ -86,15 +88,13 @@ def _value(key: str, value: Any, default: Any, where: str) -> Any:
     return value
 
 
-def building_of(
-    tier: str, settings: dict[str, Any], models: tuple[str, ...], where: str
-) -> BuildingConfig | HomeConfig:
+def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> BuildingConfig | HomeConfig:
     """What to build, from a tier's name and settings as a recipe or a command line gives them.
 
     Args:
         tier: `sparse`, or one of `converters.generate.homes.config.TIERS`.
         settings: by name: those of `BuildingConfig`, or of `HomeConfig` and its shell.
-        models: names of the CAD models that may be used.
+        split: train or test; decides the CAD models.
         where: named in errors.
 
     Raises:
@@ -108,8 +108,8 @@ def building_of(
     values = {key: _value(key, value, fields[key], where) for key, value in settings.items()}
     try:
         if tier == SPARSE:
-            return BuildingConfig(**values, models=models).validate()
-        return home_config(tier, values, models)
+            return BuildingConfig(**values, models=MODELS[split]).validate()
+        return home_config(tier, values, HOME_MODELS[split])
     except GenerationError as error:
         raise GenerationError(f"{where}: {error}") from error
 
@@ -166,8 +166,8 @@ def parse_recipes(data: Any, where: str) -> Recipes:
         seed = recipe.get("seed")
         if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
             raise GenerationError(f"{here}: seed is {seed!r}, expected a whole number of 0 or more")
-        models, settings = MODELS[recipe["split"]], recipe.get("building") or {}
-        building = building_of(recipe.get("tier", SPARSE), settings, models, f"{here}: building")
+        settings = recipe.get("building") or {}
+        building = building_of(recipe.get("tier", SPARSE), settings, recipe["split"], f"{here}: building")
         scenes.append(SceneRecipe(str(name), recipe["split"], seed, building))
     return Recipes(tuple(scenes), dict(conversion))
 

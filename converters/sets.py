@@ -7,6 +7,7 @@ so that any machine that sees the folder can make it.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import subprocess
 import sys
@@ -162,7 +163,7 @@ class RayRunner:
         self._ray, self._mine, self._started = ray, not ray.is_initialized(), []
         if self._mine:
             try:
-                ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+                ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
             except (ConnectionError, ValueError, RuntimeError) as error:
                 first = next(iter(str(error).splitlines()), "")
                 raise ConfigError(

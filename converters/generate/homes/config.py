@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.models.cad import TRAIN_MODELS
+from converters.generate.models.cad import HOME_TRAIN_MODELS
 
 Range = tuple[float, float]
 SHARE_TOLERANCE = 0.02
@@ -104,7 +104,7 @@ def home_fields() -> dict[str, Any]:
     return own | {name: value for name, value in shell.items() if name not in ("models", *COUNTED)}
 
 
-def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = TRAIN_MODELS) -> HomeConfig:
+def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = HOME_TRAIN_MODELS) -> HomeConfig:
     """A tier's home with some settings changed.
 
     Args:
