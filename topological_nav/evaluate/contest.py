@@ -69,6 +69,8 @@ class Contest:
         for name in self.contenders:
             if name not in CONTENDERS:
                 raise ConfigError(f"contender is '{name}', expected a choice from {', '.join(CONTENDERS)}")
+        if len(set(self.contenders)) < len(self.contenders):
+            raise ConfigError(f"contenders are {', '.join(self.contenders)}, expected each once")
         if "ppo" in self.contenders and self.ppo is None:
             raise ConfigError("contender ppo needs the run folder of a trained policy: --ppo RUN")
         if preset(self.domain) != preset("clean") and self.truth:
