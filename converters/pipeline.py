@@ -261,6 +261,13 @@ def _report_objects(
             row["hinge_assumed"] = placed.hinge.assumed
 
 
+def _measures(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
+    """How full a whole scene is."""
+    assert parts.structure_visual is not None
+    seen = [(to_world(o, v.vertices), v.faces) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
+    return measure_scene(parts.objects, maps, [(parts.structure_visual.vertices, parts.structure_visual.faces), *seen])
+
+
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
     """Every stage after reading; writes into `folder`, which exists and is empty.
 
@@ -318,11 +325,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         gates = evaluate(spec, maps, tuple(o.name for o in parts.objects))
         area = float(plan.traversable.sum()) * plan.grid.resolution_m**2
-        surfaces = [(to_world(o, v.vertices), v.faces) for o, v in zip(parts.objects, visuals, strict=True)]
-        measures = measure_scene(parts.objects, maps, [(structure.vertices, structure.faces), *surfaces])
-        manifest = make_manifest(
-            raw, config.split, parts, area, rows, gates, decompose_config, decomposed.fallbacks, measures
-        )
+        found = decomposed.fallbacks, _measures(parts, maps)
+        manifest = make_manifest(raw, config.split, parts, area, rows, gates, decompose_config, *found)
         save_manifest(manifest, folder)
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds)
 
