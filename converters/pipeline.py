@@ -21,7 +21,6 @@ from converters.bodies.objects import PlacedObject, name_objects, place_object, 
 from converters.bodies.physical import physical_properties, with_source
 from converters.bodies.placement import compare, upright
 from converters.check.gates import evaluate
-from converters.check.measures import measure_scene
 from converters.check.settle import Settled, settle
 from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
@@ -261,13 +260,6 @@ def _report_objects(
             row["hinge_assumed"] = placed.hinge.assumed
 
 
-def _measures(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
-    """How full a whole scene is."""
-    assert parts.structure_visual is not None
-    seen = [(to_world(o, v.vertices), v.faces) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
-    return measure_scene(parts.objects, maps, [(parts.structure_visual.vertices, parts.structure_visual.faces), *seen])
-
-
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
     """Every stage after reading; writes into `folder`, which exists and is empty.
 
@@ -324,9 +316,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         gates = evaluate(spec, maps, tuple(o.name for o in parts.objects))
-        area = float(plan.traversable.sum()) * plan.grid.resolution_m**2
-        found = decomposed.fallbacks, _measures(parts, maps)
-        manifest = make_manifest(raw, config.split, parts, area, rows, gates, decompose_config, *found)
+        area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
+        manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
         save_manifest(manifest, folder)
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds)
 
