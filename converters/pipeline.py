@@ -21,7 +21,6 @@ from converters.bodies.objects import PlacedObject, name_objects, place_object, 
 from converters.bodies.physical import physical_properties, with_source
 from converters.bodies.placement import compare, upright
 from converters.check.gates import evaluate
-from converters.check.measures import measure_scene
 from converters.check.settle import Settled, settle
 from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
@@ -317,12 +316,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Cloc
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         gates = evaluate(spec, maps, tuple(o.name for o in parts.objects))
-        area = float(plan.traversable.sum()) * plan.grid.resolution_m**2
-        surfaces = [(to_world(o, v.vertices), v.faces) for o, v in zip(parts.objects, visuals, strict=True)]
-        measures = measure_scene(parts.objects, maps, [(structure.vertices, structure.faces), *surfaces])
-        manifest = make_manifest(
-            raw, config.split, parts, area, rows, gates, decompose_config, decomposed.fallbacks, measures
-        )
+        area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
+        manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
         save_manifest(manifest, folder)
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds)
 

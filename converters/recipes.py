@@ -128,9 +128,7 @@ def parse_settings(words: Iterable[str]) -> dict[str, Any]:
         try:
             settings[key] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise GenerationError(
-                f"{key}: '{value}' is not readable as YAML; give a number or [lowest, highest]"
-            ) from error
+            raise GenerationError(f"{key}: cannot read '{value}', expected a number or [lowest, highest]") from error
     return settings
 
 

@@ -75,7 +75,7 @@ class SceneManifest:
     warnings: tuple[str, ...] = ()
     """What the converter repaired, left out or found missing in the source."""
     measures: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How full the scene is and how hard to get through (`converters/check/measures.py`); empty: not measured."""
+    """How full the scene is and how hard to get through (`converters/write/measures.py`); empty: not measured."""
     schema_version: int = SCHEMA_VERSION
 
 

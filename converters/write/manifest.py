@@ -10,7 +10,8 @@ from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig
 from converters.records.gate import Gate
 from converters.records.raw import RawScene
 from converters.write.emit import SceneParts
-from scenes_mjcf.schema import SceneManifest, SceneObject
+from converters.write.measures import measure_parts
+from scenes_mjcf.schema import SceneManifest, SceneMaps, SceneObject
 
 PACKAGES = (
     "mujoco",
@@ -34,11 +35,11 @@ def make_manifest(
     gates: tuple[Gate, ...],
     decompose: DecomposeConfig,
     fallbacks: dict[str, str] | None = None,
-    measures: dict[str, Any] | None = None,
+    maps: SceneMaps | None = None,
 ) -> SceneManifest:
     """Collects what a scene is, where it came from and which gates it passed; all paths are relative.
 
-    `fallbacks` names the models whose one convex hull stands for them, and why; `measures` tells how full the scene is.
+    `fallbacks` names the models whose one convex hull stands for them, and why; with `maps`, it is measured too.
     """
     fell = fallbacks or {}
     objects = tuple(
@@ -66,7 +67,7 @@ def make_manifest(
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),
-        measures=measures or {},
+        measures=measure_parts(parts, maps) if maps is not None else {},
         warnings=(
             *raw.warnings,
             *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items())),

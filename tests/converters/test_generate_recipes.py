@@ -15,7 +15,7 @@ import shapely
 
 from converters import recipes
 from converters.__main__ import main
-from converters.generate import Building, GenerationError, design_building
+from converters.generate import Building, GenerationError, HomeConfig, design_building
 from converters.generate.design.doors import wall_behind_m
 from converters.generate.design.furnish import SIDE_WALL_M
 from converters.generate.design.maps import clearance
@@ -47,12 +47,45 @@ def test_a_number_stands_for_a_range_and_the_split_chooses_the_models():
     assert a.building.models == TRAIN_MODELS and b.building.models == TEST_MODELS
 
 
+def test_a_tier_makes_a_home_with_the_split_s_models():
+    data = good()
+    settings = {"n_rooms": 5, "must_push_fetch": None}
+    data["scenes"]["a"] = {"split": "test", "seed": 1, "tier": "cluttered", "building": settings}
+    home = parse_recipes(data, "x").scenes[0].building
+    assert isinstance(home, HomeConfig) and home.tier == "cluttered" and home.furniture_share == 0.33
+    assert home.shell.n_rooms == (5, 5) and home.shell.models == TEST_MODELS
+    assert home.must_push == {"turtlebot": (0.35, 0.6)}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--tier", "furnisht"], "error: settings: tier is 'furnisht', expected one of sparse, furnished, cluttered"),
+        (
+            ["--tier", "furnished", "furniture_shar=0.2"],
+            "unknown key 'furniture_shar'; did you mean 'furniture_share'?",
+        ),
+        (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9: expected 0 to 0.5"),
+        (["--tier", "furnished", "furniture_share=x"], "furniture_share is 'x', expected a float"),
+        (["--tier", "furnished", "n_chairs=3"], "unknown key 'n_chairs'"),
+        (["n_rooms=[3"], "n_rooms: cannot read '[3', expected a number or [lowest, highest]"),
+        (["n_rooms"], "got 'n_rooms', expected KEY=VALUE"),
+    ],
+)
+def test_wrong_tiers_and_settings_of_one_building_are_told_in_a_line(tmp_path, capsys, words, message):
+    assert main(["generate", str(tmp_path / "home"), "--seed", "1", *words]) == 2
+    told = capsys.readouterr().err.strip()
+    assert message in told and "\n" not in told and not (tmp_path / "home").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda d: d.update(scene={}), "unknown key 'scene'; did you mean 'scenes'"),
         (lambda d: d["scenes"].update(a=3), "scenes: a: got 3, expected a mapping"),
         (lambda d: d["scenes"]["a"].update(split="val"), "split is 'val', expected one of train, test"),
+        (lambda d: d["scenes"]["a"].update(tier="full"), "building: tier is 'full', expected one of sparse, furnished"),
+        (lambda d: d["scenes"]["a"].update(tier="furnished"), "building: unknown key 'n_chairs'"),
         (lambda d: d["scenes"]["a"].update(seed=-1), "seed is -1, expected a whole number"),
         (lambda d: d["scenes"]["a"]["building"].update(n_room=4), "unknown key 'n_room'; did you mean 'n_rooms'"),
         (lambda d: d["scenes"]["a"]["building"].update(n_rooms="4"), "n_rooms is '4', expected a number or"),

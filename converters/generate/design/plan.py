@@ -15,6 +15,7 @@ import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.instance import Instance
+from converters.generate.design.parts import Parts
 
 CM = 0.01
 DOORWAY_MARGIN_M = 0.12
@@ -98,29 +99,6 @@ class Plan:
     door_height_m: float
     built_in: tuple[Instance, ...] = dataclasses.field(default=(), compare=False)
     """Furniture that stays: part of the static structure as the fixtures are."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Parts:
-    """How a rectangle is shared among rooms."""
-
-    weights: tuple[float, ...]
-    """Area of each room against the others', in the order in which they lie."""
-    spread: float = 0.1
-    """A cut is up to this share of the side away from where the weights have it."""
-
-    @classmethod
-    def even(cls, n: int) -> Parts:
-        """n rooms of one size."""
-        return cls((1.0,) * n)
-
-    def share(self, n_low: int) -> float:
-        """Of the first `n_low` rooms."""
-        return sum(self.weights[:n_low]) / sum(self.weights)
-
-    def cut(self, n_low: int) -> tuple[Parts, Parts]:
-        """The first `n_low` rooms and the others."""
-        return Parts(self.weights[:n_low], self.spread), Parts(self.weights[n_low:], self.spread)
 
 
 def snap(value: float) -> float:

@@ -89,7 +89,7 @@ TIERS: dict[str, dict[str, Any]] = {
     "cluttered": {
         "furniture_share": 0.33,
         "clutter_per_10_m2": (4.0, 5.0),
-        "must_push_turtlebot": (0.40, 0.55),
+        "must_push_turtlebot": (0.35, 0.60),
         "must_push_fetch": (0.50, 0.75),
     },
 }

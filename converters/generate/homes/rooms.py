@@ -13,7 +13,8 @@ import math
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.plan import Parts, Plan, Rect, make_plan
+from converters.generate.design.parts import Parts
+from converters.generate.design.plan import Plan, Rect, make_plan
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.bodies.objects import PlacedObject
-from converters.check.measures import measure_scene, navigation_complexity, shadow, specific_surface_1_m
 from converters.geometry.boxes import convex_hull
 from converters.geometry.density import ROBOT_RADIUS_M, Ways, clearance_m, must_push_shares
+from converters.write.measures import measure_scene, navigation_complexity, shadow, specific_surface_1_m
 from interactive_nav.robots import get_robot
 from scenes_mjcf.schema import SceneMaps, load_manifest
 

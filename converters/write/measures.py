@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull
 from converters.bodies.objects import PlacedObject, to_world
 from converters.geometry.density import ROBOT_RADIUS_M, clearance_m, must_push_shares, regions
 from converters.geometry.faces import face_areas
+from converters.write.emit import SceneParts
 from scenes_mjcf.schema import SceneMaps
 
 NAVIGATION_CELL_M = 0.1
@@ -122,3 +123,11 @@ def measure_scene(
         "specific_surface_1_m": round(specific_surface_1_m(surfaces), 4),
         "navigation_complexity": round(complexity, 3),
     }
+
+
+def measure_parts(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
+    """`measure_scene` of a scene with its visuals."""
+    structure = parts.structure_visual
+    assert structure is not None
+    seen = [(to_world(o, v.vertices), v.faces) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
+    return measure_scene(parts.objects, maps, [(structure.vertices, structure.faces), *seen])
