@@ -77,7 +77,7 @@ class Category:
 # Furnished homes, from the same table: armchair 27 kg, bedside unit 14, blanket box or ottoman 11, bench of solid wood
 # 30, bed with mattress 53 (single) to 91 (king), chest of drawers 27, sideboard 35, TV unit 17, bookcase 21, coffee
 # table 14. Stools, bins, plants in wet soil, lamps, bags, boxes, suitcases (a packed one up to the 23 kg that airlines
-# take), baskets with laundry, carts, racks: own estimates. Densities as above, over the hulls of the generator's models;
+# take), baskets with laundry, carts, racks: own estimates. Densities as above, over hulls of the generator's models;
 # those of solid pieces hold what their parts do, of tables and stools thrice, of wire racks up to twenty times as much.
 # Small things: a pair of trainers weighs 0.6 kg in 2.5 dm3 of hulls, a clay pot of 15 cm 0.7 kg in 0.8 dm3, a plastic
 # toy is mostly hollow; other things lie between. Their friction: rubber soles, clay, plastic, anything.
