@@ -1,4 +1,4 @@
-"""`python -m converters convert|object|propose|check|generate|generate-scenes|preview`: parse, print, exit.
+"""`python -m converters convert|object|propose|check|generate|generate-scenes|models|preview`: parse, print, exit.
 
 Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
 line on stderr), 130 or 143 interrupted.
@@ -156,6 +156,14 @@ def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
     with stage_progress(console) as report:
         failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
     return 1 if failed else 0
+
+
+def _models(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.check.model_sheet import model_sheet
+
+    count = model_sheet(arguments.output, arguments.names)
+    console.print(f"{arguments.output}: picture of {count} models", soft_wrap=True)
+    return 0
 
 
 def _preview(arguments: argparse.Namespace, console: Console) -> int:
@@ -320,6 +328,13 @@ def _add_generate_scenes(commands: _Commands) -> None:
     command.set_defaults(run=_generate_scenes, writes=("{}/*",))
 
 
+def _add_models(commands: _Commands) -> None:
+    command = commands.add_parser("models", help="draw the CAD models that generated buildings are furnished with")
+    command.add_argument("names", nargs="*", metavar="NAME", help="models or categories (default: all models)")
+    command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
+    command.set_defaults(run=_models, writes=("{}",))
+
+
 def _add_preview(commands: _Commands) -> None:
     command = commands.add_parser("preview", help="draw a conversion's stages from above")
     command.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
@@ -331,7 +346,8 @@ def _add_preview(commands: _Commands) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (_add_convert, _add_propose, _add_object, _add_check, _add_generate, _add_generate_scenes, _add_preview):
+    generating = (_add_generate, _add_generate_scenes, _add_models)
+    for add in (_add_convert, _add_propose, _add_object, _add_check, *generating, _add_preview):
         add(commands)
     return parser
 

@@ -174,22 +174,16 @@ def lamp_shade(height=1.55, foot=0.17, metal="black", shade="lampshade", top=0.1
 
 
 def lamp_tripod(height=1.5, wood="oak", shade="white") -> list[Part]:
+    """Its legs carry a tray, which keeps their hulls apart and its weight low."""
     parts = [
-        pillar((0, height - 0.3, 0), 0.25, (0.19, 0.15), shade, 18),
-        pillar((0, height - 0.42, 0), 0.14, 0.03, "black", 10),
+        pillar((0, height - 0.27, 0), 0.22, (0.16, 0.13), shade, 18),
+        pillar((0, height - 0.4, 0), 0.14, 0.03, "black", 10),
     ]
     for a in (math.pi / 2, math.pi * 7 / 6, math.pi * 11 / 6):
-        parts.append(
-            bar(
-                (0.3 * math.cos(a), 0, 0.3 * math.sin(a)),
-                (0.02 * math.cos(a), height - 0.36, 0.02 * math.sin(a)),
-                0.022,
-                wood,
-                8,
-            )
-        )
-        parts.append(bar((0, 0.5, 0), (0.2 * math.cos(a), 0.5, 0.2 * math.sin(a)), 0.008, "brass", 4))
-    return parts
+        c, s = math.cos(a), math.sin(a)
+        parts += [bar((0.32 * c, 0, 0.32 * s), (0.02 * c, height - 0.36, 0.02 * s), (0.032, 0.022), wood, 8)]
+        parts += [pillar((0.32 * c, 0, 0.32 * s), 0.05, 0.045, wood, 10)]
+    return [*parts, pillar((0, 0.42, 0), 0.03, 0.25, wood, 18)]
 
 
 def lamp_uplighter(height=1.75, foot=0.15, metal="steel", shade="ceramic") -> list[Part]:

@@ -50,9 +50,8 @@ def test_sizes_are_those_of_real_furniture(category, height_m, width_m):
         assert width_m[0] <= size_m[0] <= width_m[1], model.name
 
 
-def test_held_out_models_are_apart_and_cover_all_categories():
+def test_held_out_models_are_apart_and_cover_all_categories_of_sparse_homes():
     assert set(TRAIN_MODELS).isdisjoint(TEST_MODELS)
-    assert set(TRAIN_MODELS) | set(TEST_MODELS) == set(LIBRARY)
     for names in (TRAIN_MODELS, TEST_MODELS):
         assert {LIBRARY[n].category for n in names} == {"chair", "sofa", "table", "desk", "door"}
     assert len({cad_model(n).id_cad for n in LIBRARY}) == len(LIBRARY)

@@ -14,10 +14,13 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.bodies.alignment import apply_alignment
+from converters.generate.models.cad import cad_model
+from converters.generate.surface.write import write_cad
 from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_iou, propose_instances
 from converters.propose.retrieval import fit_model, read_library, retrieve, without_annotation
 from converters.read.annotations import parse_annotations
 from converters.read.scan2cad import read_scan2cad
+from converters.records.errors import SceneRejected
 from converters.records.raw import CadModel, ScanMesh
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
@@ -158,6 +161,14 @@ def test_box_iou_by_hand():
     one = (np.zeros(3), np.ones(3))
     assert box_iou(one, (np.array([0.5, 0, 0]), np.array([1.5, 1, 1]))) == pytest.approx(1 / 3)
     assert box_iou(one, (np.array([2.0, 0, 0]), np.array([3.0, 1, 1]))) == 0.0
+
+
+def test_models_of_classes_that_are_not_looked_for_are_passed_over(tmp_path):
+    write_cad(tmp_path / "cad", cad_model("bed_panel"))
+    with pytest.raises(SceneRejected, match="no model of a known class"):
+        read_library(tmp_path)
+    write_cad(tmp_path / "cad", cad_model("chair_slat"))
+    assert [cad.category for cad in read_library(tmp_path).values()] == ["chair"]
 
 
 def test_the_tiny_room_is_proposed_and_its_models_are_found(scan2cad_raw):
