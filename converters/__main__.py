@@ -13,7 +13,6 @@ import glob
 import os
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TypeAlias
@@ -23,7 +22,7 @@ from rich.console import Console
 from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.errors import UserError
-from interactive_nav_common.progress import stage_progress
+from interactive_nav_common.progress import stage_progress, warn_once
 from scenes_mjcf.schema import CATEGORIES
 
 
@@ -33,18 +32,6 @@ class Interrupted(BaseException):
 
 def _on_sigterm(signum: int, frame: FrameType | None) -> None:
     raise Interrupted
-
-
-def _warn_once(console: Console) -> Callable[[str], None]:
-    """Prints a warning unless it has been printed before: most come while reading, and all again with the result."""
-    printed: set[str] = set()
-
-    def warn(warning: str) -> None:
-        if warning not in printed:
-            printed.add(warning)
-            console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
-
-    return warn
 
 
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
@@ -61,7 +48,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         strict=arguments.strict,
         timeout_s=arguments.timeout,
     )
-    warn = _warn_once(console)
+    warn = warn_once(console)
     with stage_progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
     for result in results:
@@ -101,7 +88,7 @@ def _object(arguments: argparse.Namespace, console: Console) -> int:
         strict=arguments.strict,
         timeout_s=arguments.timeout,
     )
-    warn = _warn_once(console)
+    warn = warn_once(console)
     made = convert_object(arguments.source, arguments.out, config, warn=warn)
     for warning in made["warnings"]:
         warn(warning)

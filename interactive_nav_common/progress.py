@@ -31,3 +31,15 @@ def stage_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
     ) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
+
+
+def warn_once(console: Console) -> Callable[[str], None]:
+    """Prints a warning unless it has been printed before: most come while reading, and all again with the result."""
+    printed: set[str] = set()
+
+    def warn(warning: str) -> None:
+        if warning not in printed:
+            printed.add(warning)
+            console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+
+    return warn
