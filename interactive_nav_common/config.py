@@ -170,7 +170,7 @@ def settings_help(config: Any) -> str:
     for name, value in to_dict(config).items():
         shown = ",".join(map(str, value)) if isinstance(value, list) else value
         choice = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is Literal else ()
-        lines.append((f"{name}={shown}", docs[name] + (f" [{' | '.join(choice)}]" if choice else "")))
+        lines.append((f"{name}={shown}", docs[name] + (f" [{' | '.join(map(str, choice))}]" if choice else "")))
     width = max(len(left) for left, _ in lines) + 2
     return "\n".join(f"  {left:<{width}}{right}" for left, right in lines)
 

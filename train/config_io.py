@@ -127,7 +127,7 @@ def help_text() -> str:
                 continue
             doc = docs[field.name]
             if typing.get_origin(hints[field.name]) is Literal:
-                doc += f" [{' | '.join(typing.get_args(hints[field.name]))}]"
+                doc += f" [{' | '.join(map(str, typing.get_args(hints[field.name])))}]"
             by_backend = AUTO_SIZES.get(prefix.rstrip("."), {}).items()
             sizes = [f"{backend}: {auto[field.name]}" for backend, auto in by_backend if field.name in auto]
             if value is None and sizes:
