@@ -300,8 +300,6 @@ SEGMENTATIONS: dict[MaskClasses, Segmentation] = {
 }
 """The setting `segmentation_classes` -> how masks are numbered; class 4 of the first two is a desk's too where desks
 have no class of their own."""
-CLASSES, CLASS_COLOURS = SEGMENTATIONS[4].names, SEGMENTATIONS[4].colours
-"""Class -> category, and colour, as in the original's code."""
 
 
 def class_id(category: str, classes: MaskClasses = 4) -> int:

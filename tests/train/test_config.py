@@ -57,6 +57,10 @@ def test_overrides():
     assert config.ppo.value_hidden_layer_sizes == (8, 9)
     assert config.run.num_timesteps == 2_000_000 and isinstance(config.run.num_timesteps, int)
     assert apply_overrides(BASE, ["ppo.num_envs=5", "ppo.num_envs=auto"]).ppo.num_envs is None
+    masks = [
+        apply_overrides(BASE, [f"env.segmentation_classes={word}"]).env.segmentation_classes for word in ("all", 5)
+    ]
+    assert masks == ["all", 5]
     assert BASE.ppo.learning_rate == 3e-4  # nothing is changed in place
 
 
@@ -82,6 +86,7 @@ def test_two_words_that_only_fit_together():
         ("run.tensorboard=1", "run.tensorboard: got 1 (int), expected true or false"),
         ("run.name=a/b", "run.name is 'a/b', expected one folder name"),
         ("env.k_int=-1", "env.k_int is -1.0, expected 0 or more"),
+        ("env.segmentation_classes=6", "env.segmentation_classes: got 6 (int), expected one of 4, 5, all"),
         ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
         ("algorithm=pop", "algorithm is 'pop', expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
         ("ppo=3", "ppo: got 3 (int), expected a mapping"),

@@ -35,8 +35,9 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.rotations import yaw_from_quat
-from scenes_mjcf.categories import CATEGORIES, CLASSES, class_id
+from scenes_mjcf.categories import CATEGORIES, SEGMENTATIONS, class_id
 
+CLASSES = SEGMENTATIONS[4].names
 STEPS = 60
 
 
