@@ -86,7 +86,7 @@ def test_two_words_that_only_fit_together():
         ("run.tensorboard=1", "run.tensorboard: got 1 (int), expected true or false"),
         ("run.name=a/b", "run.name is 'a/b', expected one folder name"),
         ("env.k_int=-1", "env.k_int is -1.0, expected 0 or more"),
-        ("env.segmentation_classes=6", "env.segmentation_classes: got 6 (int), expected one of 4, 5, all"),
+        ("env.segmentation_classes=6", "env.segmentation_classes is 6, expected one of 4, 5, all"),
         ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
         ("algorithm=pop", "algorithm is 'pop', expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
         ("ppo=3", "ppo: got 3 (int), expected a mapping"),
