@@ -53,8 +53,8 @@ def _mix(a, b, share):
 def plant_ficus(height=1.25) -> list[Part]:
     """A small tree with a round crown."""
     parts = [
-        *planter(0.19, 0.32, "cream", False),
-        bar((0, 0.3, 0), (0.02, height - 0.35, 0.01), (0.022, 0.016), "bark", 8),
+        *planter(0.22, 0.3, "cream"),
+        bar((0, 0.28, 0), (0.02, height - 0.35, 0.01), (0.022, 0.016), "bark", 8),
     ]
     for k, (x, y, z, r) in enumerate(
         (
