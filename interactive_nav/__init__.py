@@ -93,8 +93,8 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     if isinstance(scenes, (str, Path)):
         raise ValueError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
-    loaded = tuple(load_scene(s) for s in scene_folders(scenes))
-    return InteractiveNav(get_robot(robot, config.rules.control_mode), loaded, config)
+    spec = get_robot(robot, config.rules.control_mode)
+    return InteractiveNav(spec, tuple(load_scene(s) for s in scene_folders(scenes)), config)
 
 
 __all__ = [

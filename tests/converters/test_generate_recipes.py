@@ -20,7 +20,7 @@ from converters.generate.design.doors import wall_behind_m
 from converters.generate.design.furnish import SIDE_WALL_M
 from converters.generate.design.maps import clearance
 from converters.generate.design.space import GRID_M, passes, room_mask, static_grid, without
-from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS
+from converters.generate.models.cad import HOME_TEST_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.recipes import chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.errors import FileError
 
@@ -53,7 +53,7 @@ def test_a_tier_makes_a_home_with_the_split_s_models():
     data["scenes"]["a"] = {"split": "test", "seed": 1, "tier": "cluttered", "building": settings}
     home = parse_recipes(data, "x").scenes[0].building
     assert isinstance(home, HomeConfig) and home.tier == "cluttered" and home.furniture_share == 0.33
-    assert home.shell.n_rooms == (5, 5) and home.shell.models == TEST_MODELS
+    assert home.shell.n_rooms == (5, 5) and home.shell.models == HOME_TEST_MODELS
     assert home.must_push == {"turtlebot": (0.35, 0.6)}
 
 

@@ -326,7 +326,7 @@ def _windows(
             break
         axis, way, face, start, end = sides[k]
         width = snap(rng.uniform(0.8, min(1.5, end - start - 0.6)))
-        at = snap(rng.uniform(start + 0.3, end - 0.3 - width))
+        at = snap(rng.uniform(start + 0.3, max(start + 0.3, end - 0.3 - width)))
         lo, hi = sorted((face, face - way * thick))
         rect = Rect(lo, at, hi, at + width) if axis == 0 else Rect(at, lo, at + width, hi)
         near = Rect(rect.x0 - 0.3, rect.y0 - 0.3, rect.x1 + 0.3, rect.y1 + 0.3)

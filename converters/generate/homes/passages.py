@@ -21,7 +21,7 @@ from converters.generate.homes.furnish import Home, clutter_category, settle
 from converters.generate.homes.groups import LIGHT, Group
 from converters.geometry.density import ROBOT_RADIUS_M, Ways, clearance_m, must_push_shares
 
-MOST_MOVES = 240
+MOST_MOVES = 160
 """Moves tried."""
 BEFORE_M = (0.15, 0.85)
 """From a doorway's middle to a piece that narrows it, along the way through."""

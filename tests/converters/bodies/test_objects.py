@@ -36,9 +36,11 @@ def test_a_flat_sheet_becomes_one_centimetre_thick(flat_axis):
 
 def test_feet_reach_the_floor_and_nothing_goes_below():
     hull = flatten_feet(Hull(box_points((0.1, 0.1, 0.5), (0, 0, 0.26)), np.zeros((0, 3), np.int64)))  # foot at 1 cm
-    assert hull.vertices[:, 2].min() == 0.0
+    assert hull.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-12)
     sunk = flatten_feet(Hull(box_points((0.1, 0.1, 0.5), (0, 0, 0.24)), np.zeros((0, 3), np.int64)))  # at -1 cm
-    assert sunk.vertices[:, 2].min() == 0.0 and sunk.vertices[:, 2].max() == pytest.approx(0.49)
+    assert sunk.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-12) and sunk.vertices[:, 2].max() == pytest.approx(
+        0.49
+    )
     shelf = convex_hull(box_points((0.1, 0.1, 0.1), (0, 0, 0.5)))
     np.testing.assert_allclose(flatten_feet(shelf).vertices[:, 2].min(), 0.45)
 

@@ -26,7 +26,7 @@ from converters.generate.homes.furnish import Home, furnish_home
 from converters.generate.homes.groups import ALIKE, GROUPS, LIGHT, ROOM_SETS
 from converters.generate.homes.passages import adjust
 from converters.generate.homes.rooms import USES, assign_uses, home_plan, programme
-from converters.generate.models.cad import LIBRARY, TRAIN_MODELS
+from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY
 from scenes_mjcf.categories import CATEGORIES
 from tests.converters.generate.test_generate_plan import polygon, turned
 
@@ -213,7 +213,7 @@ def test_bed_heads_wardrobes_and_bookcases_have_a_wall_behind(seed):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", ["dining table", "small table", "desk"])
 def test_chairs_face_their_table_and_go_under_it_where_parts_allow(name, seed):
-    group = arrange(name, Showroom(TRAIN_MODELS, 0.08), np.random.default_rng(seed))
+    group = arrange(name, Showroom(HOME_TRAIN_MODELS, 0.08), np.random.default_rng(seed))
     assert group is not None
     host, *seats = [stand(p, np.zeros(2), 0.3) for p in group.pieces if p.model.category in ("table", "desk", "chair")]
     assert len(seats) == 1 if name == "desk" else 2 <= len(seats) <= 6
@@ -341,7 +341,7 @@ def test_tables_name_what_there_is():
 def test_a_floor_counts_what_is_put_down_and_taken_away():
     plan = make_plan(BuildingConfig(), np.random.default_rng(0))
     floor = Floor(plan, [])
-    show, rng = Showroom(TRAIN_MODELS, 0.0), np.random.default_rng(0)
+    show, rng = Showroom(HOME_TRAIN_MODELS, 0.0), np.random.default_rng(0)
     item = stand(show.piece("sofa", rng), np.array(plan.rooms[0].centre), 0.4)
     assert floor.share == 0.0
     sofa = floor.add(item, 0, "sofa")

@@ -164,7 +164,7 @@ def test_without_autoreset_only_the_masked_environments_begin_anew(settings):
         envs.step(actions()[0])
     mask = np.array([True, False, True])
     new, _ = envs.reset(seed=0, options={"reset_mask": mask})
-    np.testing.assert_array_equal(new[mask], first[mask])
+    np.testing.assert_allclose(new[mask], first[mask], atol=1e-6)  # drawn by two programs
     np.testing.assert_array_equal(new[1], obs[1])
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[1\] are over"):
         envs.step(actions()[0])
