@@ -147,21 +147,19 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     Returns:
         Positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body.
     """
-    lead, slots = qpos.shape[:-1], len(tables.slot_qpos)
-    pos = jnp.zeros((*lead, slots + 1, 3), qpos.dtype)
-    axes = jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (*lead, slots + 1, 3, 3))
+    lead = qpos.shape[:-1]
     free, hinged = np.flatnonzero(~tables.hinged), np.flatnonzero(tables.hinged)
-    if len(free):
-        pose = qpos[..., tables.slot_qpos[free][:, None] + np.arange(7)]
-        pos = pos.at[..., free, :].set(pose[..., :3])
-        axes = axes.at[..., free, :, :].set(matrix_from_quat(pose[..., 3:]))
-    if len(hinged):
-        axis, anchor = tables.hinge_axis_b[scene][..., hinged, :], tables.hinge_anchor_b[scene][..., hinged, :]
-        arm, turned = swing(axis, anchor, qpos[..., tables.slot_qpos[hinged]])
-        rest = tables.hinge_axes_w[scene][..., hinged, :, :]
-        origin = tables.hinge_pos_w[scene][..., hinged, :]
-        pos = pos.at[..., hinged, :].set(origin + rotate(rest, arm))
-        axes = axes.at[..., hinged, :, :].set(compose(rest, turned))
+    pose = qpos[..., tables.slot_qpos[free][:, None] + np.arange(7)]
+    axis, anchor = tables.hinge_axis_b[scene][..., hinged, :], tables.hinge_anchor_b[scene][..., hinged, :]
+    arm, turned = swing(axis, anchor, qpos[..., tables.slot_qpos[hinged]])
+    rest = tables.hinge_axes_w[scene][..., hinged, :, :]
+    swung = tables.hinge_pos_w[scene][..., hinged, :] + rotate(rest, arm)
+    standing = jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (*lead, 1, 3, 3))
+    pos = jnp.concatenate([pose[..., :3], swung, jnp.zeros((*lead, 1, 3), qpos.dtype)], -2)
+    axes = jnp.concatenate([matrix_from_quat(pose[..., 3:]), compose(rest, turned), standing], -3)
+    order = np.argsort(np.concatenate([free, hinged, [len(tables.slot_qpos)]]))
+    if (order != np.arange(len(order))).any():
+        pos, axes = pos[..., order, :], axes[..., order, :, :]
     return pos, axes
 
 
