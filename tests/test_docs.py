@@ -123,7 +123,7 @@ def help_of(module: str, words: list[str]) -> str:
         else module
     )
     main = importlib.import_module(name).main
-    sub = [words[0]] if words and re.fullmatch(r"[a-z]+", words[0]) else []
+    sub = [words[0]] if words and re.fullmatch(r"[a-z][a-z-]*", words[0]) else []
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         main([*sub, "--help"])

@@ -77,7 +77,7 @@ def test_a_stopped_rendering_goes_on_where_it_was(made, tmp_path):
 
 
 def test_another_dataset_in_the_folder_is_refused(made):
-    with pytest.raises(DatasetError, match="the dataset there has seed = 0, this one 1; choose another folder"):
+    with pytest.raises(DatasetError, match="was made with seed = 0, expected 1; choose another folder"):
         dataset.make_dataset([made.scene], made.data, overridden(CONFIG, ["seed=1"]))
 
 
@@ -87,7 +87,7 @@ def test_a_changed_scene_is_refused(made, tmp_path):
     header = json.loads((copy / "dataset.json").read_text())
     header["scenes"][0]["digest"] = "0" * 64
     (copy / "dataset.json").write_text(json.dumps(header))
-    with pytest.raises(DatasetError, match="the dataset there is of painted as they were; the scenes differ"):
+    with pytest.raises(DatasetError, match="is of painted as they were; the scenes differ"):
         dataset.make_dataset([made.scene], copy, CONFIG)
 
 
