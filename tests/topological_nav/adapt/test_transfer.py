@@ -78,7 +78,9 @@ def test_the_sources_statistics_return_where_the_target_is_the_source(made):
 
 def test_the_game_moves_the_target_onto_the_source(monkeypatch):
     """An extractor of one weight must learn to undo a factor of 3."""
-    monkeypatch.setattr(adaptation, "embed_training", lambda network, v, x: (x * v["params"]["gain"][None], v["batch_stats"]))
+    monkeypatch.setattr(
+        adaptation, "embed_training", lambda network, v, x: (x * v["params"]["gain"][None], v["batch_stats"])
+    )
     config = AdaptConfig(learning_rate=0.02, critic_learning_rate=0.02, hidden=16, batch=50)
     rng = np.random.default_rng(0)
     source = rng.normal([1.0, 2.0], 0.1, (400, 2)).astype(np.float32)
