@@ -7,7 +7,6 @@ which CAD models may be used. The same recipes give the same scenes, byte for by
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from converters.generate.design.config import NAMES, BuildingConfig, GenerationE
 from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_config, home_fields
 from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, convert
+from interactive_nav_common.config import nearest
 from interactive_nav_common.files import part_folder, publish
 
 MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
@@ -65,9 +65,9 @@ def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> N
     known = tuple(known)
     for key in given:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
-            raise GenerationError(f"{where}: unknown key '{key}'; {hint}")
+            raise GenerationError(
+                f"{where}: unknown key '{key}'{nearest(str(key), known)}; known keys: {', '.join(sorted(known))}"
+            )
 
 
 def _value(key: str, value: Any, default: Any, where: str) -> Any:
@@ -232,9 +232,7 @@ def chosen(
     known = [r.name for r in recipes.scenes]
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-            raise GenerationError(f"no recipe named '{name}'; {hint}")
+            raise GenerationError(f"no recipe named '{name}'{nearest(name, known)}; known: {', '.join(known)}")
     wanted = tuple(r for r in recipes.scenes if not names or r.name in names)
     todo = tuple(r for r in wanted if overwrite or not (out / r.name).exists())
     for recipe in wanted:

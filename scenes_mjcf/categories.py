@@ -7,10 +7,11 @@ field here, so that a new category is one new row and no two places differ.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Mapping
 from typing import Literal
+
+from interactive_nav_common.config import nearest
 
 Rgb = tuple[float, float, float]
 Range = tuple[float, float]
@@ -314,7 +315,6 @@ def class_id(category: str, classes: MaskClasses = 4) -> int:
     """
     ids = SEGMENTATIONS[classes].ids
     if category not in ids:
-        near = difflib.get_close_matches(category, ids, 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ValueError(f"category '{category}' has no segmentation id; {hint}known: {', '.join(ids)}")
+        near = nearest(category, list(ids))
+        raise ValueError(f"category '{category}' has no segmentation id{near}; known: {', '.join(ids)}")
     return ids[category]

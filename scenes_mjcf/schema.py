@@ -7,7 +7,6 @@ A scene folder holds `scene.xml` (MJCF), `scene.json` (this module's `SceneManif
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import math
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any, get_origin, get_type_hints
 
 import numpy as np
 
+from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import OBJECT_CATEGORIES
 
@@ -105,9 +105,8 @@ def known_keys(data: Any, cls: type, where: str) -> dict[str, Any]:
     }
     for key in data:
         if key not in names:
-            near = difflib.get_close_matches(key, names, 1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(sorted(names))}"
-            raise SceneError(f"{where}: unknown key '{key}'{hint}")
+            near = nearest(key, sorted(names))
+            raise SceneError(f"{where}: unknown key '{key}'{near}; known keys: {', '.join(sorted(names))}")
     missing = sorted(required - data.keys())
     if missing:
         raise SceneError(f"{where}: missing key '{missing[0]}'; convert the scene again to rewrite the file")

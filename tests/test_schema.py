@@ -22,7 +22,7 @@ def test_round_trip(room, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(licnce=d.pop("licence")), "unknown key 'licnce'; did you mean 'licence'"),
+        (lambda d: d.update(licnce=d.pop("licence")), "unknown key 'licnce', did you mean 'licence'"),
         (lambda d: d.pop("gates"), "missing key 'gates'"),
         (lambda d: d.update(split="val"), "split is 'val', expected one of train, test"),
         (lambda d: d["objects"][0].update(category="lamp"), "category is 'lamp', expected one of chair"),

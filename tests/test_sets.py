@@ -65,7 +65,7 @@ def test_a_set_without_scenes_of_a_split(own: Path, monkeypatch: pytest.MonkeyPa
         ({"tier": None}, "tier is null, expected a string"),
         ({"scenes": {"one": {"split": "valid", "seed": 1}}}, "one: split is 'valid', expected one of train, test"),
         ({"scenes": {"one": {"split": "train"}}}, "one: missing key 'seed'"),
-        ({"scene": {}}, "unknown key 'scene'; did you mean 'scenes'"),
+        ({"scene": {}}, "unknown key 'scene', did you mean 'scenes'"),
     ],
 )
 def test_a_broken_file_is_refused(own: Path, change: dict, message: str) -> None:

@@ -100,7 +100,7 @@ def render_building(building: Building, seed: int, config: BuildingConfig, progr
     scan = scan_building(building.plan, list(building.items), config, streams[1])
     progress("painting", 0.6)
     rooms = [(r.x0, r.y0, r.x1, r.y1) for r in building.plan.rooms]
-    return scan, make_atlas(scan, rooms, config.texels_per_m, streams[2])
+    return scan, make_atlas(scan, rooms, building.uses, config.texels_per_m, streams[2])
 
 
 def generate_building(
@@ -151,7 +151,7 @@ def _write(
     rng = _streams(seed)[3]
     write_json(folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, shell, seed, rng))
     for model in {item.model.name: item.model for item in items}.values():
-        write_cad(folder / "cad", model)
+        write_cad(folder / "cad", model, pieces=isinstance(cfg, HomeConfig))
     about = {
         "generator": "converters.generate",
         "version": GENERATOR_VERSION,

@@ -6,12 +6,23 @@ Rasters are (rows, columns) bool, True where free, of square cells.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from scipy import ndimage
 
-ROBOT_RADIUS_M = {"turtlebot": 0.18, "fetch": 0.31}
-"""Robot -> radius of the disc that it needs, as its specification has it; shares that must be pushed are theirs."""
+
+@dataclasses.dataclass(frozen=True)
+class Disc:
+    """What a robot needs of the floor."""
+
+    radius_m: float
+    height_m: float
+    """What is above is not in its way."""
+
+
+ROBOTS = {"turtlebot": Disc(0.18, 0.41), "fetch": Disc(0.31, 1.12)}
+"""Robots whose shares that must be pushed are told, as their specifications have them."""
 
 
 def clearance_m(free: np.ndarray, cell_m: float) -> np.ndarray:
@@ -64,10 +75,17 @@ class Ways:
         return 1.0 - float((with_movables**2).sum()) / pairs if pairs else 0.0
 
 
-def must_push_shares(static_free: np.ndarray, free: np.ndarray, cell_m: float) -> dict[str, float]:
-    """Robot -> `Ways.must_push_share`, of a floor with and without its movables."""
-    room_m = clearance_m(free & static_free, cell_m)
+def must_push_shares(static_free: np.ndarray, free: Mapping[str, np.ndarray], cell_m: float) -> dict[str, float]:
+    """Robot -> `Ways.must_push_share`, of a floor with and without its movables.
+
+    Args:
+        static_free: (rows, columns) bool, without movables.
+        free: robot -> the same without those that are in its way.
+        cell_m: side of a cell.
+    """
     return {
-        robot: Ways.of(static_free, cell_m, radius_m).must_push_share(room_m)
-        for robot, radius_m in ROBOT_RADIUS_M.items()
+        robot: Ways.of(static_free, cell_m, disc.radius_m).must_push_share(
+            clearance_m(free[robot] & static_free, cell_m)
+        )
+        for robot, disc in ROBOTS.items()
     }

@@ -5,15 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from converters.geometry.faces import merge_vertices
+from converters.geometry.pieces import convex_pieces
 from converters.geometry.rotations import Y_UP_TO_Z_UP
-from converters.read.files import SourceFolder
+from converters.read.files import SourceFolder, read_obj
 from converters.read.obj import GREY, read_painted_obj, texels
 from converters.records.errors import SceneRejected
 from converters.records.raw import SYNSETS, CadModel
 
+COLLISION = "collision.obj"
+"""Beside a model: its collision mesh, made of convex pieces that share no vertex."""
+MOST_OWN = 8
+"""Convex pieces of a model that came with its own."""
+OWN_SLACK = 0.02
+"""Share of the model's bounding box that joining two of them may add: slats become a back, legs stay legs."""
+
 
 def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     """Reads `cad/<synset>/<id>/models/model_normalized.obj` and turns it to z up.
+
+    A `collision.obj` beside it, of convex pieces, saves the decomposition.
 
     Raises:
         SceneRejected: unknown synset, absent model, or unreadable file.
@@ -38,7 +48,19 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     used, faces = np.unique(mesh.faces[order], return_inverse=True)
     vertices, faces, keep = merge_vertices(mesh.vertices[used], faces.reshape(-1, 3))
     vertices, faces, colours = clean_surface(source, relative, vertices, faces, colours[order][keep])
-    return CadModel(SYNSETS[synset], cad_id, vertices @ Y_UP_TO_Z_UP.T, faces, colours)
+    pieces = _own_pieces(source, f"cad/{synset}/{cad_id}/models/{COLLISION}")
+    return CadModel(SYNSETS[synset], cad_id, vertices @ Y_UP_TO_Z_UP.T, faces, colours, pieces)
+
+
+def _own_pieces(source: SourceFolder, relative: str) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
+    """Convex pieces that came with a model, z up; None where there are none, or not all of them are convex."""
+    if not source.has(relative):
+        return None
+    mesh = read_obj(source.use(relative, ""))
+    pieces = convex_pieces(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, MOST_OWN, OWN_SLACK)
+    if pieces is None:
+        source.repaired(f"{relative}: has a piece that is not convex; the model is decomposed")
+    return pieces
 
 
 def clean_surface(

@@ -12,17 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from scipy.spatial import ConvexHull, QhullError
 
+from converters.geometry.pieces import convex_pieces
 from converters.read.files import SourceFolder, read_obj
 from converters.read.meshes import read_surface
 from converters.read.obj import TexturedMesh, find_file, join_meshes
 from converters.records.errors import SceneRejected
-
-MAX_PIECES = 16
-"""Convex pieces of one object; the gates' limit (`hulls_per_object`)."""
-CONVEX_SHARE = 0.9
-"""A piece that fills this share of its convex hull counts as convex."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,65 +32,6 @@ class RigidObject:
     """The collision mesh itself, to be decomposed where there are no pieces; the surface without a collision mesh."""
     mass_kg: float | None
     friction: float | None
-
-
-def convex_pieces(
-    vertices: np.ndarray, faces: np.ndarray, most: int = MAX_PIECES
-) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
-    """Connected pieces of a mesh, if all of them are convex; the closest are joined until at most `most` are left.
-
-    Pieces are connected through shared vertex indices, as V-HACD writes them (neighbours only touch).
-
-    Returns:
-        Vertices (n, 3) and faces (m, 3) of each piece's hull, or None where a piece is not convex.
-    """
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1)
-    points: list[np.ndarray] = []
-    for group in groups:
-        own = vertices[np.unique(faces[group])]
-        full = _hull_volume(own)
-        if full <= 0:
-            continue  # flat slivers
-        if abs(trimesh.triangles.mass_properties(vertices[faces[group]]).volume) < CONVEX_SHARE * full:
-            return None
-        points.append(own)
-    if not points:
-        return None
-    points = merge_pieces(points, most)
-    hulls = [trimesh.convex.convex_hull(p) for p in points]
-    return tuple((np.asarray(h.vertices, float), np.asarray(h.faces, np.int64)) for h in hulls)
-
-
-def _hull_volume(points: np.ndarray) -> float:
-    """m3; 0 for points in a plane."""
-    try:
-        return float(ConvexHull(points).volume) if len(points) > 3 else 0.0
-    except QhullError:
-        return 0.0
-
-
-def merge_pieces(points: list[np.ndarray], most: int) -> list[np.ndarray]:
-    """Joins pairs of convex pieces, each time the pair whose common hull encloses least that neither does."""
-    pieces = list(points)
-    volume = [_hull_volume(p) for p in pieces]
-
-    def cost(i: int, j: int) -> float:
-        return _hull_volume(np.vstack([pieces[i], pieces[j]])) - volume[i] - volume[j]
-
-    alive = set(range(len(pieces)))
-    costs = {(i, j): cost(i, j) for i in alive for j in alive if i < j} if len(alive) > most else {}
-    while len(alive) > most:
-        i, j = min(costs, key=lambda pair: (costs[pair], pair))
-        joined = np.vstack([pieces[i], pieces[j]])
-        pieces.append(joined[ConvexHull(joined).vertices])
-        volume.append(_hull_volume(joined))
-        alive -= {i, j}
-        costs = {pair: c for pair, c in costs.items() if not {i, j} & set(pair)}
-        new = len(pieces) - 1
-        costs |= {(k, new): cost(k, new) for k in alive}
-        alive.add(new)
-    return [pieces[k] for k in sorted(alive)]
 
 
 def read_urdf(source: SourceFolder, relative: str, remedy: str) -> RigidObject:

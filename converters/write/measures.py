@@ -8,6 +8,7 @@ Gibson's buildings have ceilings and their furniture is part of the mesh; here i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,7 +19,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import ConvexHull
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.density import ROBOT_RADIUS_M, clearance_m, must_push_shares, regions
+from converters.geometry.density import ROBOTS, clearance_m, must_push_shares, regions
 from converters.geometry.faces import face_areas
 from converters.write.emit import SceneParts
 from scenes_mjcf.schema import SceneMaps
@@ -30,14 +31,17 @@ LEAST_APART_M = 1.0
 """Two places closer than this are no pair: a thin wall between them makes the ratio as large as one likes."""
 
 
-def shadow(objects: Sequence[PlacedObject], maps: SceneMaps) -> np.ndarray:
-    """[rows, columns] bool: cells of the map whose middle lies below a hull of a movable."""
+def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = math.inf) -> np.ndarray:
+    """[rows, columns] bool: cells of the map with their middle below a movable's hull that reaches below a height."""
     out = np.zeros_like(maps.traversable)
     rows, columns = out.shape
     step, (x, y) = maps.resolution_m, maps.origin_w
     for placed in objects:
         for hull in placed.hulls_b:
-            outline = shapely.MultiPoint(to_world(placed, hull.vertices)[:, :2]).convex_hull
+            points_w = to_world(placed, hull.vertices)
+            if points_w[:, 2].min() > height_m:
+                continue
+            outline = shapely.MultiPoint(points_w[:, :2]).convex_hull
             x0, y0, x1, y1 = outline.bounds
             c = slice(max(int((x0 - x) / step), 0), min(int((x1 - x) / step) + 1, columns))
             r = slice(max(int((y0 - y) / step), 0), min(int((y1 - y) / step) + 1, rows))
@@ -114,9 +118,10 @@ def measure_scene(
         `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
     """
     below = shadow(objects, maps)
-    free = maps.traversable & ~below
+    free = {robot: maps.traversable & ~shadow(objects, maps, disc.height_m) for robot, disc in ROBOTS.items()}
     must_push = must_push_shares(maps.traversable, free, maps.resolution_m)
-    complexity = navigation_complexity(free, maps.resolution_m, min(ROBOT_RADIUS_M.values()))
+    smallest = min(ROBOTS, key=lambda robot: ROBOTS[robot].radius_m)
+    complexity = navigation_complexity(free[smallest], maps.resolution_m, ROBOTS[smallest].radius_m)
     return {
         "movable_share": round(float(below[maps.traversable].mean()), 4),
         "must_push_share": {robot: round(share, 4) for robot, share in must_push.items()},

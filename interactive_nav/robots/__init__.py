@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 
 from interactive_nav.robots.models.ant import ant
@@ -12,6 +11,7 @@ from interactive_nav.robots.models.quadrotor import quadrotor
 from interactive_nav.robots.models.wheeled import WHEELED
 from interactive_nav.robots.own import from_file
 from interactive_nav.robots.spec import RobotSpec
+from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
 
 _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
@@ -40,9 +40,8 @@ def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
         ConfigError: unknown name (a mode: ValueError); the message lists the known ones.
     """
     if name not in _FACTORIES:
-        near = difflib.get_close_matches(str(name), _FACTORIES, 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ConfigError(f"unknown robot '{name}'; {hint}known robots: {', '.join(robot_names())}")
+        near = nearest(str(name), list(_FACTORIES))
+        raise ConfigError(f"unknown robot '{name}'{near}; known robots: {', '.join(robot_names())}")
     return _FACTORIES[name](control_mode)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 
 import jax
@@ -14,6 +13,7 @@ import numpy as np
 from interactive_nav.robots.spec import Camera
 from interactive_nav.sensing.base import CameraPose, look_along
 from interactive_nav.sensing.boxes import compose, rotate, swing
+from interactive_nav_common.config import nearest
 from interactive_nav_common.rotations import matrix_from_quat
 
 
@@ -77,9 +77,10 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:
     base, body = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in (base_body, camera.body))
     own = [model.body(b).name for b in range(model.nbody) if model.body_rootid[b] == base]
     if body < 0 or model.body_rootid[body] != base:
-        near = difflib.get_close_matches(camera.body, own, 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ValueError(f"camera body '{camera.body}' is no body of the robot; {hint}its bodies: {', '.join(own)}")
+        raise ValueError(
+            f"camera body {camera.body!r} is no body of the robot{nearest(camera.body, own)}; "
+            f"its bodies: {', '.join(own)}"
+        )
     links = []
     while body != base:
         joints = []

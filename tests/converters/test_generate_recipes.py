@@ -63,7 +63,7 @@ def test_a_tier_makes_a_home_with_the_split_s_models():
         (["--tier", "furnisht"], "error: settings: tier is 'furnisht', expected one of sparse, furnished, cluttered"),
         (
             ["--tier", "furnished", "furniture_shar=0.2"],
-            "unknown key 'furniture_shar'; did you mean 'furniture_share'?",
+            "unknown key 'furniture_shar', did you mean 'furniture_share'?",
         ),
         (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9: expected 0 to 0.5"),
         (["--tier", "furnished", "furniture_share=x"], "furniture_share is 'x', expected a float"),
@@ -81,19 +81,19 @@ def test_wrong_tiers_and_settings_of_one_building_are_told_in_a_line(tmp_path, c
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(scene={}), "unknown key 'scene'; did you mean 'scenes'"),
+        (lambda d: d.update(scene={}), "unknown key 'scene', did you mean 'scenes'"),
         (lambda d: d["scenes"].update(a=3), "scenes: a: got 3, expected a mapping"),
         (lambda d: d["scenes"]["a"].update(split="val"), "split is 'val', expected one of train, test"),
         (lambda d: d["scenes"]["a"].update(tier="full"), "building: tier is 'full', expected one of sparse, furnished"),
         (lambda d: d["scenes"]["a"].update(tier="furnished"), "building: unknown key 'n_chairs'"),
         (lambda d: d["scenes"]["a"].update(seed=-1), "seed is -1, expected a whole number"),
-        (lambda d: d["scenes"]["a"]["building"].update(n_room=4), "unknown key 'n_room'; did you mean 'n_rooms'"),
+        (lambda d: d["scenes"]["a"]["building"].update(n_room=4), "unknown key 'n_room', did you mean 'n_rooms'"),
         (lambda d: d["scenes"]["a"]["building"].update(n_rooms="4"), "n_rooms is '4', expected a number or"),
         (lambda d: d["scenes"]["a"]["building"].update(n_rooms=[5, 4]), "n_rooms is .5, 4.: expected 0 <= lowest"),
         (lambda d: d["scenes"]["a"]["building"].update(models=["x"]), "unknown key 'models'"),
         (lambda d: d["scenes"]["a"]["building"].update(leaves_at_walls=1), "leaves_at_walls is 1, expected a bool"),
         (lambda d: d["scenes"]["a"]["building"].update(n_blockers=9), "each bottleneck needs a chair"),
-        (lambda d: d.update(conversion={"object_face": 3}), "unknown key 'object_face'; did you mean 'object_faces'"),
+        (lambda d: d.update(conversion={"object_face": 3}), "unknown key 'object_face', did you mean 'object_faces'"),
         (lambda d: d.update(conversion={"object_faces": 0.5}), "object_faces is 0.5, expected a whole number"),
     ],
 )
@@ -112,7 +112,7 @@ def test_missing_and_unreadable_files_and_unknown_names(tmp_path, capsys):
     assert "not readable as YAML" in capsys.readouterr().err
     (tmp_path / "recipes.yaml").write_text(TINY)
     assert main(["generate-scenes", str(tmp_path), "--only", "hat"]) == 2
-    assert capsys.readouterr().err.strip() == "error: no recipe named 'hat'; did you mean 'hut'?"
+    assert capsys.readouterr().err.strip() == "error: no recipe named 'hat', did you mean 'hut'?; known: hut"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recipes.yaml"]
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.read.files import SourceFolder
-from converters.read.urdf import convex_pieces, merge_pieces, read_urdf
+from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
 from converters.single_object import ObjectConfig, convert_object, guess_category
 
@@ -100,24 +100,6 @@ def test_bad_urdfs_are_named(tmp_path, text, words):
     (tmp_path / "thing.urdf").write_text(text)
     with pytest.raises(SceneRejected, match=words):
         read_urdf(SourceFolder(tmp_path), "thing.urdf", "")
-
-
-def test_pieces_are_told_from_shapes_that_are_not_convex():
-    boxes = [trimesh.creation.box((1, 1, 1)).apply_translation((x, 0, 0)) for x in (0, 1, 2)]
-    row = trimesh.util.concatenate(boxes)
-    pieces = convex_pieces(np.asarray(row.vertices), np.asarray(row.faces))
-    assert pieces is not None and len(pieces) == 3
-    ring = trimesh.creation.annulus(0.5, 1.0, 0.2)
-    assert convex_pieces(np.asarray(ring.vertices), np.asarray(ring.faces)) is None
-
-
-def test_merging_takes_the_pair_that_encloses_least():
-    cube = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    # Two cubes side by side join without a gap; the third stands apart.
-    merged = merge_pieces([cube, cube + [5, 0, 0], cube + [1, 0, 0]], 2)
-    spans = sorted(tuple(np.ptp(p, axis=0)) for p in merged)
-    assert spans == [(1, 1, 1), (2, 1, 1)]
-    assert len(merge_pieces([cube] * 20, 16)) == 16
 
 
 def test_names_tell_categories():

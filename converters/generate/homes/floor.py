@@ -16,7 +16,7 @@ from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.homes.arrange import Arrangement
 from converters.generate.homes.groups import LOW_M
-from converters.geometry.density import clearance_m, regions
+from converters.geometry.density import ROBOTS, clearance_m, regions
 from scenes_mjcf.categories import CATEGORIES
 
 CELL_M = 0.025
@@ -46,6 +46,8 @@ class Standing:
     """Rows and columns of the raster around it."""
     shadow: np.ndarray
     """(rows, columns of `window`) bool: what it covers, seen from above."""
+    below: dict[str, np.ndarray]
+    """Robot -> what of it is in the robot's way: what lies higher is not."""
 
     @property
     def built_in(self) -> bool:
@@ -81,6 +83,8 @@ class Floor:
             self.inside[self.cells(doorway.rect)] = True
         self.covered = np.zeros(self.shape, np.uint8)
         """Pieces above each cell."""
+        self.below = {robot: np.zeros(self.shape, np.uint8) for robot in ROBOTS}
+        """Robot -> pieces in its way in each cell."""
         self.fixed = np.zeros(self.shape, bool)
         """Built-in furniture."""
         self.kept = np.zeros(self.shape, bool)
@@ -113,6 +117,10 @@ class Floor:
         x1, y1 = bounds[:, 2:].max(axis=0)
         window = self.cells(Rect(x0 - CELL_M, y0 - CELL_M, x1 + CELL_M, y1 + CELL_M))
         window = tuple(slice(s.start, min(s.stop, n)) for s, n in zip(window, self.shape, strict=True))
+        return (window[0], window[1]), self.rastered(shapes, (window[0], window[1]))
+
+    def rastered(self, shapes: list[shapely.Geometry], window: tuple[slice, slice]) -> np.ndarray:
+        """Which cells of a window have their middle inside of a shape."""
         ys, xs = (
             (np.arange(s.start, s.stop) + 0.5) * CELL_M + low for s, low in zip(window, self.low[::-1], strict=True)
         )
@@ -120,14 +128,17 @@ class Floor:
         inside = np.zeros(grid[0].shape, bool)
         for shape in shapes:
             inside |= shapely.contains_xy(shape, *grid)
-        return (window[0], window[1]), inside
+        return inside
 
     # -- what stands ----------------------------------------------------
 
     def add(self, item: Instance, room: int, group: str) -> Standing:
         """Stands a piece on the floor."""
         window, shadow = self.raster(item.outlines())
-        piece = Standing(item, room, group, window, shadow)
+        below = {
+            robot: self.rastered(item.outlines((-math.inf, disc.height_m)), window) for robot, disc in ROBOTS.items()
+        }
+        piece = Standing(item, room, group, window, shadow, below)
         self.standing.append(piece)
         self.cover(piece, 1)
         return piece
@@ -135,6 +146,8 @@ class Floor:
     def cover(self, piece: Standing, by: int) -> None:
         """Counts a piece in (1) or out (-1) of what is covered."""
         self.covered[piece.window] += np.where(piece.shadow, np.uint8(by % 256), np.uint8(0))
+        for robot, below in piece.below.items():
+            self.below[robot][piece.window] += np.where(below, np.uint8(by % 256), np.uint8(0))
         if piece.built_in:
             self.fixed[piece.window] |= piece.shadow
 
@@ -143,6 +156,10 @@ class Floor:
         assert not piece.built_in
         self.standing = [s for s in self.standing if s is not piece]
         self.cover(piece, -1)
+
+    def free(self, robot: str) -> np.ndarray:
+        """(rows, columns) bool: floor on which nothing is in a robot's way."""
+        return self.inside & (self.below[robot] == 0)
 
     @property
     def floor_cells(self) -> int:

@@ -15,7 +15,7 @@ from converters.generate.homes.arrange import Arrangement, Showroom, arrange, on
 from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
 from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
 from converters.generate.homes.groups import ALIKE, GROUPS, ROOM_SETS, RoomSet
-from converters.geometry.density import ROBOT_RADIUS_M
+from converters.geometry.density import ROBOTS
 
 LOOKS = 8
 """Best places of a group whose way round is looked at before it is left out."""
@@ -25,7 +25,7 @@ FEWEST = 4
 """Pieces that a row may do without."""
 MOST_ADDED = 500
 """Times that something is added to meet a share."""
-WIDE_M = max(ROBOT_RADIUS_M.values()) + 0.02
+WIDE_M = max(disc.radius_m for disc in ROBOTS.values()) + 0.02
 """Disc that gets past what a room's use asks for; past what is added, the disc of the settings does."""
 
 

@@ -19,7 +19,7 @@ from converters.generate.homes.config import SHARE_TOLERANCE, Range
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import Home, clutter_category, settle
 from converters.generate.homes.groups import LIGHT, Group
-from converters.geometry.density import ROBOT_RADIUS_M, Ways, clearance_m, must_push_shares
+from converters.geometry.density import ROBOTS, Ways, clearance_m, must_push_shares
 
 MOST_MOVES = 160
 """Moves tried."""
@@ -57,20 +57,22 @@ class Passages:
         floor = home.floor
         static = floor.inside & ~floor.fixed
         self.ways = {
-            robot: [Ways.of(static, CELL_M, radius + more) for more in (-DOUBT_M, DOUBT_M)]
-            for robot, radius in ROBOT_RADIUS_M.items()
+            robot: [Ways.of(static, CELL_M, disc.radius_m + more) for more in (-DOUBT_M, DOUBT_M)]
+            for robot, disc in ROBOTS.items()
         }
         self.shares = self.measure()
 
     def measure(self) -> dict[str, Shares]:
         """Robot -> shares of pairs between which it must push, as the furniture stands now."""
-        room_m = self.room_m()
-        return {robot: Shares(*(way.must_push_share(room_m) for way in ways)) for robot, ways in self.ways.items()}
+        out = {}
+        for robot, ways in self.ways.items():
+            room_m = self.room_m(robot)
+            out[robot] = Shares(*(way.must_push_share(room_m) for way in ways))
+        return out
 
-    def room_m(self) -> np.ndarray:
-        """Clearance of the floor as the furniture stands now."""
-        floor = self.home.floor
-        return clearance_m(floor.inside & (floor.covered == 0), CELL_M)
+    def room_m(self, robot: str) -> np.ndarray:
+        """Clearance of the floor for a robot as the furniture stands now."""
+        return clearance_m(self.home.floor.free(robot), CELL_M)
 
     def miss(self, shares: dict[str, Shares] | None = None) -> float:
         """How far shares (those measured last) lie from what is asked for, summed."""
@@ -112,7 +114,7 @@ class Passages:
             xy[d.axis] += (1 if side else -1) * (d.rect.size[d.axis] / 2 + rng.uniform(*BEFORE_M))
             xy[1 - d.axis] += rng.uniform(-0.5, 0.5)
             return xy, d.rooms[side]
-        room_m = self.room_m()
+        room_m = self.room_m(sorted(self.ways)[rng.integers(len(self.ways))])
         # The ridge of the clearance: as far from what stands left as from what stands right.
         ridge = (room_m > PASSAGE_M[0]) & (room_m < PASSAGE_M[1]) & (floor.room >= 0)
         ridge &= _ridge(room_m)
@@ -157,7 +159,7 @@ def adjust(home: Home) -> dict[str, float]:
         else:
             _clear(home, passages)
     floor = home.floor
-    told = must_push_shares(floor.inside & ~floor.fixed, floor.inside & (floor.covered == 0), CELL_M)
+    told = must_push_shares(floor.inside & ~floor.fixed, {robot: floor.free(robot) for robot in ROBOTS}, CELL_M)
     if passages.miss() < LEAST_GAIN and all(low <= told[robot] <= high for robot, (low, high) in wanted.items()):
         return told
     got = ", ".join(f"must_push_{robot} is {list(wanted[robot])}, got {told[robot]:.2f}" for robot in wanted)

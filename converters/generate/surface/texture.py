@@ -7,12 +7,14 @@ texel knows its place in the building, and a floor board runs on across chart bo
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
 from scipy import ndimage, sparse
 
 from converters.generate.models.parts import MATERIALS
+from converters.generate.surface.finishes import Room, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
 
 PAD = 2
@@ -138,32 +140,6 @@ def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.nda
     return np.einsum("nk,nkd->nd", w, scan.vertices[scan.faces[ids]])
 
 
-def _hash(*keys: np.ndarray) -> np.ndarray:
-    """Integers to repeatable numbers in 0..1."""
-    value = np.zeros(keys[0].shape)
-    for i, k in enumerate(keys):
-        value = value + k * (12.9898 + 65.133 * i)
-    return np.mod(np.sin(value) * 43758.5453, 1.0)
-
-
-def _boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
-    """Wooden boards, 0.14 m wide, about 1.1 m long."""
-    across, length = p[:, 1 - along] / 0.14, p[:, along] / 1.1
-    row = np.floor(across)
-    board = np.floor(length + _hash(row))
-    tone = 0.86 + 0.26 * _hash(row, board)
-    grain = 1 + 0.04 * np.sin(40 * p[:, 1 - along] + 3 * np.sin(2.5 * p[:, along]))
-    joint = np.where(np.mod(across, 1) < 0.07, 0.8, 1.0)
-    return base * (tone * grain * joint)[:, None]
-
-
-def _tiles(p: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Square tiles of 0.3 m with grout."""
-    i, j = np.floor(p[:, 0] / 0.3), np.floor(p[:, 1] / 0.3)
-    grout = (np.mod(p[:, 0], 0.3) < 0.012) | (np.mod(p[:, 1], 0.3) < 0.012)
-    return base * (np.where(grout, 0.75, 0.96 + 0.06 * _hash(i, j)))[:, None]
-
-
 def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(n,) brightness: a lamp per room that falls off, shade by direction, darker in corners near the floor."""
     away = lamp - points
@@ -174,13 +150,14 @@ def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.ra
     return light * (1 + 0.03 * smooth_noise(points, 0.8, rng))
 
 
-def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np.ndarray, ids: np.ndarray,
+def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray, ids: np.ndarray,
           normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
     """Colours of points on the scan.
 
     Args:
         scan: the mesh; the nearest solid's material decides.
-        rooms: x0, y0, x1, y1 of each; each has its own wall paint and floor.
+        rooms: x0, y0, x1, y1 of each; each has its own walls and floor.
+        uses: of the rooms, as `finishes` takes them.
         points: (n, 3).
         ids: (n,) face of each point.
         normals: (m, 3) of faces.
@@ -199,25 +176,16 @@ def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np
     half = np.array([[(r[2] - r[0]) / 2, (r[3] - r[1]) / 2] for r in rooms])
     outside = np.stack([(np.abs(points[:, :2] - c) - h).max(axis=1) for c, h in zip(centres, half, strict=True)], 1)
     room = outside.argmin(axis=1)
-    paints = np.array(
-        [[0.90, 0.88, 0.83], [0.80, 0.86, 0.84], [0.88, 0.82, 0.76], [0.82, 0.84, 0.90], [0.93, 0.92, 0.90]]
-    )
-    woods = np.array([[0.66, 0.48, 0.31], [0.50, 0.36, 0.25], [0.76, 0.62, 0.45]])
-    wood = woods[rng.integers(len(woods))]
-    along = int(rng.integers(2))
-    tiled = rng.random(len(rooms)) < 0.25
-    paint_of = rng.integers(len(paints), size=len(rooms))
+    finish = finishes(rooms, uses, rng)
     cabinet = np.array(MATERIALS["white"] if rng.random() < 0.6 else MATERIALS["oak"])
     for m, name in enumerate(names):
         here = np.flatnonzero(material == m)
         p = points[here]
-        if name == "floor":
-            value = _boards(p, wood, along)
-            tile = tiled[room[here]]
-            value[tile] = _tiles(p[tile], np.array([0.72, 0.72, 0.70]))
-        elif name == "paint":
-            value = paints[paint_of[room[here]]].copy()
-            value[p[:, 2] < 0.09] = [0.95, 0.95, 0.94]
+        if name in ("floor", "paint"):
+            value = np.zeros((len(p), 3))
+            for k, of in enumerate(finish):
+                own = room[here] == k
+                value[own] = of.floor_colour(p[own]) if name == "floor" else of.wall_colour(p[own])
         elif name == "cabinet":
             seam = (np.mod(p[:, 0] + 0.003, 0.45) < 0.012) | (np.mod(p[:, 1] + 0.003, 0.45) < 0.012)
             value = cabinet * np.where(seam, 0.7, 1.0)[:, None]
@@ -231,13 +199,14 @@ def paint(scan: Scan, rooms: list[tuple[float, float, float, float]], points: np
     return np.clip(colour * light[:, None], 0, 1)
 
 
-def make_atlas(scan: Scan, rooms: list[tuple[float, float, float, float]], texels_per_m: float,
+def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m: float,
                rng: np.random.Generator) -> Atlas:  # fmt: skip
     """Unwraps and paints a scan.
 
     Args:
         scan: the mesh.
         rooms: x0, y0, x1, y1 of each.
+        uses: of the rooms, as `finishes` takes them.
         texels_per_m: wanted resolution.
         rng: random stream.
 
@@ -251,7 +220,7 @@ def make_atlas(scan: Scan, rooms: list[tuple[float, float, float, float]], texel
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     rows, columns = np.divmod(np.arange(side * side), side)
     points = texel_positions(uv, face_uv, scan, faces_at, np.stack([columns + 0.5, rows + 0.5], axis=1))
-    shade = paint(scan, rooms, points, faces_at, normals, rng)
+    shade = paint(scan, rooms, uses, points, faces_at, normals, rng)
     # Six bits a channel and no noise per texel: the PNG stays small.
     colour = np.round(np.round(shade * 63) * (255 / 63)).astype(np.uint8)
     return Atlas(uv / side, face_uv, colour.reshape(side, side, 3)[::-1])

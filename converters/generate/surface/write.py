@@ -68,8 +68,8 @@ def write_scan(folder: Path, scan: Scan, atlas: Atlas, floor_height_m: float) ->
     write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels)
 
 
-def write_cad(library: Path, model: CadModel) -> None:
-    """Writes `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL."""
+def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
+    """Writes `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL, with `pieces` its convex parts too."""
     folder = library / model.catid / model.id_cad / "models"
     folder.mkdir(parents=True, exist_ok=True)
     chunks, base = ["mtllib model_normalized.mtl\n"], 1
@@ -83,6 +83,16 @@ def write_cad(library: Path, model: CadModel) -> None:
         chunks.append(_rows("f %d %d %d\n", faces + base))
         base += len(part.vertices)
     _lines(folder / "model_normalized.obj", chunks)
+    if pieces:
+        first, solid = 1, []
+        for k, part in enumerate(model.parts):
+            solid += [
+                f"o part_{k}\n",
+                _rows("v %.6f %.6f %.6f\n", part.vertices),
+                _rows("f %d %d %d\n", part.faces + first),
+            ]
+            first += len(part.vertices)
+        _lines(folder / "collision.obj", solid)
     colours = [
         f"newmtl {name}\nKd {r:.4f} {g:.4f} {b:.4f}\nKs 0 0 0\nd 1\nillum 1\n"
         for name, (r, g, b) in MATERIALS.items()

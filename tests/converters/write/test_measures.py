@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from converters.bodies.objects import PlacedObject
 from converters.geometry.boxes import convex_hull
-from converters.geometry.density import ROBOT_RADIUS_M, Ways, clearance_m, must_push_shares
+from converters.geometry.density import ROBOTS, Disc, Ways, clearance_m, must_push_shares
 from converters.write.measures import measure_scene, navigation_complexity, shadow, specific_surface_1_m
 from interactive_nav.robots import get_robot
 from scenes_mjcf.schema import SceneMaps, load_manifest
@@ -40,20 +41,25 @@ def box_at(x: float, y: float, size: tuple[float, float, float]) -> PlacedObject
     )  # fmt: skip
 
 
-def test_radii_are_those_of_the_robots():
-    assert {name: get_robot(name).footprint_radius_m for name in ROBOT_RADIUS_M} == ROBOT_RADIUS_M
+def for_all(free):
+    return dict.fromkeys(ROBOTS, free)
+
+
+def test_discs_are_those_of_the_robots():
+    robots = [get_robot(name) for name in ROBOTS]
+    assert {r.name: Disc(r.footprint_radius_m, r.height_m) for r in robots} == ROBOTS
 
 
 def test_nothing_must_be_pushed_where_nothing_stands():
-    assert must_push_shares(two_rooms(), two_rooms(), CELL_M) == {"turtlebot": 0.0, "fetch": 0.0}
+    assert must_push_shares(two_rooms(), for_all(two_rooms()), CELL_M) == {"turtlebot": 0.0, "fetch": 0.0}
 
 
 def test_a_barred_opening_parts_the_pairs_of_two_rooms():
     static, free = two_rooms(), two_rooms()
     free[:, 40:42] = False
-    for robot, share in must_push_shares(static, free, CELL_M).items():
+    for robot, share in must_push_shares(static, for_all(free), CELL_M).items():
         # Cells along a wall that are too near to it for the disc's middle.
-        margin = math.ceil((ROBOT_RADIUS_M[robot] + CELL_M / 2) / CELL_M) - 1
+        margin = math.ceil((ROBOTS[robot].radius_m + CELL_M / 2) / CELL_M) - 1
         a, b = (40 - 2 * margin) ** 2, (40 - 2 * margin) * (20 - 2 * margin)
         assert share == pytest.approx(2 * a * b / (a + b) ** 2)
 
@@ -66,7 +72,7 @@ def test_pairs_that_walls_part_do_not_count():
 
 
 def test_a_gap_between_the_robots_widths_bars_the_larger_one_only():
-    shares = must_push_shares(two_rooms(gap=20), two_rooms(gap=10), CELL_M)
+    shares = must_push_shares(two_rooms(gap=20), for_all(two_rooms(gap=10)), CELL_M)
     assert shares["turtlebot"] == 0.0 and shares["fetch"] > 0.2
 
 
@@ -74,15 +80,17 @@ def test_a_gap_between_the_robots_widths_bars_the_larger_one_only():
 def test_shares_are_shares_and_a_full_floor_has_none(seed):
     rng = np.random.default_rng(seed)
     free = rng.random((40, 40)) < 0.97
-    for share in must_push_shares(np.ones_like(free), free, CELL_M).values():
+    for share in must_push_shares(np.ones_like(free), for_all(free), CELL_M).values():
         assert 0.0 <= share <= 1.0
-    assert set(must_push_shares(free & False, free, CELL_M).values()) == {0.0}
+    assert set(must_push_shares(free & False, for_all(free), CELL_M).values()) == {0.0}
 
 
 def test_the_shadow_of_a_box_is_its_rectangle():
     maps = SceneMaps(np.ones((40, 60), bool), CELL_M, (-1.0, -0.5), 0.0)
     below = shadow([box_at(0.0, 0.5, (0.4, 0.6, 0.3))], maps)
     assert below.sum() == 8 * 12 and below[14:26, 16:24].all()
+    lifted = dataclasses.replace(box_at(0.0, 0.5, (0.4, 0.6, 0.3)), position_w=np.array([0.0, 0.5, 0.5]))
+    assert shadow([lifted], maps, 0.6).sum() == 8 * 12 and not shadow([lifted], maps, 0.4).any()
 
 
 def test_a_cube_has_a_specific_surface_of_six_and_half_of_it_less():

@@ -303,7 +303,7 @@ def test_bad_settings_are_refused(room, settings, message):
 
 
 def test_unknown_robot_lists_the_known_ones(room):
-    with pytest.raises(ValueError, match="unknown robot 'turtlbot'; did you mean 'turtlebot'"):
+    with pytest.raises(ValueError, match="unknown robot 'turtlbot', did you mean 'turtlebot'"):
         interactive_nav.make("turtlbot", [room])
     with pytest.raises(ValueError, match="expected a list of scene folders"):
         interactive_nav.make("turtlebot", str(room))

@@ -9,6 +9,7 @@ import pytest
 
 from interactive_nav.robots import get_robot
 from interactive_nav.sensing.base import Lens
+from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rows import read_rows
 from tests.topological_nav.conftest import Made
@@ -69,7 +70,7 @@ class Recorded:
 @pytest.fixture(scope="module")
 def watched(contest):
     """One episode of runs of 2 s played with everything recorded; nowhere is near enough to the goal to end it."""
-    config = dataclasses.replace(CONFIG, episodes=1, batch=1, run_s=2.0, success_m=0.01, glance=False)
+    config = replace(CONFIG, episodes=1, batch=1, run_s=2.0, success_m=0.01, glance=False)
     (venue,) = contest_scenes(dataclasses.replace(contest, config=config))
     navigator = venue.navigator("dense")
     navigator.policy = Recorded(navigator.policy)

@@ -1,0 +1,186 @@
+"""A room's use in, the colours of its floor and walls out: boards, tiles, carpet, paint, wallpaper, rugs, pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+Room = tuple[float, float, float, float]
+"""x0, y0, x1, y1."""
+Colouring = Callable[[np.ndarray], np.ndarray]
+"""(n, 3) places in the building -> (n, 3) colours in 0..1."""
+
+PAINTS = np.array([[0.90, 0.88, 0.83], [0.80, 0.86, 0.84], [0.88, 0.82, 0.76], [0.82, 0.84, 0.90], [0.93, 0.92, 0.90]])
+WOODS = np.array([[0.66, 0.48, 0.31], [0.50, 0.36, 0.25], [0.76, 0.62, 0.45]])
+TILES = np.array([[0.72, 0.72, 0.70], [0.83, 0.81, 0.76], [0.46, 0.49, 0.52], [0.70, 0.58, 0.48]])
+GLAZES = np.array([[0.90, 0.92, 0.92], [0.70, 0.82, 0.84], [0.84, 0.88, 0.80], [0.88, 0.82, 0.74]])
+CARPETS = np.array([[0.62, 0.58, 0.52], [0.48, 0.50, 0.55], [0.66, 0.61, 0.58], [0.45, 0.50, 0.45]])
+RUGS = np.array([[0.55, 0.22, 0.20], [0.22, 0.32, 0.46], [0.72, 0.64, 0.50], [0.33, 0.40, 0.33]])
+FRAMES = np.array([[0.16, 0.15, 0.14], [0.45, 0.30, 0.19], [0.90, 0.90, 0.88]])
+SKIRTING_M = 0.09
+"""Height of the white board along the foot of painted walls."""
+WET = ("bathroom", "kitchen")
+SOFT = ("bedroom", "office")
+"""Uses whose floors are carpets half of the time."""
+WITH_RUG = ("living", "bedroom", "dining")
+
+
+@dataclasses.dataclass(frozen=True)
+class Finish:
+    """How one room is finished."""
+
+    floor_colour: Colouring
+    wall_colour: Colouring
+
+
+def hashed(*keys: np.ndarray) -> np.ndarray:
+    """Integers to repeatable numbers in 0..1."""
+    value = np.zeros(keys[0].shape)
+    for i, k in enumerate(keys):
+        value = value + k * (12.9898 + 65.133 * i)
+    return np.mod(np.sin(value) * 43758.5453, 1.0)
+
+
+def boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
+    """Wooden boards, 0.14 m wide, about 1.1 m long."""
+    across, length = p[:, 1 - along] / 0.14, p[:, along] / 1.1
+    row = np.floor(across)
+    board = np.floor(length + hashed(row))
+    tone = 0.86 + 0.26 * hashed(row, board)
+    grain = 1 + 0.04 * np.sin(40 * p[:, 1 - along] + 3 * np.sin(2.5 * p[:, along]))
+    joint = np.where(np.mod(across, 1) < 0.07, 0.8, 1.0)
+    return base * (tone * grain * joint)[:, None]
+
+
+def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False) -> np.ndarray:
+    """Square tiles with grout, over a plane's two coordinates."""
+    i, j = np.floor(u / side_m), np.floor(v / side_m)
+    grout = (np.mod(u, side_m) < 0.012) | (np.mod(v, side_m) < 0.012)
+    tone = np.where(grout, 0.75, 0.96 + 0.06 * hashed(i, j))
+    if chequered:
+        tone = tone * np.where(np.mod(i + j, 2) < 1, 1.0, 0.62)
+    return base * tone[:, None]
+
+
+def _rug(room: Room, colour: np.ndarray, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A woven rug near the room's middle, laid over what the floor is."""
+    size = np.array([room[2] - room[0], room[3] - room[1]])
+    half = np.minimum(rng.uniform(0.24, 0.36) * size, [1.5, 1.1])
+    middle = np.array([room[0] + room[2], room[1] + room[3]]) / 2 + rng.uniform(-0.1, 0.1, 2) * size
+    period = rng.uniform(0.18, 0.4)
+
+    def lay(p: np.ndarray, under: np.ndarray) -> np.ndarray:
+        inside = half - np.abs(p[:, :2] - middle)
+        edge = inside.min(axis=1)
+        weave = 0.94 + 0.1 * hashed(np.floor(p[:, 0] / 0.02), np.floor(p[:, 1] / 0.02))
+        woven = np.mod(np.abs(p[:, :2] - middle).sum(axis=1), period) < period / 3
+        tone = np.where((edge < 0.1) & (edge > 0.05), 1.45, np.where(woven, 1.2, 1.0)) * weave
+        return np.where((edge > 0)[:, None], np.clip(colour * tone[:, None], 0, 1), under)
+
+    return lay
+
+
+def _pictures(
+    room: Room, count: int, rng: np.random.Generator
+) -> list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray]]:
+    """Framed pictures: the wall's axis and place along it, middle and half size on it, and its frame's colour."""
+    hung = []
+    for _ in range(count):
+        axis = int(rng.integers(2))
+        wall = room[axis] if rng.random() < 0.5 else room[axis + 2]
+        low, high = room[1 - axis], room[3 - axis]
+        half = rng.uniform([0.2, 0.16], [0.45, 0.34])
+        if high - low < 2 * half[0] + 0.6:
+            continue
+        middle = np.array([rng.uniform(low + half[0] + 0.3, high - half[0] - 0.3), rng.uniform(1.45, 1.6)])
+        hung.append((axis, wall, middle, half, FRAMES[rng.integers(len(FRAMES))]))
+    return hung
+
+
+def _hang(p: np.ndarray, colour: np.ndarray, room: Room, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Paints pictures, each a horizon under a sky with a sun, over a wall's colours."""
+    for axis, wall, middle, half, frame in _pictures(room, count, rng):
+        sky, land = rng.uniform(0.45, 0.95, 3), rng.uniform(0.12, 0.7, 3)
+        sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
+        at = (p[:, [1 - axis, 2]] - middle) / half
+        on = (np.abs(p[:, axis] - wall) < 0.08) & (np.abs(at) < 1).all(axis=1)
+        rim = ((1 - np.abs(at)) * half < 0.035).any(axis=1)
+        hill = at[:, 1] < horizon + 0.15 * np.sin(5 * at[:, 0] + 9 * sun)
+        inner = np.where(hill[:, None], land, sky)
+        inner = np.where((np.hypot(at[:, 0] - sun, at[:, 1] - 0.5) < 0.16)[:, None], [0.96, 0.86, 0.55], inner)
+        colour = np.where(on[:, None], np.where(rim[:, None], frame, inner), colour)
+    return colour
+
+
+def _wall(room: Room, use: str, rng: np.random.Generator) -> Colouring:
+    """Paint or wallpaper over a skirting board; glazed tiles in wet rooms; pictures in dry ones."""
+    base, glaze = PAINTS[rng.integers(len(PAINTS))], GLAZES[rng.integers(len(GLAZES))]
+    tiled_to = {"bathroom": rng.choice([1.25, 2.0]), "kitchen": 1.45}.get(use, 0.0)
+    tiled_from = 0.85 if use == "kitchen" else 0.0
+    papered = use in ("bedroom", "living", "dining") and rng.random() < 0.4
+    stripe, accent = rng.uniform(0.08, 0.2), base * rng.uniform(0.82, 0.93, 3)
+    pictures = 0 if use in ("", "bathroom", "storage") else int(rng.integers(1, 4))
+    seed = int(rng.integers(2**31))
+
+    def colour(p: np.ndarray) -> np.ndarray:
+        out = np.tile(base, (len(p), 1))
+        along = np.where(np.minimum(np.abs(p[:, 0] - room[0]), np.abs(p[:, 0] - room[2])) < 0.1, p[:, 1], p[:, 0])
+        if papered:
+            out[np.mod(along, 2 * stripe) < stripe] = accent
+        tile = (p[:, 2] < tiled_to) & (p[:, 2] > tiled_from)
+        out[tile] = tiles(along[tile], p[tile, 2], glaze, 0.15)
+        if tiled_from or not tiled_to:
+            out[p[:, 2] < SKIRTING_M] = [0.95, 0.95, 0.94]
+        return _hang(p, out, room, pictures, np.random.default_rng(seed))
+
+    return colour
+
+
+def _floor(room: Room, use: str, wood: np.ndarray, along: int, rng: np.random.Generator) -> Colouring:
+    """Tiles in wet rooms, carpet in some bedrooms, boards elsewhere; a rug in some."""
+    tile, carpet = TILES[rng.integers(len(TILES))], CARPETS[rng.integers(len(CARPETS))]
+    side_m, chequered = rng.choice([0.2, 0.3, 0.45]), bool(rng.random() < 0.3)
+    soft = use in SOFT and rng.random() < 0.5
+    rug = _rug(room, RUGS[rng.integers(len(RUGS))], rng) if use in WITH_RUG and not soft else None
+
+    def colour(p: np.ndarray) -> np.ndarray:
+        if use in WET:
+            return tiles(p[:, 0], p[:, 1], tile, side_m, chequered)
+        if soft:
+            return carpet * (0.9 + 0.16 * hashed(np.floor(p[:, 0] / 0.015), np.floor(p[:, 1] / 0.015)))[:, None]
+        under = boards(p, wood, along)
+        return under if rug is None else rug(p, under)
+
+    return colour
+
+
+def finishes(rooms: Sequence[Room], uses: Sequence[str], rng: np.random.Generator) -> list[Finish]:
+    """How each room is finished.
+
+    Args:
+        rooms: x0, y0, x1, y1 of each.
+        uses: keys of `converters.generate.homes.rooms.USES`, one a room; none where the building has none: then paint
+            on all walls, boards on the floors, and tiles on a quarter of them.
+        rng: random stream.
+    """
+    wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))
+    if uses:
+        return [
+            Finish(_floor(room, use, wood, along, rng), _wall(room, use, rng))
+            for room, use in zip(rooms, uses, strict=True)
+        ]
+    tiled = rng.random(len(rooms)) < 0.25
+    paint_of = rng.integers(len(PAINTS), size=len(rooms))
+
+    def bare(k: int) -> Finish:
+        def floor(p: np.ndarray) -> np.ndarray:
+            return tiles(p[:, 0], p[:, 1], TILES[0], 0.3) if tiled[k] else boards(p, wood, along)
+
+        def wall(p: np.ndarray) -> np.ndarray:
+            return np.where((p[:, 2] < SKIRTING_M)[:, None], [0.95, 0.95, 0.94], PAINTS[paint_of[k]])
+
+        return Finish(floor, wall)
+
+    return [bare(k) for k in range(len(rooms))]
