@@ -39,7 +39,7 @@ LIMITS: dict[str, Limit] = {
     ),
     "start_goal": Limit("m", least=START_GOAL_M, meaning="farthest two cells in that piece, straight line"),
     "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
-    "hulls": Limit("count", most=400, meaning="hulls in all"),
+    "hulls": Limit("count", most=600, meaning="hulls in all"),
     "walls": Limit("count", most=200, meaning="wall boxes"),
 }
 

@@ -54,20 +54,26 @@ def hull_volume(points: np.ndarray) -> float:
         return 0.0
 
 
+def box_volume(points: np.ndarray) -> float:
+    """Of the box along the axes."""
+    return float(np.ptp(points, axis=0).prod())
+
+
 def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None) -> list[np.ndarray]:
     """Joins pairs of convex pieces, each time the pair whose common hull encloses least that neither does.
 
     Args:
         points: (n, 3) of each piece.
         most: pieces that may be left.
-        slack: joins go on below `most` while a common hull encloses at most this volume that neither piece does; None:
-            they do not.
+        slack: joins go on below `most` while a common box along the axes encloses at most this volume that neither
+            piece's does, and boxes decide throughout: what is joined then looks like a box, which collides in its
+            place; None: hulls decide, and `most` alone ends it.
     """
-    pieces = list(points)
-    volume = [hull_volume(p) for p in pieces]
+    pieces, size = list(points), hull_volume if slack is None else box_volume
+    volume = [size(p) for p in pieces]
 
     def cost(i: int, j: int) -> float:
-        return hull_volume(np.vstack([pieces[i], pieces[j]])) - volume[i] - volume[j]
+        return size(np.vstack([pieces[i], pieces[j]])) - volume[i] - volume[j]
 
     alive = set(range(len(pieces)))
     needed = len(alive) > most or slack is not None
@@ -78,7 +84,7 @@ def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None
             break
         joined = np.vstack([pieces[i], pieces[j]])
         pieces.append(joined[ConvexHull(joined).vertices])
-        volume.append(hull_volume(joined))
+        volume.append(size(joined))
         alive -= {i, j}
         costs = {pair: c for pair, c in costs.items() if not {i, j} & set(pair)}
         new = len(pieces) - 1

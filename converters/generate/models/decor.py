@@ -115,7 +115,7 @@ def plant_monstera(height=0.9) -> list[Part]:
 def plant_palm(height=1.5) -> list[Part]:
     """A trunk with a tuft of hanging fronds, in a basket."""
     parts = [
-        *turned((0, 0, 0), [(0.16, 0), (0.2, 0.16), (0.18, 0.3)], "wicker", 14),
+        *turned((0, 0, 0), [(0.2, 0), (0.23, 0.16), (0.19, 0.3)], "wicker", 14),
         pillar((0, 0.29, 0), 0.012, 0.16, "soil", 14),
     ]
     crown = (0.03, height - 0.35, 0.0)
@@ -144,7 +144,7 @@ def plant_fern(stand=0.5) -> list[Part]:
     """A bushy one on a stand of three legs."""
     parts = [
         bar(
-            (0.15 * math.cos(a), 0, 0.15 * math.sin(a)),
+            (0.18 * math.cos(a), 0, 0.18 * math.sin(a)),
             (0.1 * math.cos(a), stand + 0.06, 0.1 * math.sin(a)),
             0.013,
             "oak",
@@ -197,9 +197,12 @@ def lamp_uplighter(height=1.75, foot=0.15, metal="steel", shade="ceramic") -> li
     return parts
 
 
-def lamp_arc(height=1.7, reach=0.6, metal="chrome", stone="marble") -> list[Part]:
+def lamp_arc(height=1.7, reach=0.45, metal="chrome", stone="marble") -> list[Part]:
     """Bends over from a heavy foot."""
-    parts = [plate(rectangle(0, 0, 0.32, 0.4, 0.03), 0, 0.14, stone), pillar((0, 0.13, -0.12), 1.0, 0.014, metal, 8)]
+    parts = [
+        plate(rectangle(0, 0.03, 0.36, 0.46, 0.03), 0, 0.14, stone),
+        pillar((0, 0.13, -0.12), 1.0, 0.014, metal, 8),
+    ]
     arc = [
         (0, 1.12 + (height - 1.12) * math.sin(a), -0.12 + reach * (1 - math.cos(a)))
         for a in (0, 0.45, 0.9, 1.35, 1.75, 2.1)

@@ -38,6 +38,9 @@ from converters.generate.models.parts import (
     shell,
     turned,
 )  # fmt: skip
+from converters.geometry.boxes import convex_hull
+from converters.geometry.pieces import merge_pieces
+from converters.read.cad import MOST_OWN, OWN_SLACK
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 
 NEW = sorted(set(LIBRARY) - set(TRAIN_MODELS) - set(TEST_MODELS))
@@ -101,11 +104,12 @@ def solids(parts) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stance(name: str) -> tuple[float, float]:
-    """How far the centre of mass lies inside the edge of what the model stands on, and how high, m."""
-    parts = parts_m(name)
-    volume, centre = solids(parts)
+    """How far the centre of mass of what collides lies inside the edge of what it stands on, and how high, m."""
+    vertices = np.concatenate([p.vertices for p in parts_m(name)])
+    slack_m3 = OWN_SLACK * float(np.ptp(vertices, axis=0).prod())
+    joined = merge_pieces([p.vertices for p in parts_m(name)], MOST_OWN, slack_m3)
+    volume, centre = solids([convex_hull(points) for points in joined])
     x, y, z = (volume[:, None] * centre).sum(axis=0) / volume.sum()
-    vertices = np.concatenate([p.vertices for p in parts])
     ground = shapely.MultiPoint(vertices[vertices[:, 1] < 0.006][:, [0, 2]]).convex_hull
     assert isinstance(ground, shapely.Polygon)
     inside = ground.contains(shapely.Point(x, z))
