@@ -84,7 +84,7 @@ def test_the_topological_tables_are_those_of_their_rows(size, rows, table):
 
 @pytest.mark.parametrize(
     "name",
-    ["ahead1", "batch"]
+    ["ahead1", pytest.param("batch", marks=pytest.mark.heavy)]  # a minute of bootstrap over 8,000 episodes
     + [f"{which}{by}" for which in ("unadapted", "adapted") for by in ("", "-gl", "-policy", "-gl-policy")],
 )
 def test_the_further_topological_tables_are_those_of_their_rows(name):

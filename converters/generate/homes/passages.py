@@ -21,16 +21,21 @@ from converters.generate.homes.furnish import Home, clutter_category, settle
 from converters.generate.homes.groups import LIGHT, Group
 from converters.geometry.density import ROBOTS, Ways, clearance_m, must_push_shares
 
-MOST_MOVES = 160
+MOST_MOVES = 400
 """Moves tried."""
+MOST_IN_VAIN = 100
+"""Moves in a row that bring nothing, after which a plan is given up."""
 BEFORE_M = (0.15, 0.85)
 """From a doorway's middle to a piece that narrows it, along the way through."""
 PASSAGE_M = (0.15, 0.60)
 """Clearance in the middle of what is taken for a passage."""
 
 
-DOUBT_M = 0.02
-"""Radii this much smaller and larger are measured too: walls, hulls and maps come out a centimetre or two off."""
+FAR_M = 0.65
+"""Clearance beyond which more makes no difference."""
+DOUBT_M = (-0.02, 0.08)
+"""Radii this much smaller and larger are measured: a gap counts as barred where the smaller does not pass and as open
+where the larger does. Maps come out a centimetre or two off, and planners on a grid of 5 cm keep 6 to 8 cm away."""
 ROUND_M = 0.02
 """Between a piece put into a passage and what stands there."""
 LEAST_GAIN = 1e-4
@@ -57,22 +62,32 @@ class Passages:
         floor = home.floor
         static = floor.inside & ~floor.fixed
         self.ways = {
-            robot: [Ways.of(static, CELL_M, disc.radius_m + more) for more in (-DOUBT_M, DOUBT_M)]
-            for robot, disc in ROBOTS.items()
+            robot: [Ways.of(static, CELL_M, disc.radius_m + more) for more in DOUBT_M] for robot, disc in ROBOTS.items()
         }
-        self.shares = self.measure()
+        self.room_m = {robot: np.minimum(clearance_m(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
+        """Robot -> clearance of the floor as the furniture stands, up to `FAR_M`."""
+        self.shares = self.measure(self.room_m)
 
-    def measure(self) -> dict[str, Shares]:
-        """Robot -> shares of pairs between which it must push, as the furniture stands now."""
-        out = {}
-        for robot, ways in self.ways.items():
-            room_m = self.room_m(robot)
-            out[robot] = Shares(*(way.must_push_share(room_m) for way in ways))
+    def measure(self, room_m: dict[str, np.ndarray]) -> dict[str, Shares]:
+        """Robot -> shares of pairs between which it must push, given the clearance."""
+        return {
+            robot: Shares(*(way.must_push_share(room_m[robot]) for way in ways)) for robot, ways in self.ways.items()
+        }
+
+    def room_after(self, standing: list[Standing]) -> dict[str, np.ndarray]:
+        """`room_m` as the furniture stands now, where it stood as listed when that was measured."""
+        floor, reach = self.home.floor, math.ceil(FAR_M / CELL_M)
+        out = {robot: room_m.copy() for robot, room_m in self.room_m.items()}
+        gone, come = _changed(standing, floor.standing)
+        for piece in gone + come:
+            # What is farther than `FAR_M` from a piece does not feel it, nor what is farther than that from there.
+            near, around = (
+                tuple(slice(max(s.start - k * reach, 0), s.stop + k * reach) for s in piece.window) for k in (1, 2)
+            )
+            inner = tuple(slice(n.start - a.start, n.stop - a.start) for n, a in zip(near, around, strict=True))
+            for robot, room_m in out.items():
+                room_m[near] = np.minimum(clearance_m(floor.free(robot)[around], CELL_M), FAR_M)[inner]
         return out
-
-    def room_m(self, robot: str) -> np.ndarray:
-        """Clearance of the floor for a robot as the furniture stands now."""
-        return clearance_m(self.home.floor.free(robot), CELL_M)
 
     def miss(self, shares: dict[str, Shares] | None = None) -> float:
         """How far shares (those measured last) lie from what is asked for, summed."""
@@ -90,18 +105,17 @@ class Passages:
             change: changes the home; False where it could not.
         """
         floor, cfg = self.home.floor, self.home.cfg
-        shares, standing = self.shares, floor.standing
+        shares, standing, room_m = self.shares, floor.standing, self.room_m
         if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
-            self.shares = self.measure()
+            self.room_m = self.room_after(standing)
+            self.shares = self.measure(self.room_m)
             if self.miss() < self.miss(shares) - LEAST_GAIN:
                 return True
-        for piece in floor.standing:
-            if not any(piece is old for old in standing):
-                floor.cover(piece, -1)
-        for piece in standing:
-            if not any(piece is new for new in floor.standing):
-                floor.cover(piece, 1)
-        floor.standing, self.shares = standing, shares
+        gone, come = _changed(standing, floor.standing)
+        for pieces, by in ((come, -1), (gone, 1)):
+            for piece in pieces:
+                floor.cover(piece, by)
+        floor.standing, self.shares, self.room_m = standing, shares, room_m
         return False
 
     def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
@@ -114,7 +128,7 @@ class Passages:
             xy[d.axis] += (1 if side else -1) * (d.rect.size[d.axis] / 2 + rng.uniform(*BEFORE_M))
             xy[1 - d.axis] += rng.uniform(-0.5, 0.5)
             return xy, d.rooms[side]
-        room_m = self.room_m(sorted(self.ways)[rng.integers(len(self.ways))])
+        room_m = self.room_m[sorted(self.ways)[rng.integers(len(self.ways))]]
         # The ridge of the clearance: as far from what stands left as from what stands right.
         ridge = (room_m > PASSAGE_M[0]) & (room_m < PASSAGE_M[1]) & (floor.room >= 0)
         ridge &= _ridge(room_m)
@@ -124,6 +138,12 @@ class Passages:
         row, column = cells[rng.integers(len(cells))]
         xy = floor.low + (np.array([column, row]) + 0.5) * CELL_M + rng.uniform(-0.1, 0.1, 2)
         return xy, int(floor.room[row, column])
+
+
+def _changed(before: list[Standing], now: list[Standing]) -> tuple[list[Standing], list[Standing]]:
+    """Pieces that stood and no longer do, and those that did not and now do."""
+    was, stands = {id(s) for s in before}, {id(s) for s in now}
+    return [s for s in before if id(s) not in stands], [s for s in now if id(s) not in was]
 
 
 def _ridge(room_m: np.ndarray) -> np.ndarray:
@@ -148,8 +168,9 @@ def adjust(home: Home) -> dict[str, float]:
     """
     rng, passages = home.rng, Passages(home)
     wanted = home.cfg.must_push
+    in_vain = 0
     for _ in range(MOST_MOVES):
-        if passages.miss() < LEAST_GAIN:
+        if passages.miss() < LEAST_GAIN or in_vain == MOST_IN_VAIN:
             break
         shares = passages.shares
         too_low = any(shares[robot].least < low for robot, (low, _) in wanted.items())
@@ -158,12 +179,13 @@ def adjust(home: Home) -> dict[str, float]:
             _narrow(home, passages)
         else:
             _clear(home, passages)
+        in_vain = in_vain + 1 if passages.shares is shares else 0
     floor = home.floor
     told = must_push_shares(floor.inside & ~floor.fixed, {robot: floor.free(robot) for robot in ROBOTS}, CELL_M)
     if passages.miss() < LEAST_GAIN and all(low <= told[robot] <= high for robot, (low, high) in wanted.items()):
         return told
     got = ", ".join(f"must_push_{robot} is {list(wanted[robot])}, got {told[robot]:.2f}" for robot in wanted)
-    raise GenerationError(f"{got} after {MOST_MOVES} moves: ask for a wider range or another furniture_share")
+    raise GenerationError(f"{got} after up to {MOST_MOVES} moves: ask for a wider range or another furniture_share")
 
 
 def _narrow(home: Home, passages: Passages) -> None:
@@ -210,8 +232,9 @@ def _clear(home: Home, passages: Passages) -> None:
     rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
 
     def change() -> bool:
+        standing = floor.standing
         floor.remove(piece)
-        if passages.miss(passages.measure()) >= passages.miss() - LEAST_GAIN:
+        if passages.miss(passages.measure(passages.room_after(standing))) >= passages.miss() - LEAST_GAIN:
             return False
         any(settle(home, model.category, alone, room, home.narrow_m) for room in rooms)
         return True
