@@ -28,6 +28,8 @@ HOME_MODELS = {"train": HOME_TRAIN_MODELS, "test": HOME_TEST_MODELS}
 """Split -> CAD models of homes."""
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 _FIXED = ("models",)
+MOST_SEEDS, NEXT_SEED = 5, 1_000_000
+"""Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
 SPARSE = "sparse"
 """Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
 GENERATE, CONVERT, DRAW = 0.55, 0.35, 0.10
@@ -185,6 +187,17 @@ def load_recipes(path: Path) -> Recipes:
     return parse_recipes(data, str(path))
 
 
+def _generate(recipe: SceneRecipe, raw: Path, report: Report) -> None:
+    """The recipe's building; a home whose seed gives no plan that can be furnished so takes the next of its seeds."""
+    tries = MOST_SEEDS if isinstance(recipe.building, HomeConfig) else 1
+    for k in range(tries):
+        try:
+            return generate_building(raw, recipe.seed + k * NEXT_SEED, report, recipe.building)
+        except GenerationError:
+            if k == tries - 1:
+                raise
+
+
 def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report) -> list[str]:
     """Generates, converts and draws one scene; `folder` appears whole or not at all.
 
@@ -202,7 +215,7 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
         FileError: it cannot be written; an older one is untouched.
     """
     with part_folder(folder, overwrite=True) as work:
-        generate_building(work / "raw", recipe.seed, lambda s, share: report(s, GENERATE * share), recipe.building)
+        _generate(recipe, work / "raw", lambda s, share: report(s, GENERATE * share))
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
         made = work / folder.name
         result = convert(work / "raw", made, config, lambda s, share: report(s, GENERATE + CONVERT * share))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.locks import release, take_lock
+from interactive_nav_common.locks import is_locked, release, take_lock
 from interactive_nav_common.signals import signals_wait
 
 STALE_S = 1.0
@@ -116,10 +116,15 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
         overwrite: a folder that stands there may be replaced.
 
     Raises:
-        FileError: `target` is there and may not be replaced, or cannot be written.
+        FileError: `target` is there and may not be replaced, another process is about to put something there, or it
+            cannot be written.
     """
     if target.parent.is_dir():
         remove_stale(target)
+        pattern = re.compile(rf"\.{re.escape(target.name)}\.part-(\d+)-[0-9a-f]+")
+        others = [m[1] for p in target.parent.iterdir() if (m := pattern.fullmatch(p.name)) and is_locked(p)]
+        if others and not overwrite:
+            raise FileError(f"{target}: process {others[0]} is making it; wait for it or give another place")
     if target.exists() and not overwrite:
         raise FileError(f"{target}: exists already; give another place or add --overwrite")
     if target.exists() and not target.is_dir():

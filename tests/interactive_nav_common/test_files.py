@@ -172,6 +172,17 @@ def test_what_a_killed_writer_left_goes_and_what_runs_stays(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["made"]
 
 
+def test_a_second_writer_of_a_new_folder_is_told_at_once(tmp_path):
+    with part_folder(tmp_path / "made"):
+        with (
+            pytest.raises(FileError, match=rf"made: process {os.getpid()} is making it; wait for it or give"),
+            part_folder(tmp_path / "made"),
+        ):
+            pass
+        with part_folder(tmp_path / "made", overwrite=True), part_folder(tmp_path / "made.x"):
+            pass  # of two that replace one, the last stands; another name is another folder
+
+
 def test_files_of_killed_writers_go_and_those_of_running_ones_stay(tmp_path):
     path = tmp_path / "rows.txt"
     with whole_file(path) as running:

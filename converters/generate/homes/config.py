@@ -89,8 +89,8 @@ TIERS: dict[str, dict[str, Any]] = {
     "cluttered": {
         "furniture_share": 0.33,
         "clutter_per_10_m2": (4.0, 5.0),
-        "must_push_turtlebot": (0.12, 0.40),
-        "must_push_fetch": (0.28, 0.56),
+        "must_push_turtlebot": (0.08, 0.30),
+        "must_push_fetch": (0.22, 0.46),
     },
 }
 """Tier -> how it departs from the defaults. Shares that must be pushed: so that planners that never push arrive in the

@@ -15,7 +15,7 @@ from converters.generate.homes.furnish import WIDE_M, furnish_home
 from converters.generate.homes.passages import adjust
 from converters.generate.homes.rooms import home_plan
 
-MOST_PLANS = 10
+MOST_PLANS = 5
 """Plans furnished before giving up."""
 
 

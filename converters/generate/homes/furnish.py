@@ -226,7 +226,7 @@ def grow(home: Home) -> None:
                 break
             weights = np.array([w for _, w in groups])
             name = groups[rng.choice(len(groups), p=weights / weights.sum())][0]
-            if not try_group(home, name, room, home.narrow_m):
+            if not (try_group(home, name, room, WIDE_M) or try_group(home, name, room, home.narrow_m)):
                 tired.add((room, name))
             break
         else:
