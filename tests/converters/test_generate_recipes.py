@@ -104,6 +104,28 @@ def test_bad_recipes_are_named(change, message):
         parse_recipes(data, "x")
 
 
+def test_a_home_without_a_plan_takes_the_next_of_its_seeds(tmp_path, monkeypatch):
+    tried: list[int] = []
+
+    def generate(raw, seed, report, building):
+        tried.append(seed)
+        if len(tried) < given:
+            raise GenerationError(f"seed {seed}: no")
+
+    monkeypatch.setattr(recipes, "generate_building", generate)
+    (home,) = parse_recipes({"scenes": {"a": {"split": "train", "seed": 3, "tier": "furnished"}}}, "r").scenes
+    (plain,) = parse_recipes({"scenes": {"a": {"split": "train", "seed": 3}}}, "r").scenes
+    given = 3
+    recipes._generate(home, tmp_path, lambda stage, share: None)
+    assert tried == [3, 1_000_003, 2_000_003]
+    for recipe, count in ((home, 5), (plain, 1)):
+        given = 99
+        tried.clear()
+        with pytest.raises(GenerationError, match=f"seed {3 + (count - 1) * 1_000_000}: no"):
+            recipes._generate(recipe, tmp_path, lambda stage, share: None)
+        assert len(tried) == count
+
+
 def test_missing_and_unreadable_files_and_unknown_names(tmp_path, capsys):
     with pytest.raises(GenerationError, match="no such file"):
         load_recipes(tmp_path / "recipes.yaml")
@@ -112,7 +134,7 @@ def test_missing_and_unreadable_files_and_unknown_names(tmp_path, capsys):
     assert "not readable as YAML" in capsys.readouterr().err
     (tmp_path / "recipes.yaml").write_text(TINY)
     assert main(["generate-scenes", str(tmp_path), "--only", "hat"]) == 2
-    assert capsys.readouterr().err.strip() == "error: no recipe named 'hat', did you mean 'hut'?; known: hut"
+    assert capsys.readouterr().err.strip() == "error: no recipe named 'hat', did you mean 'hut'?; known: hut, shed"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recipes.yaml"]
 
 
