@@ -13,6 +13,8 @@ from converters.records.raw import Annotation, CadModel
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
 
 FOOT_M = 0.02
+ROUND_FILL = 0.9
+"""Outlines that fill less of their smallest box are round: that box then stands along the walls."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +105,8 @@ def place_object(
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     hulls = tuple(convex_hull(h.vertices * pose.scale - base) for h in hulls_cad)
     hulls = tuple(flatten_feet(h) for h in hulls)
+    # Exact pieces have exact boxes; coacd's hulls are rough, and stored scenes have theirs along the walls.
+    round_fill = 1.0 if cad.pieces is None else ROUND_FILL
     position = yaw_matrix(pose.yaw) @ base + pose.translation
     position[2] -= floor_height_m
     return PlacedObject(
@@ -113,7 +117,7 @@ def place_object(
         faces=cad.faces,
         face_colours=cad.face_colours,
         hulls_b=hulls,
-        boxes_b=tuple(fit_box(h, 0.0, walls_yaw - pose.yaw) for h in hulls),
+        boxes_b=tuple(fit_box(h, 0.0, walls_yaw - pose.yaw, round_fill) for h in hulls),
         position_w=position,
         quaternion_w=np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)]),
         hinge=_door_hinge(annotation, pose.scale, base, high - low) if annotation.category == "door" else None,

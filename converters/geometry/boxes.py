@@ -62,26 +62,29 @@ def convex_hull(points: np.ndarray) -> Hull:
     return Hull(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64))
 
 
-def upright_box(points: np.ndarray, prefer_yaw: float = 0.0) -> Box:
+def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> Box:
     """Smallest box with a vertical axis around (n, 3) points.
 
     Round things have no smallest direction: where the box along `prefer_yaw` is at most `PREFER_SLACK`
     larger in area it is taken, so that a round table's box stands square to the walls and not with a corner
-    in one.
+    in one. With `round_fill` only where the outline fills at most this share of its smallest box (a circle: 0.79): the
+    box of a long thing a degree off would stand out of it by a sixtieth of its length.
     """
-    outline = points[ConvexHull(points[:, :2]).vertices, :2]
+    shadow = ConvexHull(points[:, :2])
+    outline = points[shadow.vertices, :2]
     edges = np.roll(outline, -1, axis=0) - outline
     # The smallest rectangle around a convex polygon lies along one of its edges.
     angles = np.append(np.arctan2(edges[:, 1], edges[:, 0]), prefer_yaw) % (math.pi / 2)
     area = np.array([np.ptp(outline @ yaw_matrix(t)[:2, :2], axis=0).prod() for t in angles])
-    best = len(angles) - 1 if area[-1] <= PREFER_SLACK * area.min() else int(np.argmin(area))
+    prefer = area[-1] <= PREFER_SLACK * area.min() and shadow.volume <= round_fill * area.min() * (1 + 1e-9)
+    best = len(angles) - 1 if prefer else int(np.argmin(area))
     rotation = yaw_matrix(float(angles[best]))
     turned = points @ rotation
     low, high = turned.min(axis=0), turned.max(axis=0)
     return Box(rotation @ ((low + high) / 2), rotation, (high - low) / 2)
 
 
-def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0) -> Box:
+def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> Box:
     """Oriented box that stands for a hull where collisions are boxes, at least `MIN_THICKNESS_M` thick.
 
     The general smallest box of a slanted leg reaches below the leg's own foot and would lift the object off
@@ -94,8 +97,9 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0) -> Box:
         hull: body frame, m.
         lowest_m: height of the object's lowest point, body frame.
         prefer_yaw: direction of the walls in the body frame, rad.
+        round_fill: as `upright_box` has it.
     """
-    box = upright_box(hull.vertices, prefer_yaw)
+    box = upright_box(hull.vertices, prefer_yaw, round_fill)
     shadow = float(ConvexHull(hull.vertices[:, :2]).volume)  # scipy: `volume` of a planar hull is its area
     fill = shadow / max(float(4 * box.half[0] * box.half[1]), 1e-12)
     draw_in = max(math.sqrt(min(fill, 1.0)), MIN_DRAW_IN)

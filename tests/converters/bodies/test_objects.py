@@ -64,6 +64,18 @@ def test_a_round_top_stands_square_to_the_walls_and_is_drawn_in_to_its_area():
     assert box.half[2] == pytest.approx(0.025)
 
 
+def test_a_long_things_box_keeps_its_own_yaw_and_a_round_ones_the_walls():
+    angle = math.radians(1.0)
+    turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
+    long = np.array([(x, y, z) for x in (-0.8, 0.8) for y in (-0.2, 0.2) for z in (0, 0.4)]) @ turn.T
+    sides = np.arange(16) * math.tau / 16 + 0.1
+    disc = np.array([(math.cos(a), math.sin(a), z) for a in sides for z in (0, 1)])
+    np.testing.assert_allclose(upright_box(long, 0.0, 0.9).half, (0.8, 0.2, 0.2), atol=1e-9)
+    assert upright_box(long, 0.0).half[1] > 0.213  # along the walls it stands out
+    np.testing.assert_allclose(upright_box(disc, 0.3, 0.9).rotation, upright_box(disc, 0.3).rotation)
+    assert abs(upright_box(disc, 0.3, 0.9).rotation[0, 0]) == pytest.approx(math.cos(0.3))
+
+
 def test_a_box_fits_a_box_exactly():
     box = fit_box(convex_hull(box_points((0.6, 0.4, 0.2), (0.1, 0.2, 0.5))), 0.0)
     np.testing.assert_allclose(np.sort(box.half), [0.1, 0.2, 0.3], atol=1e-6)
