@@ -130,8 +130,7 @@ def _members(word: str) -> list[str] | None:
             what = f"{len(missing)} of {len(names)} scenes are missing (the first is '{missing[0]}')"
         if what:
             raise SceneError(
-                f"{word}: {what}; make them with "
-                f"'python -m converters generate-scenes {os.path.relpath(root)} --tier {scenes.tier}'"
+                f"{word}: {what}; make them with 'python -m converters generate-scenes {os.path.relpath(root)}'"
             )
         return [os.path.relpath(root / n) if Path.cwd() in (root / n).absolute().parents else str(root / n)
                 for n in names]  # fmt: skip

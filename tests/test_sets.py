@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from converters.__main__ import main
+from converters.generate.homes.config import TIERS
+from converters.recipes import load_recipes
 from scenes_mjcf.schema import SceneError, load_manifest
 from scenes_mjcf.sets import COMMITTED, Member, SceneSet, read_set, scene_digest, scene_folders, write_set
 
@@ -31,6 +34,33 @@ def test_the_sparse_set_is_the_ten(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(scene_folders(["sparse"])) == 10
 
 
+@pytest.mark.parametrize(("tier", "seed"), [("furnished", 520_000), ("cluttered", 510_000)])
+def test_a_committed_tier_lists_what_its_recipes_make(tier: str, seed: int) -> None:
+    folder = ROOT / "scenes_mjcf" / tier
+    listed, recipes = read_set(folder / "set.json"), load_recipes(folder / "recipes.yaml").scenes
+    assert listed.tier == tier and {r.tier for r in recipes} == {tier}
+    assert {r.name: (r.split, r.seed) for r in recipes} == {n: (m.split, m.seed) for n, m in listed.scenes.items()}
+    assert sorted(m.split for m in listed.scenes.values()) == ["test"] * 2 + ["train"] * 8
+    assert min(m.seed for m in listed.scenes.values()) == seed
+    digests = [m.digest for m in listed.scenes.values()]
+    assert len(set(digests)) == 10 and all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
+    wanted = TIERS[tier]
+    for name, member in listed.scenes.items():
+        assert set(member.measures["must_push_share"]) == {"turtlebot", "fetch"}
+        assert wanted.get("furniture_share", 0.30) - 0.12 < member.measures["movable_share"] < 0.4, name
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", ["furnished/furnished_008", "cluttered/cluttered_009"])
+def test_a_scene_of_a_tier_is_made_as_it_is_listed(tmp_path: Path, name: str) -> None:
+    tier, _, scene = name.partition("/")
+    recipes = ROOT / "scenes_mjcf" / tier / "recipes.yaml"
+    assert main(["generate-scenes", str(tmp_path), "--recipes", str(recipes), "--only", scene, "--jobs", "1"]) == 0
+    listed = read_set(recipes.with_name("set.json")).scenes[scene]
+    assert scene_digest(tmp_path / scene) == listed.digest
+    assert load_manifest(tmp_path / scene).measures == listed.measures
+
+
 def test_sets_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert scene_folders(["sparse/test"]) == tuple(str(ROOT / "scenes_mjcf" / name) for name in ("rowan", "willow"))
@@ -47,7 +77,7 @@ def test_own_sets_and_scenes_stand_side_by_side(own: Path, monkeypatch: pytest.M
 def test_what_is_missing_is_named_with_the_command(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(own)
     (own / "homes" / "three" / "scene.json").unlink()
-    with pytest.raises(SceneError, match="1 of 2 scenes .*'three'.*generate-scenes homes --tier furnished"):
+    with pytest.raises(SceneError, match="1 of 2 scenes .*'three'.*generate-scenes homes'"):
         scene_folders(["homes/train"])
     assert scene_folders(["homes/test"]) == ("homes/two",)
 
