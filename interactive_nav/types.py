@@ -14,6 +14,8 @@ EPISODE_METRICS = (
     *("objects_dropped", "off_distance", "lifted"),
 )
 """What an episode's last step reports, in the order of the columns of rows."""
+OF_OBJECTS = ("object_path_m", "object_contact_steps", "object_force_sum_n")
+"""Of `NavInfo`, what rows tell by category."""
 
 
 @flax.struct.dataclass
@@ -105,8 +107,10 @@ class NavInfo:
     """[] f32 l_0."""
     object_path_m: jax.Array
     """(M,) f32 l_i."""
-    touched: jax.Array
-    """(M,) bool: the robot has touched it."""
+    object_contact_steps: jax.Array
+    """(M,) i32 control steps in which the robot touched it."""
+    object_force_sum_n: jax.Array
+    """(M,) f32 sum over control steps of the largest net force, over substeps, on it."""
     force_sum_n: jax.Array
     """[] f32 sum of F_t."""
     interaction_steps: jax.Array

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -45,6 +46,8 @@ class World:
     """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
     names: tuple[tuple[str, ...], ...]
     """[S][M] body names, '' for an empty slot."""
+    categories: tuple[tuple[str, ...], ...]
+    """[S][M] categories of the same."""
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
@@ -71,16 +74,22 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
     return qpos
 
 
-def _taken_slots(scene: Scene, slots: list[tuple[str, str]]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """[M] whether a scene has something in each slot, and the names of what is there; empty ones are ''."""
+def _names_and_categories(
+    scene: Scene, small: Sequence[SmallObject], slots: list[tuple[str, str]]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """[M] names and categories of what a scene has in each slot; '' where it has nothing."""
     free, hinged = sorted_movables(scene)
     movables: dict[str, list[Movable]] = {"free": free, "hinge": hinged}
-    own, label = [], []
+    found = []
     for name, kind in slots:
-        index, source = int(name.rsplit("_", 1)[1]), movables.get(kind)
-        own.append(source is None or index < len(source))
-        label.append(name if source is None else source[index].name if index < len(source) else "")
-    return np.asarray(own, bool), tuple(label)
+        index = int(name.rsplit("_", 1)[1])
+        if kind == "small":
+            found.append((name, small[index].category))
+        else:
+            there = index < len(movables[kind])
+            found.append((movables[kind][index].name, movables[kind][index].category) if there else ("", ""))
+    names, categories = zip(*found, strict=True) if found else ((), ())
+    return names, categories
 
 
 def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) -> World:
@@ -110,14 +119,16 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         specs.append(spec)
         models.append(spec.compile())
     layout = find_layout(models[0], robot, slots)
-    occupied, mass, names, rest = [], [], [], []
+    occupied, mass, names, categories, rest = [], [], [], [], []
     for scene, model in zip(scenes, models, strict=True):
-        own, label = _taken_slots(scene, slots)
+        label, category = _names_and_categories(scene, small, slots)
+        own = np.array([name != "" for name in label], bool)
         qpos = _settle(model, layout, robot)
         if not np.isfinite(qpos).all():
             raise SceneError(f"{scene.path}: its furniture does not settle (non-finite); convert the scene again")
         occupied.append(own)
         names.append(label)
+        categories.append(category)
         mass.append(np.where(own, model.body_mass[layout.slot_body], 0.0))
         rest.append(qpos)
     return World(
@@ -132,4 +143,5 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         mass_kg=np.asarray(mass),
         occupied=np.asarray(occupied),
         names=tuple(names),
+        categories=tuple(categories),
     )

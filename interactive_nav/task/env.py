@@ -149,7 +149,7 @@ class InteractiveNav(Env):
         return self.observe(self._begin(start, rng))
 
     def _begin(self, start: EpisodeStart, rng: jax.Array) -> State:
-        physics = self._initial_physics(start)
+        physics = self.initial_physics(start)
         pos_w, rotation = self._robot_pose(physics)
         scene = start.scene_index
         goal = goal_field(self.tables, scene, start.goal_xy_w)
@@ -169,7 +169,8 @@ class InteractiveNav(Env):
             shortest_path_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
             robot_path_m=zero,
             object_path_m=jnp.zeros(slots),
-            touched=jnp.zeros(slots, bool),
+            object_contact_steps=jnp.zeros(slots, jnp.int32),
+            object_force_sum_n=jnp.zeros(slots),
             force_sum_n=zero,
             interaction_steps=count,
             structure_steps=count,
@@ -257,7 +258,8 @@ class InteractiveNav(Env):
             },
         )
 
-    def _initial_physics(self, start: EpisodeStart) -> PhysicsState:
+    def initial_physics(self, start: EpisodeStart) -> PhysicsState:
+        """The physics' state that a given episode begins with."""
         layout = self.world.layout
         qpos = self.tables.rest_qpos[start.scene_index]
         yaw, at = start.start_yaw_rad, layout.robot_qpos
@@ -309,7 +311,8 @@ class InteractiveNav(Env):
         objects = jnp.where(broken, nav.object_pos_w, self._object_positions(scene, physics))
         travelled = _moved(pos_w - nav.robot_pos_w)
         pushed = jnp.where(self.tables.mass_kg[scene, 1:] > 0, _moved(objects - nav.object_pos_w), 0.0)
-        touched = nav.touched | (~broken & (signals.slot_force_n > TOUCH_FORCE_N))
+        contact_steps = nav.object_contact_steps + (~broken & (signals.slot_force_n > TOUCH_FORCE_N))
+        touched = contact_steps > 0
         settled = nav.step_count >= SETTLE_STEPS
         counts = touched if self.config.rules.kinematic_sum == "touched" else touched | settled
         pushed = jnp.where(counts, pushed, 0.0)
@@ -326,7 +329,8 @@ class InteractiveNav(Env):
             geodesic_m=self._geodesic(scene, goal, pos_w),
             robot_path_m=nav.robot_path_m + travelled,
             object_path_m=nav.object_path_m + pushed,
-            touched=touched,
+            object_contact_steps=contact_steps,
+            object_force_sum_n=nav.object_force_sum_n + jnp.where(broken, 0.0, signals.slot_force_n),
             force_sum_n=nav.force_sum_n + jnp.where(broken, 0.0, signals.force_n),
             interaction_steps=nav.interaction_steps + ok * touches.astype(jnp.int32),
             structure_steps=nav.structure_steps + ok * hits_wall.astype(jnp.int32),

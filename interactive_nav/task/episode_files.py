@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
+from interactive_nav.navigation.ways import Ways
 from interactive_nav.scenes.scene import TASK_DIGEST
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
@@ -47,7 +48,8 @@ class EpisodeFile:
     and of their looks too."""
     episodes: tuple[dict[str, Any], ...]
     """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
-    that found no place) and shortest_path_m; metres and radians, world frame."""
+    that found no place), shortest_path_m, and, in newer files, push_needed: whether there is no way round everything
+    that can be moved; metres and radians, world frame."""
 
 
 class EpisodeFileError(UserError):
@@ -70,10 +72,11 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
     starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
     starts, lengths = jax.tree.map(np.asarray, (starts, lengths))
+    qpos, ways = np.asarray(jax.jit(jax.vmap(lambda start: env.initial_physics(start).qpos))(starts)), Ways(env, None)
     rows = []
     for i in range(episodes):
         small = [
-            [*map(float, xy), float(yaw)] if placed else None
+            [*map(_short_float, xy), _short_float(yaw)] if placed else None
             for xy, yaw, placed in zip(
                 starts.small_xy_w[i], starts.small_yaw_rad[i], starts.small_placed[i], strict=True
             )
@@ -81,11 +84,14 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
         rows.append(
             {
                 "scene": int(starts.scene_index[i]),
-                "start_xy_w": [float(v) for v in starts.start_xy_w[i]],
-                "start_yaw_rad": float(starts.start_yaw_rad[i]),
-                "goal_xy_w": [float(v) for v in starts.goal_xy_w[i]],
+                "start_xy_w": [_short_float(v) for v in starts.start_xy_w[i]],
+                "start_yaw_rad": _short_float(starts.start_yaw_rad[i]),
+                "goal_xy_w": [_short_float(v) for v in starts.goal_xy_w[i]],
                 "objects": small,
-                "shortest_path_m": float(lengths[i]),
+                "shortest_path_m": _short_float(lengths[i]),
+                "push_needed": not ways.exists(
+                    int(starts.scene_index[i]), qpos[i], starts.start_xy_w[i], starts.goal_xy_w[i]
+                ),
             }
         )
     return EpisodeFile(
@@ -96,6 +102,11 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
         objects_digest=_objects_digests(env)[0],
         episodes=tuple(rows),
     )
+
+
+def _short_float(value: Any) -> float:
+    """A 32-bit float by the fewest digits that tell it from its neighbours."""
+    return float(str(np.float32(value)))
 
 
 def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart, Any]:

@@ -54,7 +54,7 @@ def test_a_tier_makes_a_home_with_the_split_s_models():
     home = parse_recipes(data, "x").scenes[0].building
     assert isinstance(home, HomeConfig) and home.tier == "cluttered" and home.furniture_share == 0.33
     assert home.shell.n_rooms == (5, 5) and home.shell.models == HOME_TEST_MODELS
-    assert home.must_push == {"turtlebot": (0.35, 0.6)}
+    assert home.must_push == {"turtlebot": (0.08, 0.3)}
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from train import figures
 from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
 from train.scoring.row_files import paths_beside
+from train.scoring.rows import BY_CATEGORY
 from train.scoring.statistics import claims
 
 
@@ -250,8 +251,35 @@ def test_success_where_touching_is_needed_by_hand():
     learned = episodes_of("learned", [1.0, 0.0, 0.0, 1.0])  # the avoider never played the last one
     assert "| Fetch | 1 | 0.500 (2) | 0.000 (1) |" in tables.need_lines(pa.concat_tables([learned, avoider]))
     assert tables.need_lines(learned) == "" and tables.need_lines(pa.table({"policy": ["learned"]})) == ""
+    told = learned.append_column("push_needed", pa.array([True, False, None, True]))
+    assert "| Fetch | 1 | 0.000 (1) | 1.000 (2) |" in tables.need_lines(told)
     elsewhere = episodes_of("avoider", [1.0, 0.0], scene="willow")
     assert tables.need_lines(pa.concat_tables([learned, elsewhere])) == ""
+
+
+def test_what_was_moved_by_hand():
+    """Two episodes with 2 and 1 chairs: 1 of 3 touched, 0.6 m in all are 20 cm a chair; the shoe stands in one."""
+
+    def told(category, objects, touched, moved_m):
+        names = ("category", "objects", "touched", "contact_steps", "displacement_m", "force_sum_n")
+        return dict(zip(names, (category, objects, touched, 9, moved_m, 5.0), strict=True))
+
+    one, two = [told("chair", 2, 1, 0.5), told("coffee_table", 1, 0, 0.0)], [told("chair", 1, 0, 0.1)]
+    learned = episodes_of("learned", [1.0, 1.0], split="test").append_column(
+        "by_category", pa.array([one, two], BY_CATEGORY)
+    )
+    random = episodes_of("random", [1.0], split="train").append_column("by_category", pa.array([one], BY_CATEGORY))
+    rows = pa.concat_tables([random, learned])
+    assert tables.category_lines(rows, None).splitlines() == [
+        "| robot | category | k_int = 1 | random |",
+        "| --- | --- | --- | --- |",
+        "| Fetch | chair | 33.3%, 20.0 | 50.0%, 25.0 |",
+        "| Fetch | coffee table | 0.0%, 0.0 | 0.0%, 0.0 |",
+    ]
+    assert "random" not in tables.category_lines(rows, "test")
+    assert tables.category_lines(rows.drop_columns("by_category"), None) == ""
+    old = episodes_of("learned", [1.0], split="test").append_column("by_category", pa.nulls(1, BY_CATEGORY))
+    assert tables.category_lines(old, None) == ""
 
 
 def test_effort_without_walls_leaves_their_episodes_out():

@@ -39,6 +39,9 @@ class ToyNav:
     robot_pos_w: jax.Array
     yaw_rad: jax.Array
     object_pos_w: jax.Array
+    object_path_m: jax.Array
+    object_contact_steps: jax.Array
+    object_force_sum_n: jax.Array
     robot_path_m: jax.Array
     step_count: jax.Array
     velocity: jax.Array
@@ -53,7 +56,7 @@ class ToyEnv(Env):
         self.robot = get_robot("turtlebot")
         maps = SceneMaps(np.ones((80, 80), bool), 0.1, (-4.0, -4.0), 0.0)
         self.scenes = (SimpleNamespace(name="plane", split="train", maps=maps),)
-        self.world = SimpleNamespace(names=(("box_0",),))
+        self.world = SimpleNamespace(names=(("box_0",),), categories=(("box",),))
         self.furniture_map = lambda scene: np.zeros((80, 80), bool)
         self.nan_at_step = nan_at_step
 
@@ -108,6 +111,9 @@ class ToyEnv(Env):
             robot_pos_w=jnp.zeros(3),
             yaw_rad=2 * jnp.pi * yaw,
             object_pos_w=jnp.array([[3.0, 3.0, 0.0]]),
+            object_path_m=jnp.zeros(1),
+            object_contact_steps=jnp.zeros(1, jnp.int32),
+            object_force_sum_n=jnp.zeros(1),
             robot_path_m=jnp.zeros(()),
             step_count=jnp.zeros((), jnp.int32),
             velocity=jnp.zeros(2),

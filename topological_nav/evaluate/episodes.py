@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import label as components
 
+from interactive_nav.navigation.ways import PathGrid
 from interactive_nav.scenes.scene import Scene
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import SpaceError
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.space import FreeSpace
-from train.scoring.planners import PathGrid
 
 CONNECTED_M = 0.25
 """Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""

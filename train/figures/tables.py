@@ -17,6 +17,8 @@ from train.scoring.statistics import Finding, cells, claims, learned_rows, run_m
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
 NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
+MOVED = ("touched", "displacement_m")
+"""Of `by_category`, what is told for each object that was there."""
 
 
 def score_cells(rows: pa.Table) -> str:
@@ -68,12 +70,16 @@ def effort_lines(rows: pa.Table, split: str | None) -> str:
 
 
 def need_lines(rows: pa.Table) -> str:
-    """Success by whether the avoider, which touches nothing, reached the goal of the same episode; empty without it."""
+    """Success by whether the goal can be reached without touching anything: as the episodes' file says, or as the
+    avoider did; empty where neither is known."""
     names = ("policy", "robot", "scene", "episode", "k_int", "success")
     if not set(names) <= set(rows.column_names):
         return ""
     every = list(zip(*(rows[name].to_pylist() for name in names), strict=True))
     avoidable = {tuple(task): success > 0 for policy, *task, _, success in every if policy == "avoider"}
+    if "push_needed" in rows.column_names:
+        told = zip(every, rows["push_needed"].to_pylist(), strict=True)
+        avoidable |= {tuple(task): not needed for (_, *task, _, _), needed in told if needed is not None}
     found: dict[tuple[str, float], dict[bool, list[float]]] = {}
     for policy, *task, k_int, success in every:
         if policy == "learned" and tuple(task) in avoidable:
@@ -83,8 +89,40 @@ def need_lines(rows: pa.Table) -> str:
     for (robot, k_int), cell in sorted(found.items()):
         scores = [f"{np.mean(cell[free]):.3f} ({len(cell[free]):,})" if cell[free] else "-" for free in (True, False)]
         lines.append((style.robot_name(robot), f"{k_int:g}", *scores))
-    header = ("robot", "k_int", "success where the avoider arrived (episodes)", "where it did not")
+    header = ("robot", "k_int", "success where no push is needed (episodes)", "where one is")
     return markdown(header, lines) if lines else ""
+
+
+def category_lines(rows: pa.Table, split: str | None) -> str:
+    """How often and how far each policy moved things of each category; empty where rows do not tell."""
+    if "by_category" not in rows.column_names:
+        return ""
+    rows = rows.filter(pc.is_valid(rows["by_category"]))
+    rows = rows if split is None else rows.filter(pc.field("split") == split)
+    told = rows["by_category"].combine_chunks()
+    policy = [
+        name if name != "learned" else f"k_int = {k_int:g}"
+        for name, k_int in zip(rows["policy"].to_pylist(), rows["k_int"].to_pylist(), strict=True)
+    ]
+    of_row = pc.list_parent_indices(told)
+    entries = pa.Table.from_struct_array(pc.list_flatten(told))
+    entries = entries.append_column("robot", rows["robot"].combine_chunks().take(of_row))
+    entries = entries.append_column("of", pa.array(policy, pa.string()).take(of_row))
+    wanted = [(name, "sum") for name in ("objects", *MOVED)]
+    found = {
+        (entry["robot"], entry["category"], entry["of"]): entry
+        for entry in entries.group_by(["robot", "category", "of"]).aggregate(wanted).to_pylist()
+    }
+    policies = sorted({of for *_, of in found}, key=lambda of: (not of.startswith("k_int"), of))
+    lines = []
+    for robot, category in sorted({key[:2] for key in found}):
+        shown = []
+        for of in policies:
+            sums = found.get((robot, category, of), {})
+            share, moved_m = (sums[f"{name}_sum"] / sums["objects_sum"] if sums else None for name in MOVED)
+            shown.append("-" if share is None else f"{share:.1%}, {100 * moved_m:.1f}")
+        lines.append((style.robot_name(robot), category.replace("_", " "), *shown))
+    return markdown(("robot", "category", *policies), lines) if lines else ""
 
 
 def provenance(rows: pa.Table) -> str:
@@ -136,9 +174,17 @@ def document(rows: pa.Table, split: str | None) -> str:
     if need := need_lines(rows):
         parts += [
             "## Where touching is needed",
-            "All scenes and algorithms, the episodes that the avoider played too: it knows where everything stands and "
-            "touches nothing; where it does not arrive, it found no way wide enough.",
+            "All scenes and algorithms, the episodes of which it is known: their file says so, or the avoider played "
+            "them too. It knows where everything stands and touches nothing; where it does not arrive, it found no way "
+            "wide enough.",
             need,
+        ]
+    if moved := category_lines(rows, split):
+        parts += [
+            "## What was touched and moved",
+            "By category, over all algorithms: the share of the objects there that were touched in an episode, and how "
+            "far each of them was moved on average, in centimetres of its centre's path.",
+            moved,
         ]
     if known := yardsticks(rows):
         parts += ["## Policies that never learned", "Mean over episodes [95 % interval].", known]

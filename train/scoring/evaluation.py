@@ -153,7 +153,11 @@ def evaluate(
             constants["checkpoint_steps"] = meta.env_steps
         else:
             constants |= dict.fromkeys(OF_LEARNED)
-        tables.append(episode_table(played[name], env.scenes, constants))
+        table = episode_table(played[name], env.scenes, env.world.categories, constants)
+        if fixed:
+            needed = [row.get("push_needed") for row in fixed.episodes]
+            table = table.append_column("push_needed", pa.array(needed, pa.bool_()))
+        tables.append(table)
         note = f" ({policy.note})" if isinstance(policy, Planner) and policy.note else ""
         console.print(f"{name}: {asked.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
     return pa.concat_tables(tables), played

@@ -1,8 +1,8 @@
 """Planners that never learn: the scene's state in, wheel actions out, on the host, for many episodes at once.
 
 They bracket what any policy can reach (paper section IV): the avoider goes round every object, the NAMO-style
-planner (navigation among movable obstacles; Stilman and Kuffner 2005, paper section II-D) weighs pushing against
-detour. Both know the state exactly: where furniture, doors and small objects are, their mass and friction.
+planner weighs pushing against detour (`interactive_nav.navigation.ways`). Both know the state exactly: where
+furniture, doors and small objects are, their mass and friction.
 """
 
 from __future__ import annotations
@@ -11,24 +11,13 @@ import dataclasses
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
-import scipy.ndimage
-import scipy.sparse
-import scipy.sparse.csgraph
-import scipy.spatial
 
-from interactive_nav.geodesic import crossed_cells, largest_component, sampled_clearance
+from interactive_nav.navigation.ways import Ways
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
 from train.scoring.steering import velocity_towards
 
-CELL_M = 0.05
-MARGIN_M = 0.02
-"""Kept from objects beyond the robot's radius: what episodes begin with."""
-NEAR_M = 0.15
-"""Within this much more of structure or an object a way costs up to `NEAR_COST` times more: room to steer."""
-NEAR_COST = 2.0
 REPLAN_STEPS = 10
 """Control steps between two plans of an episode, where something has moved."""
 MOVED_M = 0.02
@@ -36,9 +25,6 @@ LOOK_AHEAD_M = 0.25
 CRUISE_M_S = 0.4
 ALIGNED_RAD = math.pi / 6
 """Beyond this bearing the planners turn on the spot."""
-FORCED_COST = 1e3
-"""Metres of detour that a metre through an object is worth at weight 1: it is pushed only where no way is free."""
-MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,157 +38,12 @@ class Plan:
     step: int
 
 
-class Footprints:
-    """Cells of a grid over which each movable body of a scene stands, below the robot's height."""
-
-    def __init__(self, model: mujoco.MjModel, bodies: np.ndarray, height_m: float, origin_w: Any, shape: Any):
-        self._model, self._data = model, mujoco.MjData(model)
-        self._bodies, self._height_m = bodies, height_m
-        self._origin, self._shape = np.asarray(origin_w, float), shape
-        self._geoms = [
-            [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_rbound[g] > 5e-3]
-            for body in bodies
-        ]
-        self._known: dict[Any, np.ndarray] = {}
-        self._corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
-
-    def cells(self, qpos: np.ndarray) -> list[np.ndarray]:
-        """Per body, the flat indices of the cells that it covers."""
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, self._data)
-        out = []
-        for k, geoms in enumerate(self._geoms):
-            pose = np.concatenate([self._data.xpos[self._bodies[k]], self._data.xmat[self._bodies[k]]])
-            key = (k, *np.round(pose * 200).astype(int).tolist())
-            if key not in self._known:
-                if len(self._known) > 20_000:
-                    self._known.clear()
-                self._known[key] = self._covered(geoms)
-            out.append(self._known[key])
-        return out
-
-    def _covered(self, geoms: list[int]) -> np.ndarray:
-        model, data = self._model, self._data
-        found = []
-        for g in geoms:
-            if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
-                mesh = model.geom_dataid[g]
-                first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-                local = model.mesh_vert[first : first + count]
-            else:
-                local = self._corners * model.geom_size[g]
-            points = data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T
-            if points[:, 2].min() > self._height_m:
-                continue
-            found.append(self._polygon(points[:, :2]))
-        return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
-
-    def _polygon(self, points: np.ndarray) -> np.ndarray:
-        """Cells whose middle lies in the convex hull of points [p, 2], or within half a cell of it."""
-        rows, columns = self._shape
-        at = (points - self._origin) / CELL_M
-        low = np.maximum(np.floor(at.min(0) - 1), 0).astype(int)
-        high = np.minimum(np.ceil(at.max(0) + 1), [columns, rows]).astype(int)
-        if (high <= low).any():
-            return np.zeros(0, np.int64)
-        hull = scipy.spatial.ConvexHull(at, qhull_options="QJ").equations
-        c, r = np.arange(low[0], high[0]), np.arange(low[1], high[1])
-        middle = np.stack(np.meshgrid(c + 0.5, r + 0.5, indexing="xy"), -1)
-        inside = (middle @ hull[:, :2].T + hull[:, 2] <= 0.5).all(-1)
-        rr, cc = np.nonzero(inside)
-        return (rr + low[1]) * columns + cc + low[0]
-
-
-class _SceneGrid:
-    """One scene's static map on the planners' grid, and its objects."""
-
-    def __init__(self, env: Any, index: int):
-        world, maps = env.world, env.scenes[index].maps
-        self.origin_w = np.asarray(maps.origin_w, float)
-        self.room_m = sampled_clearance(maps.traversable, maps.resolution_m, CELL_M)
-        self.shape = self.room_m.shape
-        self.free = largest_component(self.room_m >= env.robot.footprint_radius_m)
-        self.occupied = np.flatnonzero(world.occupied[index])
-        bodies = world.layout.slot_body[self.occupied]
-        model = world.models[index]
-        self.footprints = Footprints(model, bodies, env.robot.height_m, self.origin_w, self.shape)
-        self.mass_kg = world.mass_kg[index][self.occupied]
-        self.slides = np.array([world.layout.slot_kind[k] != "hinge" for k in self.occupied])
-        first = [model.body_geomadr[b] for b in bodies]
-        self.friction = model.geom_friction[first, 0]
-
-
-class PathGrid:
-    """Ways over one grid by Dijkstra over 16 moves; the graph is made once.
-
-    Args:
-        free: [rows, columns] bool.
-        cost: [rows, columns] at least 1, per metre.
-    """
-
-    def __init__(self, free: np.ndarray, cost: np.ndarray):
-        self._shape = rows, columns = free.shape
-        self._any = bool(free.any())
-        if not self._any:
-            return
-        _, self._nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
-        self._index = index = np.arange(rows * columns).reshape(rows, columns)
-        sources, targets, weights = [], [], []
-        for dr, dc in MOVES:
-            r0, r1, c0, c1 = 0, rows - dr, max(0, -dc), columns - max(0, dc)
-            a = (slice(r0, r1), slice(c0, c1))
-            b = (slice(dr, rows), slice(c0 + dc, c1 + dc))
-            ok = free[a] & free[b]
-            mean = 0.5 * (cost[a] + cost[b])
-            through = np.zeros(mean.shape)
-            # The two cells in the middle of a knight's move, the two beside a diagonal.
-            for mr, mc in set(crossed_cells((dr, dc))) - {(0, 0), (dr, dc)}:
-                m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
-                ok = ok & free[m]
-                through = through + cost[m]
-            if abs(dr) + abs(dc) == 3:
-                mean = 0.5 * mean + 0.25 * through
-            sources.append(index[a][ok])
-            targets.append(index[b][ok])
-            weights.append(CELL_M * math.hypot(dr, dc) * mean[ok])
-        self._graph = scipy.sparse.csr_matrix(
-            (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets))), shape=(rows * columns,) * 2
-        )
-
-    def path(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-        """The cheapest one between two cells.
-
-        Args:
-            start: (row, column), the nearest free cell stands for it.
-            goal: likewise.
-
-        Returns:
-            [p, 2] (row, column), both ends included; [0, 2] where there is none.
-        """
-        if not self._any:
-            return np.zeros((0, 2), np.int64)
-        begin, end = self._nearest[:, start[0], start[1]], self._nearest[:, goal[0], goal[1]]
-        source, target = self._index[begin[0], begin[1]], self._index[end[0], end[1]]
-        _, previous = scipy.sparse.csgraph.dijkstra(
-            self._graph, directed=False, indices=target, return_predecessors=True
-        )
-        path = [source]
-        while path[-1] != target:
-            if previous[path[-1]] < 0:
-                return np.zeros((0, 2), np.int64)
-            path.append(previous[path[-1]])
-        return np.stack(np.unravel_index(path, self._shape), -1)
-
-
 class Planner:
     """Plans and steers many episodes; the state in, actions out.
 
     Args:
         env: one environment, not batched.
-        weight: 0 takes the shortest way and pushes what stands in it; between 0 and 1, a metre through an object of
-            mass m and friction mu costs w / (1 - w) * mu m / m_0 metres of detour, its friction's work over the
-            robot's weight; 1 pushes only where no way is free. What the robot cannot push (friction above its own
-            weight) costs as much as at 1. None: the avoider, which never pushes.
+        weight: of `Ways`; 0 pushes what stands in the shortest way, None never pushes: the avoider.
 
     Raises:
         UserError: the robot takes no base velocity, or a weight outside [0, 1].
@@ -217,7 +58,7 @@ class Planner:
                 f"'{env.robot.control_mode}', expected one of its modes that does; leave them out of --policies"
             )
         self._env, self._weight = env, weight
-        self._grids = [_SceneGrid(env, i) for i in range(len(env.scenes))]
+        self._ways = Ways(env, weight)
         self._plans: dict[int, Plan] = {}
         self.no_path = 0
         """Plans that found no way."""
@@ -258,49 +99,10 @@ class Planner:
         return bool(moved or off)
 
     def _plan(self, scene: int, qpos, pos, goal, objects, step: int) -> Plan:
-        grid, radius = self._grids[scene], self._env.robot.footprint_radius_m
+        path = self._ways.way(scene, qpos, pos, goal)
         self.plans += 1
-        cost = np.ones(grid.shape)
-        free = grid.free
-        near = np.clip(1.0 - (grid.room_m - radius) / NEAR_M, 0.0, 1.0)
-        if self._weight != 0.0:
-            covered = np.zeros(grid.shape)  # metres of detour per metre through what stands here
-            blocked = np.zeros(grid.shape, bool)
-            share = 1.0 if self._weight is None else self._weight
-            for k, cells in enumerate(grid.footprints.cells(qpos)):
-                if len(cells):
-                    price = grid.mass_kg[k] * grid.friction[k] / self._env.world.robot_mass_kg
-                    stuck = grid.slides[k] and price > 1.0  # its friction exceeds the robot's weight
-                    price = FORCED_COST if stuck or share == 1.0 else min(share / (1.0 - share) * price, FORCED_COST)
-                    blocked.flat[cells] = True
-                    covered.flat[cells] = np.maximum(covered.flat[cells], price)
-            away, index = scipy.ndimage.distance_transform_edt(~blocked, return_indices=True)  # type: ignore[misc]
-            away_m = np.maximum(away - 0.5, 0.0) * CELL_M if blocked.any() else np.full(grid.shape, np.inf)
-            hits = away_m < radius + MARGIN_M
-            if self._weight is None:
-                free = free & ~hits
-            else:
-                cost = cost + np.where(hits, covered[index[0], index[1]], 0.0)
-            near = np.maximum(near, np.clip(1.0 - (away_m - radius - MARGIN_M) / NEAR_M, 0.0, 1.0) * ~hits)
-        cost = cost + NEAR_COST * near if self._weight != 0.0 else cost + 0.2 * near
-        start, end = self._cell(grid, pos), self._cell(grid, goal)
-        way = PathGrid(free, cost).path(start, end)
-        path = grid.origin_w + (way[:, ::-1] + 0.5) * CELL_M
-        # The nearest free cells stand for start and goal: a way between others than those is none.
-        far = len(path) and (
-            np.linalg.norm(path[-1] - goal) > self._env.success_distance_m or np.linalg.norm(path[0] - pos) > 0.3
-        )
-        if not len(path) or far:
-            self.no_path += 1
-            path = np.zeros((0, 2))
-        else:
-            path = np.concatenate([path, goal[None]]) if self._weight is not None else path
+        self.no_path += not len(path)
         return Plan(path, objects.copy(), step)
-
-    @staticmethod
-    def _cell(grid: _SceneGrid, xy: np.ndarray) -> tuple[int, int]:
-        c, r = np.floor((xy - grid.origin_w) / CELL_M).astype(int)
-        return int(np.clip(r, 0, grid.shape[0] - 1)), int(np.clip(c, 0, grid.shape[1] - 1))
 
     def _steer(self, path: np.ndarray, pos: np.ndarray, yaw: float) -> tuple[float, float]:
         """Linear (m/s) and angular (rad/s) velocity towards the point of the path a little ahead of the nearest."""

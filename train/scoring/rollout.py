@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav.types import OF_OBJECTS
 from train.scoring.planners import Planner
 from train.scoring.policies import PolicyFn
 
@@ -48,6 +49,8 @@ class Episodes:
     """[N] i32."""
     metrics: dict[str, np.ndarray]
     """name -> [N], the environment's metrics at the step that ended the episode."""
+    of_objects: dict[str, np.ndarray]
+    """name of `OF_OBJECTS` -> [N, M]."""
     paths: Paths
 
 
@@ -160,7 +163,7 @@ class Player:
         policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
         first = jax.tree.map(np.asarray, state.info["nav"])
         metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
-        object_end = first.object_pos_w.copy()
+        ends = {name: getattr(first, name).copy() for name in ("object_pos_w", *OF_OBJECTS)}
         tracks = [first.robot_pos_w[None, :record, :2]]
 
         episode_of = np.arange(size)  # episode played by each place in the batch
@@ -181,7 +184,8 @@ class Player:
             new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
             for name, values in final.items():
                 metrics[name][episode_of[new]] = np.asarray(values)[new]
-            object_end[episode_of[new]] = np.asarray(moved)[new]
+            for name, values in moved.items():
+                ends[name][episode_of[new]] = np.asarray(values)[new]
             finished[episode_of[new]] = True
             places = np.full((CHUNK_STEPS, record, 2), np.nan, np.float32)
             seen = episode_of < record
@@ -192,8 +196,9 @@ class Player:
             if self.env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
                 state = jax.tree.map(operator.itemgetter(running), state)
                 episode_of = episode_of[running]
-        paths = _paths(first, object_end, tracks, record)
-        return Episodes(first.scene_index[:count], {name: x[:count] for name, x in metrics.items()}, paths)
+        paths = _paths(first, ends.pop("object_pos_w"), tracks, record)
+        metrics, ends = ({name: x[:count] for name, x in values.items()} for values in (metrics, ends))
+        return Episodes(first.scene_index[:count], metrics, ends, paths)
 
     def _begin(self, keys: jax.Array, starts: Any, scene_index: np.ndarray | None) -> Any:
         """The first states of a batch; see `play`."""
@@ -233,6 +238,7 @@ def _joined(parts: list[Episodes]) -> Episodes:
     return Episodes(
         np.concatenate([part.scene_index for part in parts]),
         {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
+        {name: np.concatenate([part.of_objects[name] for part in parts]) for name in OF_OBJECTS},
         Paths(**{field.name: along(field.name) for field in dataclasses.fields(Paths)}),
     )
 
@@ -244,14 +250,22 @@ def _play_step(env: Any, carry: Any, action: jax.Array) -> tuple[Any, jax.Array]
     ends = (state.done > 0) & ~ended
     nav = state.info["nav"]
     final = {name: jnp.where(ends, state.metrics[name], value) for name, value in final.items()}
-    moved = jnp.where(ends[:, None, None], nav.object_pos_w, moved)
+    moved = {
+        name: jnp.where(ends.reshape(-1, *[1] * (old.ndim - 1)), getattr(nav, name), old) for name, old in moved.items()
+    }
     track = jnp.where(ended[:, None], jnp.nan, nav.robot_pos_w[:, :2])
     return (state, ended | ends, final, moved), track
 
 
+def _carry(state: Any, ended: jax.Array) -> Any:
+    """What `_play_step` hands on: the state, which episodes are over, and what they ended with."""
+    nav = state.info["nav"]
+    return state, ended, dict(state.metrics), {name: getattr(nav, name) for name in ("object_pos_w", *OF_OBJECTS)}
+
+
 def _play_planned(one_step: Any, planner: Any, state: Any, episode_of: np.ndarray, ended: jax.Array, step: int) -> Any:
     """`_play_chunk` for a planner on the host."""
-    carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
+    carry = _carry(state, ended)
     tracks = []
     for t in range(CHUNK_STEPS):
         running = ~np.asarray(carry[1])
@@ -268,7 +282,7 @@ def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: 
     """Steps all environments by `CHUNK_STEPS`.
 
     Returns:
-        state, ended [N], metrics at the end {name: [N]}, objects at the end [N, M, 3],
+        state, ended [N], metrics at the end {name: [N]}, what is told of objects at the end {name: [N, M, ...]},
         robot positions [T, N, 2] (NaN after the end).
     """
 
@@ -276,6 +290,5 @@ def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: 
         action = jax.vmap(policy)(carry[0].obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
         return _play_step(env, carry, action)
 
-    carry = (state, ended, dict(state.metrics), state.info["nav"].object_pos_w)
-    (state, ended, final, moved), track = jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))
+    (state, ended, final, moved), track = jax.lax.scan(one_step, _carry(state, ended), jnp.arange(CHUNK_STEPS))
     return state, ended, final, moved, track

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from rich.table import Table
 
+from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.statistics import RESAMPLES, mean_text
 
 if TYPE_CHECKING:
@@ -31,12 +33,32 @@ TYPES: dict[str, pa.DataType] = {
 """Of the constant columns, which are empty where they mean nothing (a yardstick has no seed)."""
 
 
-def episode_table(episodes: Episodes, scenes: Any, constants: dict[str, Any]) -> pa.Table:
+BY_CATEGORY = pa.list_(
+    pa.struct(
+        {
+            "category": pa.string(),
+            "objects": pa.int32(),
+            "touched": pa.int32(),
+            "contact_steps": pa.int32(),
+            "displacement_m": pa.float32(),
+            "force_sum_n": pa.float32(),
+        }
+    )
+)
+"""Of the column `by_category`: how many objects of each category that a scene has were there and were touched, and,
+summed over them, control steps in contact, path lengths of their centres of mass, and largest net forces of the
+steps."""
+
+
+def episode_table(
+    episodes: Episodes, scenes: Any, categories: Sequence[Sequence[str]], constants: dict[str, Any]
+) -> pa.Table:
     """One row an episode.
 
     Args:
         episodes: what was played.
         scenes: the environment's, with name and split.
+        categories: [S][M] of what is in each scene's slots, '' for nothing.
         constants: columns that are the same in every row; they come first.
     """
     count = len(episodes.scene_index)
@@ -46,7 +68,28 @@ def episode_table(episodes: Episodes, scenes: Any, constants: dict[str, Any]) ->
     columns["scene"] = [scenes[i].name for i in episodes.scene_index]
     columns["split"] = [scenes[i].split for i in episodes.scene_index]
     columns["episode"] = np.arange(count, dtype=np.int32)
-    return pa.table({**columns, **episodes.metrics})
+    columns |= episodes.metrics
+    told = [_by_category(episodes, i, categories[scene]) for i, scene in enumerate(episodes.scene_index)]
+    return pa.table({**columns, "by_category": pa.array(told, BY_CATEGORY)})
+
+
+def _by_category(episodes: Episodes, episode: int, categories: Sequence[str]) -> list[dict[str, Any]]:
+    """One episode's entries of `by_category`, in alphabetical order."""
+    path_m, steps, force_n = (episodes.of_objects[name][episode] for name in OF_OBJECTS)
+    rows = []
+    for category in sorted(set(categories) - {""}):
+        of = np.array([other == category for other in categories])
+        rows.append(
+            {
+                "category": category,
+                "objects": int(of.sum()),
+                "touched": int((steps[of] > 0).sum()),
+                "contact_steps": int(steps[of].sum()),
+                "displacement_m": float(path_m[of].sum()),
+                "force_sum_n": float(force_n[of].sum()),
+            }
+        )
+    return rows
 
 
 def score_table(rows: pa.Table, title: str) -> Table:

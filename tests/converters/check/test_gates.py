@@ -179,7 +179,7 @@ def test_a_simulation_that_mujoco_started_over_has_not_settled(tiny_scene, monke
         settle(tiny_scene[1].settled.parts)
 
 
-@pytest.mark.parametrize(("name", "value"), [("hulls_per_object", 17), ("hulls", 401), ("walls", 201)])
+@pytest.mark.parametrize(("name", "value"), [("hulls_per_object", 17), ("hulls", 601), ("walls", 201)])
 def test_the_counting_gates_fail_above_their_limits(name, value):
     assert not judge(name, value).passed
 

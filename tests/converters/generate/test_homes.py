@@ -1,4 +1,4 @@
-"""Furnished homes of three seeds: shares that are met, groups as people stand them, free ways; no scan is made here."""
+"""Furnished homes of two seeds: shares that are met, groups as people stand them, free ways; no scan is made here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY
 from scenes_mjcf.categories import CATEGORIES
 from tests.converters.generate.test_generate_plan import polygon, turned
 
-SEEDS = (1, 2, 3)
+SEEDS = (5, 6)
 FLAT = {"floor_area_m2": (55.0, 65.0), "n_rooms": (5, 5)}
 HAVE = {d.category for d in LIBRARY.values()}
 complete = pytest.mark.skipif("bed" not in HAVE, reason="no CAD models of beds yet")

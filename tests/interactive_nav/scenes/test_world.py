@@ -32,6 +32,8 @@ def test_slots_masses_and_names(world):
         "table_0",
         "door_0",
     )
+    small = tuple(o.category for o in world.small_objects)
+    assert world.categories == ((*small, "chair", "", ""), (*small, "chair", "table", "door"))
     np.testing.assert_allclose(world.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
     assert world.robot_mass_kg == pytest.approx(2.673)
     for model, rest in zip(world.models, world.rest_qpos, strict=True):

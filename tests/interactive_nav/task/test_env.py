@@ -180,7 +180,7 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
         for i in range(N):
             if not done_at[i]:
                 tracks[i].append(np.vstack([nav.robot_pos_w[i], nav.object_pos_w[i]]))
-                touched[i].append(np.asarray(nav.touched[i]))
+                touched[i].append(np.asarray(nav.object_contact_steps[i]) > 0)
                 forces[i].append(float(nav.force_sum_n[i]) - previous[i])
                 if state.done[i]:
                     done_at[i] = {k: float(v[i]) for k, v in state.metrics.items()}

@@ -69,8 +69,8 @@ def centres(model: mujoco.MjModel, bodies, qpos: np.ndarray) -> list[list[float]
     return [data.xipos[b].tolist() for b in bodies]
 
 
-def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[dict[str, float]]]:
-    """Scores and rewards of episode i; the room is convex, so distances to the goal are straight lines."""
+def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[dict[str, float]], dict[str, list]]:
+    """Scores, rewards and what is told of objects of episode i; in a convex room the goal is straight ahead."""
     bodies = [int(b) for b in layout.slot_body]
     masses = [float(model.body_mass[b]) for b in bodies]
     robot_kg = sum(float(model.body_mass[b]) for b in layout.robot_bodies)
@@ -80,6 +80,7 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
     gaps = [math.hypot(p[0] - goal[0], p[1] - goal[1]) for p in robot]
     robot_path, force_sum, paths = 0.0, 0.0, [0.0] * len(bodies)
     touched, rewards, interactions, structure, lifted = [False] * len(bodies), [], 0, 0, False
+    contact_steps, on_objects = [0] * len(bodies), [0.0] * len(bodies)
     success, steps = False, 0
     for t in range(STEPS):
         substeps = forces[t][i]
@@ -92,6 +93,8 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
         for k in range(len(bodies)):
             if t >= 5 or touched[k]:  # what settles untouched in the first half second was not moved
                 paths[k] += lengths[k + 1]
+        contact_steps = [n + a for n, a in zip(contact_steps, step_touch, strict=True)]
+        on_objects = [f + max(norm(s[k]) for s in substeps) for k, f in enumerate(on_objects)]
         force_sum += sum(norm(sum(s)) for s in substeps) / len(substeps)
         interactions += any(step_touch)
         structure += any(norm(s[-1]) > 1e-4 for s in substeps)
@@ -125,7 +128,8 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
         "lifted": lifted,
     }
     scores |= dict.fromkeys(("nonfinite", "overflow_steps", "left_out_steps", "objects_dropped", "off_distance"), 0.0)
-    return {name: float(value) for name, value in scores.items()}, rewards
+    of_objects = {"object_path_m": paths, "object_contact_steps": contact_steps, "object_force_sum_n": on_objects}
+    return {name: float(value) for name, value in scores.items()}, rewards, of_objects
 
 
 @pytest.fixture(scope="module")
@@ -137,13 +141,16 @@ def scored(played):
 @pytest.mark.parametrize("i", range(len(STARTS)))
 def test_every_score_and_reward(played, scored, i):
     _, _, _, states = played
-    want, rewards = scored[i]
+    want, rewards, of_objects = scored[i]
     assert {*want, "unconverged_steps"} == set(EPISODE_METRICS)
     steps = int(want["episode_steps"])
     last = states[steps]
     assert last.done[i] == 1 and all(s.done[i] == 0 for s in states[:steps])
     for name, value in want.items():
         assert float(last.metrics[name][i]) == pytest.approx(value, rel=1e-3, abs=2e-4), name
+    for name, values in of_objects.items():
+        got = np.asarray(getattr(last.info["nav"], name)[i])
+        np.testing.assert_allclose(got, values, rtol=1e-3, atol=2e-4, err_msg=name)
     for t, terms in enumerate(rewards, 1):
         for name, value in terms.items():
             got = float(states[t].metrics[f"reward/{name}"][i])

@@ -1,8 +1,7 @@
-"""Paths by hand on small grids; planners on real physics: who touches, who reports no way, who pushes what."""
+"""Planners on real physics: who touches, who reports no way, who pushes what."""
 
 from __future__ import annotations
 
-import math
 from typing import Any, cast
 
 import jax
@@ -14,38 +13,9 @@ import interactive_nav
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
-from train.scoring.planners import CELL_M, Footprints, PathGrid, Planner
+from train.scoring.planners import Planner
 from train.scoring.policies import make_yardstick
 from train.scoring.rollout import episode_keys, run_episodes
-
-
-def length(path):
-    return CELL_M * np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()
-
-
-def test_paths_by_hand():
-    free = np.ones((20, 30), bool)
-    ones = np.ones(free.shape)
-    grid = PathGrid(free, ones)
-    straight = grid.path((5, 2), (5, 22))
-    assert length(straight) == pytest.approx(1.0) and tuple(straight[0]) == (5, 2) and tuple(straight[-1]) == (5, 22)
-    # A knight's move each: 10 of (1, 2).
-    assert length(grid.path((2, 2), (12, 22))) == pytest.approx(10 * CELL_M * math.sqrt(5))
-    free[:19, 15] = False  # a wall with a gap on row 19 only
-    path = PathGrid(free, ones).path((5, 2), (5, 28))
-    assert (path[path[:, 1] == 15][:, 0] == 19).all() and (path[:, 1] == 15).any()
-    free[19, 15] = False
-    assert len(PathGrid(free, ones).path((5, 2), (5, 28))) == 0
-    assert len(PathGrid(np.zeros((4, 4), bool), np.ones((4, 4))).path((0, 0), (3, 3))) == 0
-
-
-def test_a_dear_cell_is_gone_round_only_if_that_is_shorter():
-    free, cost = np.ones((21, 21), bool), np.ones((21, 21))
-    cost[5:16, 10] = 1.5  # 0.05 m through at half as much again costs 0.025 m: cheaper than round
-    assert (PathGrid(free, cost).path((10, 2), (10, 18))[:, 0] == 10).all()
-    cost[5:16, 10] = 60.0
-    path = PathGrid(free, cost).path((10, 2), (10, 18))
-    assert abs(path[path[:, 1] == 10][:, 0] - 10).min() >= 5
 
 
 @pytest.fixture(scope="module")
@@ -101,21 +71,6 @@ def test_weight_0_pushes_and_a_large_weight_goes_round(played):
     assert careful.metrics["effort_efficiency"][1] > follower.metrics["effort_efficiency"][1]
     # Where no way is free it pushes all the same.
     assert careful.metrics["interaction_steps"][0] > 3 and careful.metrics["success"][0] == 1
-
-
-def test_footprints_cover_the_cube_below_the_robot_only(env):
-    world = env.world
-    model = world.models[1]
-    slot = int(np.flatnonzero(world.occupied[1])[0])
-    prints = Footprints(model, world.layout.slot_body[[slot]], 0.41, (-2.5, -2.0), (80, 100))
-    qpos = world.rest_qpos[1].copy()
-    (cells,) = prints.cells(qpos)
-    r, c = np.unravel_index(cells, (80, 100))
-    assert 64 <= len(cells) <= 100  # 8 x 8 cells of the 0.4 m cube, and a rim of half a cell
-    assert -2.5 + (c.mean() + 0.5) * 0.05 == pytest.approx(0.0, abs=0.03)
-    assert -2.0 + (r.mean() + 0.5) * 0.05 == pytest.approx(0.0, abs=0.03)
-    qpos[world.layout.slot_qpos[slot] + 2] += 1.0
-    assert len(prints.cells(qpos)[0]) == 0
 
 
 def test_names_and_weights_are_checked(env):

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from interactive_nav_common.errors import FileError
@@ -133,13 +132,27 @@ def test_bootstrap_interval_is_near_the_normal_one():
 
 def test_rows_and_file(tmp_path):
     paths = rollout.Paths(*(np.zeros(0) for _ in range(6)))
-    played = rollout.Episodes(np.array([1, 0]), {"success": np.array([1.0, 0.0], np.float32)}, paths)
+    of_objects = {
+        "object_path_m": np.array([[0.5, 0.0, 0.25, 0.0], [0.0] * 4], np.float32),
+        "object_contact_steps": np.array([[3, 0, 2, 0], [0] * 4]),
+        "object_force_sum_n": np.array([[8.0, 0.0, 4.0, 0.0], [0.0] * 4], np.float32),
+    }
+    played = rollout.Episodes(np.array([1, 0]), {"success": np.array([1.0, 0.0], np.float32)}, of_objects, paths)
     scenes = (SimpleNamespace(name="a", split="train"), SimpleNamespace(name="b", split="test"))
-    table = episode_table(played, scenes, {"run": "r", "k_int": 0.1})
+    categories = (("toy", "", "chair", ""), ("toy", "chair", "chair", ""))
+    table = episode_table(played, scenes, categories, {"run": "r", "k_int": 0.1})
     write_parquet(table, tmp_path / "deep" / "rows.parquet")
-    assert pq.read_table(tmp_path / "deep" / "rows.parquet").to_pylist() == [
-        {"run": "r", "k_int": 0.1, "scene": "b", "split": "test", "episode": 0, "success": 1.0},
-        {"run": "r", "k_int": 0.1, "scene": "a", "split": "train", "episode": 1, "success": 0.0},
+
+    def entry(category, *values):
+        names = ("objects", "touched", "contact_steps", "displacement_m", "force_sum_n")
+        return {"category": category, **dict(zip(names, values, strict=True))}
+
+    moved = [entry("chair", 2, 1, 2, 0.25, 4.0), entry("toy", 1, 1, 3, 0.5, 8.0)]
+    still = [entry("chair", 1, 0, 0, 0.0, 0.0), entry("toy", 1, 0, 0, 0.0, 0.0)]
+    row = {"run": "r", "k_int": 0.1}
+    assert read_rows([tmp_path / "deep" / "rows.parquet"]).to_pylist() == [
+        {**row, "scene": "b", "split": "test", "episode": 0, "success": 1.0, "by_category": moved},
+        {**row, "scene": "a", "split": "train", "episode": 1, "success": 0.0, "by_category": still},
     ]
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="cannot be written"):
