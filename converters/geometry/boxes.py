@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -17,9 +18,23 @@ MIN_THICKNESS_M = 0.01
 
 PREFER_SLACK = 1.15
 
+NOISE_DIGITS = 9
+"""Decimals beyond which numbers differ by how a processor rounds."""
+TIE_DIGITS = 6
+"""Decimals to which two boxes that are as good are equal."""
 
 MIN_DRAW_IN = 0.85
 """Least horizontal factor on an upright box; a circle's is sqrt(pi / 4) = 0.886."""
+
+
+AXES = np.array(
+    [
+        np.eye(3)[list(order)] * signs
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    ]
+)
+"""(48, 3, 3) all ways to name and direct three axes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +60,10 @@ class Box:
 
 
 def convex_hull(points: np.ndarray) -> Hull:
-    """Convex hull of a point cloud; one without volume is first thickened to `MIN_THICKNESS_M` across."""
+    """Convex hull of a point cloud; one without volume is first thickened to `MIN_THICKNESS_M` across.
+
+    Points are rounded to a nanometre, so that processors that round differently give the same vertices and faces.
+    """
     points = np.asarray(points, float)
     centre = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - centre, full_matrices=True)
@@ -58,7 +76,8 @@ def convex_hull(points: np.ndarray) -> Hull:
         middle = (along[:, k].min() + along[:, k].max()) / 2
         half = len(along) // 2
         along[:half, k], along[half:, k] = middle - MIN_THICKNESS_M / 2, middle + MIN_THICKNESS_M / 2
-    hull = trimesh.convex.convex_hull(along @ axes + centre)
+    # Which facets are coplanar is a matter of the last digits: they go first.
+    hull = trimesh.convex.convex_hull(np.round(along @ axes + centre if thin.any() else points, NOISE_DIGITS))
     return Hull(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64))
 
 
@@ -75,13 +94,25 @@ def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float =
     edges = np.roll(outline, -1, axis=0) - outline
     # The smallest rectangle around a convex polygon lies along one of its edges.
     angles = np.append(np.arctan2(edges[:, 1], edges[:, 0]), prefer_yaw) % (math.pi / 2)
+    angles[angles > math.pi / 2 - 10.0**-NOISE_DIGITS] = 0.0
     area = np.array([np.ptp(outline @ yaw_matrix(t)[:2, :2], axis=0).prod() for t in angles])
     prefer = area[-1] <= PREFER_SLACK * area.min() and shadow.volume <= round_fill * area.min() * (1 + 1e-9)
-    best = len(angles) - 1 if prefer else int(np.argmin(area))
+    # Of several as small, the one that turns least: which of them is a rounding smaller depends on the processor.
+    tied = area <= area.min() * (1 + 10.0**-TIE_DIGITS)
+    best = len(angles) - 1 if prefer else int(np.lexsort((np.round(angles, TIE_DIGITS), ~tied))[0])
     rotation = yaw_matrix(float(angles[best]))
     turned = points @ rotation
     low, high = turned.min(axis=0), turned.max(axis=0)
     return Box(rotation @ ((low + high) / 2), rotation, (high - low) / 2)
+
+
+def _least_turned(box: Box) -> Box:
+    """The same box with its axes named and directed so that it is turned least."""
+    turns = np.einsum("ij,pjk->pik", box.rotation, AXES)
+    turns = turns[np.linalg.det(turns) > 0]
+    order = np.lexsort(np.round([*turns.reshape(-1, 9).T, -np.trace(turns, axis1=1, axis2=2)], TIE_DIGITS))
+    rotation = turns[order[0]]
+    return Box(box.centre, rotation, np.abs(rotation.T @ box.rotation) @ box.half)
 
 
 def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> Box:
@@ -105,11 +136,9 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: fl
     draw_in = max(math.sqrt(min(fill, 1.0)), MIN_DRAW_IN)
     upright = dataclasses.replace(box, half=box.half * [draw_in, draw_in, 1.0])
     to_origin, size = trimesh.bounds.oriented_bounds(hull.vertices, angle_digits=2)
-    rotation = to_origin[:3, :3].T
-    if np.linalg.det(rotation) < 0:
-        rotation = rotation * [1.0, 1.0, -1.0]
-    tilted = Box(-to_origin[:3, :3].T @ to_origin[:3, 3], rotation, np.asarray(size) / 2)
-    foot = tilted.centre[2] - np.abs(rotation[2]) @ tilted.half
+    centre = -to_origin[:3, :3].T @ to_origin[:3, 3]
+    tilted = _least_turned(Box(centre, to_origin[:3, :3].T, np.asarray(size) / 2))
+    foot = tilted.centre[2] - np.abs(tilted.rotation[2]) @ tilted.half
     better = np.prod(tilted.half) < 0.9 * np.prod(upright.half) and foot >= lowest_m + 0.002
     chosen = tilted if better else upright
     return dataclasses.replace(chosen, half=np.maximum(chosen.half, MIN_THICKNESS_M / 2))

@@ -118,9 +118,11 @@ def category_lines(rows: pa.Table, split: str | None) -> str:
     for robot, category in sorted({key[:2] for key in found}):
         shown = []
         for of in policies:
-            sums = found.get((robot, category, of), {})
-            share, moved_m = (sums[f"{name}_sum"] / sums["objects_sum"] if sums else None for name in MOVED)
-            shown.append("-" if share is None else f"{share:.1%}, {100 * moved_m:.1f}")
+            if sums := found.get((robot, category, of)):
+                share, moved_m = (sums[f"{name}_sum"] / sums["objects_sum"] for name in MOVED)
+                shown.append(f"{share:.1%}, {100 * moved_m:.1f}")
+            else:
+                shown.append("-")
         lines.append((style.robot_name(robot), category.replace("_", " "), *shown))
     return markdown(("robot", "category", *policies), lines) if lines else ""
 

@@ -69,7 +69,7 @@ def episode_table(
     columns["split"] = [scenes[i].split for i in episodes.scene_index]
     columns["episode"] = np.arange(count, dtype=np.int32)
     columns |= episodes.metrics
-    told = [_by_category(episodes, i, categories[scene]) for i, scene in enumerate(episodes.scene_index)]
+    told = [_by_category(episodes, i, categories[int(scene)]) for i, scene in enumerate(episodes.scene_index)]
     return pa.table({**columns, "by_category": pa.array(told, BY_CATEGORY)})
 
 

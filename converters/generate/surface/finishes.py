@@ -109,7 +109,8 @@ def _hang(p: np.ndarray, colour: np.ndarray, room: Room, count: int, rng: np.ran
         rim = ((1 - np.abs(at)) * half < 0.035).any(axis=1)
         hill = at[:, 1] < horizon + 0.15 * np.sin(5 * at[:, 0] + 9 * sun)
         inner = np.where(hill[:, None], land, sky)
-        inner = np.where((np.hypot(at[:, 0] - sun, at[:, 1] - 0.5) < 0.16)[:, None], [0.96, 0.86, 0.55], inner)
+        shines = np.hypot(at[:, [0]] - sun, at[:, [1]] - 0.5) < 0.16
+        inner = np.where(shines, [0.96, 0.86, 0.55], inner)
         colour = np.where(on[:, None], np.where(rim[:, None], frame, inner), colour)
     return colour
 

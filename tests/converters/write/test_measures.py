@@ -41,7 +41,7 @@ def box_at(x: float, y: float, size: tuple[float, float, float]) -> PlacedObject
     )  # fmt: skip
 
 
-def for_all(free):
+def for_all(free: np.ndarray) -> dict[str, np.ndarray]:
     return dict.fromkeys(ROBOTS, free)
 
 

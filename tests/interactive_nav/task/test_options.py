@@ -18,7 +18,7 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
-from scenes_mjcf.categories import SEGMENTATIONS
+from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
 from tests.toys import write_room
 
 N = 3
@@ -325,7 +325,8 @@ def test_unchecked_goals_may_lie_under_furniture_and_objects_may_face_alike(push
 def test_desks_are_tables_in_the_mask_unless_five_classes_are_asked_for(tmp_path):
     blocks = (("desk", 0.8, 0.5, 9.0, 0.5), ("table", 0.8, -0.5, 9.0, 0.5))
     scene = write_room(tmp_path / "desks", (4.0, 3.0), blocks)
-    for classes, ids in ((4, {0, 4}), (5, {0, 4, 11}), ("all", {0, 3, 6})):
+    found: tuple[tuple[MaskClasses, set[int]], ...] = ((4, {0, 4}), (5, {0, 4, 11}), ("all", {0, 3, 6}))
+    for classes, ids in found:
         env = make(scene, observations=("segmentation",), segmentation_classes=classes, image_size=20)
         state = jax.jit(jax.vmap(env.reset_to))(start(), jax.random.split(jax.random.PRNGKey(0), N))
         mask = np.asarray(state.obs["pixels/segmentation"])[0, ..., 0] * SEGMENTATIONS[classes].divisor
