@@ -76,8 +76,9 @@ def convex_hull(points: np.ndarray) -> Hull:
         middle = (along[:, k].min() + along[:, k].max()) / 2
         half = len(along) // 2
         along[:half, k], along[half:, k] = middle - MIN_THICKNESS_M / 2, middle + MIN_THICKNESS_M / 2
-    # Which facets are coplanar is a matter of the last digits: they go first.
-    hull = trimesh.convex.convex_hull(np.round(along @ axes + centre if thin.any() else points, NOISE_DIGITS))
+    # Which facets are coplanar is a matter of the last digits and of the points' order: both go first.
+    points = np.unique(np.round(along @ axes + centre if thin.any() else points, NOISE_DIGITS), axis=0)
+    hull = trimesh.convex.convex_hull(points)
     return Hull(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64))
 
 
@@ -106,13 +107,18 @@ def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float =
     return Box(rotation @ ((low + high) / 2), rotation, (high - low) / 2)
 
 
-def _least_turned(box: Box) -> Box:
-    """The same box with its axes named and directed so that it is turned least."""
-    turns = np.einsum("ij,pjk->pik", box.rotation, AXES)
+def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same axes named and directed so that they are turned least, and right-handed.
+
+    Args:
+        rotation: (3, 3) columns are the axes.
+        along: (3,) what belongs to each of them, such as a box's half sizes.
+    """
+    turns = np.einsum("ij,pjk->pik", rotation, AXES)
     turns = turns[np.linalg.det(turns) > 0]
     order = np.lexsort(np.round([*turns.reshape(-1, 9).T, -np.trace(turns, axis1=1, axis2=2)], TIE_DIGITS))
-    rotation = turns[order[0]]
-    return Box(box.centre, rotation, np.abs(rotation.T @ box.rotation) @ box.half)
+    best = turns[order[0]]
+    return best, np.abs(best.T @ rotation) @ along
 
 
 def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> Box:
@@ -137,7 +143,7 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: fl
     upright = dataclasses.replace(box, half=box.half * [draw_in, draw_in, 1.0])
     to_origin, size = trimesh.bounds.oriented_bounds(hull.vertices, angle_digits=2)
     centre = -to_origin[:3, :3].T @ to_origin[:3, 3]
-    tilted = _least_turned(Box(centre, to_origin[:3, :3].T, np.asarray(size) / 2))
+    tilted = Box(centre, *least_turned(to_origin[:3, :3].T, np.asarray(size) / 2))
     foot = tilted.centre[2] - np.abs(tilted.rotation[2]) @ tilted.half
     better = np.prod(tilted.half) < 0.9 * np.prod(upright.half) and foot >= lowest_m + 0.002
     chosen = tilted if better else upright

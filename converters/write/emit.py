@@ -13,7 +13,7 @@ import numpy as np
 
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
-from converters.geometry.boxes import Box, Hull
+from converters.geometry.boxes import Box, Hull, least_turned
 from converters.records.visual import VisualMesh
 from converters.write.texture import quantise
 
@@ -72,9 +72,9 @@ def _add_movable(
     body.explicitinertial = True
     body.mass = round(physical.mass_kg, 4)
     body.ipos = _tidy(physical.com_b)
-    moments, axes = np.linalg.eigh(physical.inertia_b)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] = -axes[:, 0]
+    # Rounded first: which axes a round thing has is a matter of the last digits.
+    moments, axes = np.linalg.eigh(np.round(physical.inertia_b, 12))
+    axes, moments = least_turned(axes, moments)
     body.inertia = np.round(moments, 8)
     body.iquat = np.round(_quaternion(axes), 9)
     if placed.hinge is None:
