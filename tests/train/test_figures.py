@@ -14,9 +14,9 @@ from tests.train.synthetic import paper_like, run_rows, write_results, yardstick
 from train import figures
 from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
+from train.scoring.claims import claims
 from train.scoring.row_files import paths_beside
 from train.scoring.rows import BY_CATEGORY
-from train.scoring.statistics import claims
 
 
 def xy(line) -> np.ndarray:

@@ -12,7 +12,8 @@ import pyarrow.compute as pc
 from interactive_nav_common.rows import markdown
 from interactive_nav_common.statistics import estimate, mean_text
 from train.figures import style
-from train.scoring.statistics import Finding, cells, claims, learned_rows, run_means
+from train.scoring.claims import Finding, claims
+from train.scoring.statistics import cells, learned_rows, run_means, things_moved
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
@@ -95,31 +96,21 @@ def need_lines(rows: pa.Table) -> str:
 
 def category_lines(rows: pa.Table, split: str | None) -> str:
     """How often and how far each policy moved things of each category; empty where rows do not tell."""
-    if "by_category" not in rows.column_names:
-        return ""
-    rows = rows.filter(pc.is_valid(rows["by_category"]))
     rows = rows if split is None else rows.filter(pc.field("split") == split)
-    told = rows["by_category"].combine_chunks()
+    if not len(rows):
+        return ""
     policy = [
         name if name != "learned" else f"k_int = {k_int:g}"
         for name, k_int in zip(rows["policy"].to_pylist(), rows["k_int"].to_pylist(), strict=True)
     ]
-    of_row = pc.list_parent_indices(told)
-    entries = pa.Table.from_struct_array(pc.list_flatten(told))
-    entries = entries.append_column("robot", rows["robot"].combine_chunks().take(of_row))
-    entries = entries.append_column("of", pa.array(policy, pa.string()).take(of_row))
-    wanted = [(name, "sum") for name in ("objects", *MOVED)]
-    found = {
-        (entry["robot"], entry["category"], entry["of"]): entry
-        for entry in entries.group_by(["robot", "category", "of"]).aggregate(wanted).to_pylist()
-    }
-    policies = sorted({of for *_, of in found}, key=lambda of: (not of.startswith("k_int"), of))
+    found = things_moved(rows.append_column("of", pa.array(policy, pa.string())), ["robot", "of"])
+    policies = sorted({of for _, of, _ in found}, key=lambda of: (not of.startswith("k_int"), of))
     lines = []
-    for robot, category in sorted({key[:2] for key in found}):
+    for robot, category in sorted({key[::2] for key in found}):
         shown = []
         for of in policies:
-            if sums := found.get((robot, category, of)):
-                share, moved_m = (sums[f"{name}_sum"] / sums["objects_sum"] for name in MOVED)
+            if sums := found.get((robot, of, category)):
+                share, moved_m = (sums[name] / sums["objects"] for name in MOVED)
                 shown.append(f"{share:.1%}, {100 * moved_m:.1f}")
             else:
                 shown.append("-")

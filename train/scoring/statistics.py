@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from scipy import stats
 
-from interactive_nav_common.statistics import CONFIDENCE, LEVEL, Contrast, _constant, estimate, p_text, welch
+from interactive_nav_common.statistics import CONFIDENCE, LEVEL, Contrast, _constant, p_text, welch
 
 SCORES = ("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5")
+
+
+Things = Mapping[str, float]
+"""Sums over episodes of the numbers of `by_category` (`train.scoring.rows`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +36,8 @@ class RunMean:
     seed: int
     episodes: int
     scores: Mapping[str, float]
+    things: Mapping[str, Things]
+    """By category; empty where rows do not tell."""
 
     @property
     def cell(self) -> tuple[str, str, float]:
@@ -42,11 +48,34 @@ class RunMean:
         """Interactive navigation score: alpha P_eff + (1 - alpha) E_eff."""
         return alpha * self.scores["path_efficiency"] + (1.0 - alpha) * self.scores["effort_efficiency"]
 
+    def of_things(self, what: str, categories: Iterable[str]) -> float:
+        """`touched` or `displacement_m` of `by_category`, for each thing of some categories that was there; NaN for
+        none."""
+        found = [self.things[name] for name in categories if name in self.things]
+        there = sum(things["objects"] for things in found)
+        return sum(things[what] for things in found) / there if there else math.nan
+
 
 def learned_rows(rows: pa.Table, split: str | None = None) -> pa.Table:
     """Those of learned policies, in one part of the scenes or all."""
     kept = pc.field("policy") == "learned"
     return rows.filter(kept if split is None else kept & (pc.field("split") == split))
+
+
+def things_moved(rows: pa.Table, keys: list[str]) -> dict[tuple[Any, ...], Things]:
+    """(value of each key, category) -> sums over episodes of `by_category`; empty where rows do not tell."""
+    if "by_category" not in rows.column_names:
+        return {}
+    rows = rows.filter(pc.is_valid(rows["by_category"]))
+    told = rows["by_category"].combine_chunks()
+    entries = pa.Table.from_struct_array(pc.list_flatten(told))
+    for key in keys:
+        entries = entries.append_column(key, rows[key].combine_chunks().take(pc.list_parent_indices(told)))
+    numbers = [name for name in entries.column_names if name not in ("category", *keys)]
+    summed = entries.group_by([*keys, "category"]).aggregate([(name, "sum") for name in numbers]).to_pylist()
+    return {
+        tuple(row[key] for key in (*keys, "category")): {name: row[f"{name}_sum"] for name in numbers} for row in summed
+    }
 
 
 def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
@@ -57,6 +86,7 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
         split: train or test scenes; None: all.
     """
     chosen = learned_rows(rows, split)
+    things = things_moved(chosen, ["run"])
     names = [name for name in SCORES if name in chosen.column_names]
     keys = ["run", "robot", "algorithm", "k_int", "seed"]
     means = chosen.group_by(keys).aggregate([(name, "mean") for name in names] + [("episode", "count")]).to_pylist()
@@ -65,6 +95,7 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
             *(row[key] for key in keys),
             episodes=row["episode_count"],
             scores={name: row[f"{name}_mean"] for name in names},
+            things={category: sums for (run, category), sums in things.items() if run == row["run"]},
         )
         for row in means
     ]
@@ -176,94 +207,3 @@ def correlation(x: Iterable[float], y: Iterable[float]) -> Correlation:
     test = stats.pearsonr(a, b)
     interval = test.confidence_interval(CONFIDENCE)
     return Correlation(float(test.statistic), float(interval.low), float(interval.high), float(test.pvalue), len(a))
-
-
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """What our runs say to one comparison behind a claim."""
-
-    claim: str
-    compared: str
-    result: str
-    verdict: str
-
-
-def _verdict(test: Contrast, expected: str) -> str:
-    """What a contrast says to a claim that expects higher, lower or same."""
-    if expected == "same" and test.verdict == "undecided":
-        return "no significant difference"
-    if math.isnan(test.p_value):
-        return "too few runs to test"
-    return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
-
-
-def _compared(
-    means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **where: Any
-) -> Finding:
-    """A claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
-    axis, left, right = sides
-    test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **where)
-    if test is None:
-        return Finding(claim, what, "-", f"no runs of {left} and {right} to compare")
-    return Finding(claim, what, str(test), _verdict(test, expected))
-
-
-def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
-    """What k_int does to one robot's scores."""
-    by_cell = {
-        cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
-    }
-    best = max(by_cell, key=lambda cell: by_cell[cell])
-    yield Finding(
-        "k_int = 1 is best at alpha = 0",
-        f"{robot}: cell of the highest mean INS_0",
-        f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
-        "holds" if best[2] == 1.0 else "does not hold",
-    )
-    for k, claim, expectations in (
-        (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
-        (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
-    ):
-        for alpha, name, expected in ((0.0, "E_eff", expectations[0]), (1.0, "P_eff", expectations[1])):
-            what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
-            yield _compared(means, claim, what, expected, alpha, "k_int", k, 0.0, robot=robot)
-
-
-def _of_splits(rows: pa.Table) -> Finding:
-    """Train against test scenes."""
-    pairs, test = seen_unseen(rows)
-    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
-    result, verdict = "-", "no runs with rows of train and of test scenes"
-    if test is not None:
-        result = str(test)
-        verdict = "too few runs to test" if math.isnan(test.p_value) else _verdict(test, "same")
-    return Finding("Seen and unseen scenes do not differ", what, result, verdict)
-
-
-def claims(rows: pa.Table, split: str | None) -> list[Finding]:
-    """The paper's claims (section V), one comparison a line; those whose runs are missing say so.
-
-    Args:
-        rows: of `train.evaluate`.
-        split: of the scenes for all but the train/test claim; None: all.
-    """
-    means = run_means(rows, split)
-    robots = sorted({run.robot for run in means})
-    algorithms = {run.algorithm for run in means}
-    found: list[Finding] = []
-    for robot in robots:
-        for other in [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]:
-            claim, what = "SAC is best overall", f"{robot}: INS_0.5, SAC minus {other.upper()}, mean over k_int"
-            found.append(_compared(means, claim, what, "higher", 0.5, "algorithm", "sac", other, robot=robot))
-    for robot in robots:
-        found += _of_penalties(means, robot)
-    for alpha, name, expected in ((0.0, "E_eff", "higher"), (1.0, "P_eff", "same")) if len(robots) > 1 else ():
-        claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
-        what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
-        found.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
-    for robot in robots:
-        chosen = [run.scores for run in means if run.robot == robot]
-        r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
-        what = f"{robot}: Pearson's r over runs"
-        found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
-    return [*found, _of_splits(rows)]

@@ -11,7 +11,9 @@ import pytest
 
 from interactive_nav_common.statistics import estimate, p_text, welch
 from tests.train.synthetic import K_INTS, paper_like, run_rows, yardstick_rows
-from train.scoring.statistics import claims, contrast, correlation, run_means, seen_unseen
+from train.scoring.claims import LARGE, MEDIUM, SMALL, claims
+from train.scoring.rows import BY_CATEGORY
+from train.scoring.statistics import contrast, correlation, run_means, seen_unseen
 
 
 def test_a_run_counts_once_whatever_its_episodes():
@@ -91,13 +93,15 @@ def test_correlation_by_hand():
 def test_every_claim_holds_where_it_was_put_in():
     found = claims(paper_like(), "test")
     verdicts = {(f.claim, f.compared): f.verdict for f in found}
-    assert len(verdicts) == len(found) == 2 * 2 + 2 * 5 + 2 + 2 + 1
+    assert len(verdicts) == len(found) == 2 * (2 + 4 + 1) + 2 * 5 + 2 + 2 + 1
     expected = {"holds", "no significant difference"}
     by_claim = {}
     for (claim, _), verdict in verdicts.items():
         by_claim.setdefault(claim, set()).add(verdict)
     assert by_claim == {
         "SAC is best overall": {"holds"},
+        "SAC is best whatever alpha": {"holds"},
+        "SAC with k_int = 0.1 is best at every alpha but 0": {"does not hold"},  # at 0.1 it is k_int = 1
         "k_int = 1 is best at alpha = 0": {"holds"},
         "k_int = 1 gains effort efficiency and loses path efficiency": {"holds"},
         "k_int = 0.1 keeps path efficiency at higher effort efficiency": expected,
@@ -105,6 +109,11 @@ def test_every_claim_holds_where_it_was_put_in():
         "The two terms of E_eff are correlated": {"holds"},
         "Seen and unseen scenes do not differ": {"too few runs to test"},  # the rows of both are the same
     }
+    milder = paper_like().filter(pa.compute.field("k_int") < 1.0)
+    path = pa.compute.add(milder["path_efficiency"], pa.compute.multiply(milder["k_int"], 0.01))
+    milder = milder.set_column(milder.column_names.index("path_efficiency"), "path_efficiency", path)
+    best = [f for f in claims(milder, "test") if f.claim == "SAC with k_int = 0.1 is best at every alpha but 0"]
+    assert [(f.verdict, f.result) for f in best] == [("holds", "SAC, k_int = 0.1: 10")] * 2
     sac = next(f for f in found if "turtlebot: INS_0.5, SAC minus PPO" in f.compared)
     assert sac.result.startswith("+0.052 [")
 
@@ -123,11 +132,37 @@ def test_claims_that_fail_say_so_and_missing_runs_too():
     assert found["turtlebot: E_eff, k_int = 1 minus 0, mean over algorithms"].verdict == "too few runs to test"
     assert found["turtlebot: P_eff, k_int = 1 minus 0, mean over algorithms"].verdict == "undecided"
     assert found["turtlebot: cell of the highest mean INS_0"].verdict == "does not hold"
+    best = found["turtlebot: cell of the highest mean INS at alpha 0.1, 0.2, ... 1"]
+    assert best.verdict == "does not hold" and best.result == "PPO, k_int = 0: 10"
     seen = next(f for f in found.values() if f.claim == "Seen and unseen scenes do not differ")
     assert seen.verdict == "does not hold: lower" and "18 runs" in seen.compared
     only_ppo = [table for table in tables if table["algorithm"][0].as_py() == "ppo"]
     first = claims(pa.concat_tables(only_ppo), "train")[0]
     assert first.verdict == "no runs of sac and ppo to compare"
+
+
+def things_touched(rows: pa.Table, wanted: bool) -> pa.Table:
+    """Each run's things: what the paper says is touched or moved as wanted, else the other way round."""
+    told = []
+    for robot, k_int, seed in zip(*(rows[name].to_pylist() for name in ("robot", "k_int", "seed")), strict=True):
+        entries = []
+        for kinds, touched in ((LARGE, 10), (MEDIUM, 50 if k_int == 0 else 20), (SMALL, 30 if k_int == 1 else 60)):
+            moved_m = (8.0 if (robot == "fetch") is wanted else 2.0) + seed
+            touched = (touched if wanted else 70 - touched) + seed
+            names = [*kinds, *(("coffee_table", "armchair") if kinds is LARGE else ())]
+            entries += [(name, 100, touched, 0, moved_m, 0.0) for name in names]
+        told.append([dict(zip((f.name for f in BY_CATEGORY.value_type), entry, strict=True)) for entry in entries])
+    return rows.append_column("by_category", pa.array(told, BY_CATEGORY))
+
+
+def test_claims_about_things():
+    """Shares by hand: of 100 things 11 large and 61 small ones are touched, on average over the seeds."""
+    for wanted, verdict in ((True, "holds"), (False, "does not hold: ")):
+        found = claims(things_touched(paper_like(), wanted), "test")
+        found = [f for f in found if f.claim.startswith(("Depending", "Fetch moves"))]
+        assert len(found) == 5 and all(f.verdict.startswith(verdict) for f in found)
+        assert found[0].result.startswith("-0.500 [" if wanted else "+0.500 [")
+        assert found[3].result.startswith("+0.060 [" if wanted else "-0.060 [")
 
 
 def test_p_values_are_written_as_papers_do():

@@ -1,0 +1,164 @@
+"""Rows of episodes in; what they say to the paper's claims (section V), one comparison a line, out."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from interactive_nav_common.statistics import Contrast, estimate, welch
+from train.scoring.statistics import RunMean, cells, contrast, correlation, run_means, seen_unseen
+
+ALPHAS = tuple(k / 10 for k in range(11))
+LARGE = ("sofa", "table", "desk", "bed", "sideboard", "dresser", "bookcase")
+MEDIUM = ("basket", "laundry_basket", "bin", "box", "bag", "stool")
+SMALL = ("shoe", "pot", "toy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """What our runs say to one comparison behind a claim."""
+
+    claim: str
+    compared: str
+    result: str
+    verdict: str
+
+
+def _verdict(test: Contrast, expected: str) -> str:
+    """What a contrast says to a claim that expects higher, lower or same."""
+    if expected == "same" and test.verdict == "undecided":
+        return "no significant difference"
+    if math.isnan(test.p_value):
+        return "too few runs to test"
+    return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
+
+
+def _compared(
+    means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **where: Any
+) -> Finding:
+    """A claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
+    axis, left, right = sides
+    test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **where)
+    if test is None:
+        return Finding(claim, what, "-", f"no runs of {left} and {right} to compare")
+    return Finding(claim, what, str(test), _verdict(test, expected))
+
+
+def _of_sac(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
+    """SAC against the others. INS is linear in alpha: what holds at 0 and at 1 holds between."""
+    algorithms = {run.algorithm for run in means}
+    others = [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]
+    for claim, alphas in (("SAC is best overall", (0.5,)), ("SAC is best whatever alpha", (0.0, 1.0))):
+        for other in others:
+            for alpha in alphas:
+                what = f"{robot}: INS_{alpha:g}, SAC minus {other.upper()}, mean over k_int"
+                yield _compared(means, claim, what, "higher", alpha, "algorithm", "sac", other, robot=robot)
+    of_robot = {cell: runs for cell, runs in cells(means).items() if cell[0] == robot}
+    best = collections.Counter(
+        max(of_robot, key=lambda cell: estimate(run.ins(alpha) for run in of_robot[cell]).mean) for alpha in ALPHAS[1:]
+    )
+    told = (f"{algorithm.upper()}, k_int = {k_int:g}: {count}" for (_, algorithm, k_int), count in best.most_common())
+    yield Finding(
+        "SAC with k_int = 0.1 is best at every alpha but 0",
+        f"{robot}: cell of the highest mean INS at alpha 0.1, 0.2, ... 1",
+        "; ".join(told),
+        "holds" if set(best) == {(robot, "sac", 0.1)} else "does not hold",
+    )
+
+
+def _of_things(means: Sequence[RunMean]) -> Iterator[Finding]:
+    """What is pushed and what is gone round; nothing where rows do not tell by category."""
+
+    def compared(claim: str, what: str, expected: str, test: Contrast | None) -> Finding:
+        if test is None or math.isnan(test.difference):
+            return Finding(claim, what, "-", "no runs to compare")
+        return Finding(claim, what, str(test), _verdict(test, expected))
+
+    if not any(run.things for run in means):
+        return
+    claim = "Depending on the penalty a TurtleBot avoids large, medium or small things"
+    free = [run for run in means if (run.robot, run.k_int) == ("turtlebot", 0.0)]
+    share = [
+        [np.mean([run.of_things("touched", kinds) for run in free if run.seed == seed]) for seed in seeds]
+        for seeds in [sorted({run.seed for run in free})]
+        for kinds in (LARGE, SMALL)
+    ]
+    what = "turtlebot: share of large less share of small things that are touched, k_int = 0, mean over algorithms"
+    yield compared(claim, what, "lower", welch(*map(np.asarray, share)) if free else None)
+    for kinds, name, high, low in ((MEDIUM, "medium", 0.1, 0.0), (SMALL, "small", 1.0, 0.1)):
+        what = f"turtlebot: share of {name} things that are touched, k_int = {high:g} minus {low:g}"
+        test = contrast(
+            means, "k_int", high, low, lambda run, kinds=kinds: run.of_things("touched", kinds), robot="turtlebot"
+        )
+        yield compared(claim, f"{what}, mean over algorithms", "lower", test)
+    for kinds, name in ((("table", "coffee_table"), "tables"), (("sofa", "armchair"), "sofas")):
+        test = contrast(
+            means, "robot", "fetch", "turtlebot", lambda run, kinds=kinds: run.of_things("displacement_m", kinds)
+        )
+        what = f"metres that each of the {name} is moved, Fetch minus TurtleBot, mean over algorithms and k_int"
+        yield compared("Fetch moves tables and sofas", what, "higher", test)
+
+
+def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
+    """What k_int does to one robot's scores."""
+    by_cell = {
+        cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
+    }
+    best = max(by_cell, key=lambda cell: by_cell[cell])
+    yield Finding(
+        "k_int = 1 is best at alpha = 0",
+        f"{robot}: cell of the highest mean INS_0",
+        f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
+        "holds" if best[2] == 1.0 else "does not hold",
+    )
+    for k, claim, expectations in (
+        (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),
+        (0.1, "k_int = 0.1 keeps path efficiency at higher effort efficiency", ("higher", "same")),
+    ):
+        for alpha, name, expected in ((0.0, "E_eff", expectations[0]), (1.0, "P_eff", expectations[1])):
+            what = f"{robot}: {name}, k_int = {k:g} minus 0, mean over algorithms"
+            yield _compared(means, claim, what, expected, alpha, "k_int", k, 0.0, robot=robot)
+
+
+def _of_splits(rows: pa.Table) -> Finding:
+    """Train against test scenes."""
+    pairs, test = seen_unseen(rows)
+    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
+    result, verdict = "-", "no runs with rows of train and of test scenes"
+    if test is not None:
+        result = str(test)
+        verdict = "too few runs to test" if math.isnan(test.p_value) else _verdict(test, "same")
+    return Finding("Seen and unseen scenes do not differ", what, result, verdict)
+
+
+def claims(rows: pa.Table, split: str | None) -> list[Finding]:
+    """The paper's claims, one comparison a line; those whose runs are missing say so.
+
+    Args:
+        rows: of `train.evaluate`.
+        split: of the scenes for all but the train/test claim; None: all.
+    """
+    means = run_means(rows, split)
+    robots = sorted({run.robot for run in means})
+    found: list[Finding] = []
+    for robot in robots:
+        found += _of_sac(means, robot)
+    for robot in robots:
+        found += _of_penalties(means, robot)
+    found += _of_things(means)
+    for alpha, name, expected in ((0.0, "E_eff", "higher"), (1.0, "P_eff", "same")) if len(robots) > 1 else ():
+        claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
+        what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
+        found.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
+    for robot in robots:
+        chosen = [run.scores for run in means if run.robot == robot]
+        r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
+        what = f"{robot}: Pearson's r over runs"
+        found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
+    return [*found, _of_splits(rows)]
