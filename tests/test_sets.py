@@ -10,6 +10,7 @@ import pytest
 from converters.__main__ import main
 from converters.generate.homes.config import TIERS
 from converters.recipes import load_recipes
+from interactive_nav.episodes import load
 from scenes_mjcf.schema import SceneError, load_manifest
 from scenes_mjcf.sets import COMMITTED, Member, SceneSet, read_set, scene_digest, scene_folders, write_set
 
@@ -48,6 +49,32 @@ def test_a_committed_tier_lists_what_its_recipes_make(tier: str, seed: int) -> N
     for name, member in listed.scenes.items():
         assert set(member.measures["must_push_share"]) == {"turtlebot", "fetch"}
         assert wanted.get("furniture_share", 0.30) - 0.12 < member.measures["movable_share"] < 0.4, name
+
+
+ARRIVES = {
+    ("cluttered", "turtlebot"): (0.40, 0.65),
+    ("cluttered", "fetch"): (0.25, 0.50),
+    ("furnished", "turtlebot"): (0.65, 1.0),
+    ("furnished", "fetch"): (0.40, 0.95),
+}
+"""Share of a tier's episodes in which a planner that touches nothing finds a way."""
+
+
+@pytest.mark.parametrize("robot", ["turtlebot", "fetch"])
+@pytest.mark.parametrize("tier", ["furnished", "cluttered"])
+def test_fixed_episodes_are_in_the_scenes_of_their_split(tier: str, robot: str) -> None:
+    listed = read_set(ROOT / "scenes_mjcf" / tier / "set.json").scenes
+    arrives = 0.0
+    for split in ("train", "test"):
+        file = load(ROOT / "scenes_mjcf" / "episodes" / f"{tier}-{robot}-{split}.json.gz")
+        of_split = [name for name, member in listed.items() if member.split == split]
+        assert [name for name, _ in file.scenes] == of_split
+        assert len(file.episodes) == 1000 and file.robot == robot and len(file.objects) == 4
+        assert {row["scene"] for row in file.episodes} == set(range(len(of_split)))
+        open_ = [not row["push_needed"] for row in file.episodes]
+        arrives += sum(open_) / len(open_) * len(of_split) / len(listed)
+    low, high = ARRIVES[tier, robot]
+    assert low <= arrives <= high
 
 
 @pytest.mark.heavy

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import gzip
 import hashlib
 import json
 import math
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,11 @@ from interactive_nav.scenes.scene import TASK_DIGEST
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import whole_file
 
 FORMAT = "interactive-nav-episodes"
 VERSION = 1
+PACKED = ".gz"
 LENGTH_TOLERANCE_M = 1e-3
 """L* of a file and of the environment may differ by rounding only."""
 
@@ -203,7 +206,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
 
 
 def save(file: EpisodeFile, path: str | Path) -> None:
-    """Writes whole or not at all.
+    """Writes whole or not at all; packed where the name ends with `.gz`.
 
     Raises:
         FileError: it cannot be written.
@@ -212,7 +215,10 @@ def save(file: EpisodeFile, path: str | Path) -> None:
     head = {k: v for k, v in data.items() if k != "episodes"}
     # One line an episode: readable, and small in a diff.
     lines = ",\n".join(json.dumps(row) for row in file.episodes)
-    write_text(path, f'{json.dumps(head, indent=1)[:-2]},\n "episodes": [\n{lines}\n ]\n}}\n')
+    text = f'{json.dumps(head, indent=1)[:-2]},\n "episodes": [\n{lines}\n ]\n}}\n'
+    with whole_file(path) as partial:
+        data = text.encode("utf-8")
+        partial.write_bytes(gzip.compress(data, mtime=0) if Path(path).suffix == PACKED else data)
 
 
 def load(path: str | Path) -> EpisodeFile:
@@ -222,7 +228,10 @@ def load(path: str | Path) -> EpisodeFile:
         EpisodeFileError: no such file, not such a file, another version, a missing or impossible value.
     """
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = Path(path).read_bytes()
+        data = json.loads(gzip.decompress(data) if Path(path).suffix == PACKED else data)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise EpisodeFileError(f"{path}: not readable as packed with gzip ({error}); make it again") from None
     except OSError as error:
         raise EpisodeFileError(
             f"{path}: cannot read ({error.strerror}); make one with 'python -m interactive_nav.episodes make'"

@@ -1,6 +1,7 @@
 """Episode files: the same episodes for everybody, and one clear line for each way a file does not fit."""
 
 import dataclasses
+import gzip
 import hashlib
 import json
 import shutil
@@ -159,6 +160,21 @@ def test_damaged_files_are_named(made, tmp_path, change, message):
     path.write_text(json.dumps(data))
     with pytest.raises(EpisodeFileError, match=message):
         episodes.load(path)
+
+
+def test_packed_files(made, tmp_path):
+    plain, packed = tmp_path / "episodes.json", tmp_path / "episodes.json.gz"
+    episodes.save(made, plain)
+    episodes.save(made, packed)
+    assert episodes.load(packed) == made and packed.stat().st_size < 0.7 * plain.stat().st_size
+    assert gzip.decompress(packed.read_bytes()) == plain.read_bytes()
+    again = tmp_path / "again.json.gz"
+    episodes.save(made, again)
+    assert again.read_bytes() == packed.read_bytes()  # no time of day in it
+    for damage in (packed.read_bytes()[:60], plain.read_bytes()):
+        packed.write_bytes(damage)
+        with pytest.raises(EpisodeFileError, match="not readable as packed with gzip"):
+            episodes.load(packed)
 
 
 def test_the_command_line(room, tmp_path, capsys):
