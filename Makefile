@@ -5,7 +5,7 @@ SHELL := /bin/bash
 
 PYTHON3 ?= python3
 PY := .venv/bin/python
-SEED ?= 4
+SEED ?= 5
 EPISODES ?= 200
 DEMO := demo
 say = @printf '\n\033[1m== %s\033[0m\n'
@@ -13,7 +13,7 @@ say = @printf '\n\033[1m== %s\033[0m\n'
 .PHONY: help sync demo test test-all docs lint types format check lock clean-demo
 
 help:
-	@echo "make demo    generate and convert a small building, train a TurtleBot, score it, draw it (SEED=$(SEED))"
+	@echo "make demo    generate and convert a furnished flat, train a TurtleBot, score it, draw it (SEED=$(SEED))"
 	@echo "make test    tests, slow ones included; make test-all: the heaviest too"
 	@echo "make docs    the documentation as HTML, in docs/_build/html"
 	@echo "make lint | types | format | check (lint, types, docs and test) | sync (environment) | lock | clean-demo"
@@ -37,19 +37,19 @@ demo: $(DEMO)/figures/.complete
 	@echo "Pictures: $(DEMO)/preview.png and $(DEMO)/figures/"
 
 $(DEMO)/raw: | sync
-	$(say) "1/5 Generating the scan of a small building (seed $(SEED))"
+	$(say) "1/5 Generating the scan of a furnished flat (seed $(SEED))"
 	@mkdir -p $(DEMO)
-	@$(PY) -m converters generate $@ --seed $(SEED)
+	@$(PY) -m converters generate $@ --tier furnished --seed $(SEED) floor_area_m2=60 n_rooms=5
 
-$(DEMO)/apartment: | sync $(DEMO)/raw
+$(DEMO)/flat: | sync $(DEMO)/raw
 	$(say) "2/5 Converting it to MuJoCo"
 	@$(PY) -m converters convert $(DEMO)/raw $@
 	@$(PY) -m converters check $@
 	@$(PY) -m converters preview $@ -o $(DEMO)/preview.png
 
-$(DEMO)/runs/demo/summary.json: | sync $(DEMO)/apartment
+$(DEMO)/runs/demo/summary.json: | sync $(DEMO)/flat
 	$(say) "3/5 Training a TurtleBot with PPO on the CPU (a few minutes; interrupted, it continues where it was)"
-	@$(PY) -m train --config demo 'env.scenes=[$(DEMO)/apartment]' run.out_dir=$(DEMO)/runs run.name=demo
+	@$(PY) -m train --config demo 'env.scenes=[$(DEMO)/flat]' run.out_dir=$(DEMO)/runs run.name=demo env.num_objects=4 run.num_timesteps=600_000
 
 $(DEMO)/scores.txt: $(DEMO)/runs/demo/summary.json
 	$(say) "4/5 Scoring it on $(EPISODES) fixed episodes, beside policies that never learned"

@@ -6,6 +6,7 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -34,6 +35,8 @@ from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
+LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19
+"""Inches that an entry of the legend takes across and down."""
 MARGIN_M = 0.3
 """Empty border around the map."""
 SURFACE_PIXELS = 480
@@ -284,9 +287,11 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     shown = sorted({o.category for o in scene.manifest.objects})
     handles = [Patch(facecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
     handles += [Patch(facecolor=TRAVERSABLE, label="traversable"), Patch(facecolor=WALL, label="wall")]
-    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=min(len(handles), 12), frameon=False)
+    across = min(len(handles), int(width / LEGEND_ENTRY_IN))
+    figure.legend(handles=handles, loc="lower center", fontsize=8, ncols=across, frameon=False)
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
-    figure.tight_layout(rect=(0, 0.03, 1, 0.985))
+    lines = math.ceil(len(handles) / across)
+    figure.tight_layout(rect=(0, 0.01 + LEGEND_LINE_IN * lines / figure.get_figheight(), 1, 0.985))
     views = [view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3]
     return figure, _palette(views, shown)
 
