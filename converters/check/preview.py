@@ -41,6 +41,11 @@ MARGIN_M = 0.3
 """Empty border around the map."""
 SURFACE_PIXELS = 480
 """Longer side of a surface's picture; a panel is about as large on the page."""
+FURNISHED_PIXELS = 800
+ELEVATION_RAD = math.radians(53.0)
+CUT_M = 1.3
+LIGHT_W = np.array([0.35, -0.45, 0.82])
+"""Where the light comes from in the view from the side."""
 DPI = 100
 SURFACE_COLOURS = 64
 ALWAYS_IN_PALETTE = 10
@@ -71,14 +76,13 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarra
     return points[ConvexHull(points).vertices]
 
 
-def _coloured_points(folder: Path, stem: str, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) on a visual mesh, as stored, and their colours (n, 3) uint8."""
+def _coloured_points(folder: Path, stem: str, spacing_m: float) -> ColourCloud:
+    """Points on a visual mesh, as stored."""
     vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{stem}_visual.obj")
     image = read_image(folder / "assets" / f"{stem}.png", "RGB")
     assert corner_uv is not None
     scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
-    cloud = colour_cloud(scan, vertices, faces, np.arange(len(faces)), spacing_m)
-    return cloud.points, cloud.colours.astype(np.uint8)
+    return colour_cloud(scan, vertices, faces, np.arange(len(faces)), spacing_m)
 
 
 def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:
@@ -143,6 +147,31 @@ def _draw_surface(axes: Axes, scene: _Scene, sample: Callable[[float], list[Colo
     extent = (low[0], low[0] + shape[1] * pixel_m, low[1], low[1] + shape[0] * pixel_m)
     axes.imshow(seen, origin="lower", extent=extent, interpolation="nearest")
     _frame(axes, scene, title)
+
+
+def _draw_furnished(axes: Axes, scene: _Scene) -> None:
+    """Everything at rest, seen slantwise from the south: walls are cut at `CUT_M`, and no wall is seen from behind."""
+    left, right, bottom, top = scene.extent
+    sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
+    axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
+    low = np.array([left - MARGIN_M, sin * (bottom - MARGIN_M)])
+    size_m = np.array([right + MARGIN_M, sin * (top + MARGIN_M) + cos * CUT_M]) - low
+    pixel_m = float(size_m[0]) / FURNISHED_PIXELS
+    shape = (int(np.ceil(size_m[1] / pixel_m)), FURNISHED_PIXELS)
+    seen: list[ColourCloud] = []
+    for stem in ("structure", *(item.name for item in scene.manifest.objects)):
+        cloud = _visual_cloud(scene, stem, 0.9 * pixel_m)
+        keep = np.ones(len(cloud.points), bool)
+        if stem == "structure":
+            keep = (cloud.points[:, 2] < CUT_M) & (cloud.normals @ axes_w[2] >= 0.0)
+        light = 0.6 + 0.4 * np.abs(cloud.normals[keep] @ LIGHT_W)
+        seen.append(
+            ColourCloud(cloud.points[keep] @ axes_w.T, cloud.normals[keep], cloud.colours[keep] * light[:, None])
+        )
+    points, colours = np.vstack([c.points for c in seen]), np.vstack([c.colours for c in seen])
+    axes.imshow(view(points, colours.astype(np.uint8), low, shape, pixel_m)[::-1], interpolation="nearest")
+    axes.set_title(f"furnished, from the south; walls cut at {CUT_M:g} m", fontsize=10)
+    axes.axis("off")
 
 
 def _draw_ground(axes: Axes, scene: _Scene) -> None:
@@ -221,10 +250,10 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
 
 def _visual_cloud(scene: _Scene, stem: str, spacing_m: float) -> ColourCloud:
     """World points on a textured mesh of the scene."""
-    points, colours = _coloured_points(scene.folder, stem, spacing_m)
+    cloud = _coloured_points(scene.folder, stem, spacing_m)
     body = scene.model.body(stem).id
-    points = points @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body]
-    return ColourCloud(points, np.zeros_like(points), colours)
+    turn = scene.data.xmat[body].reshape(3, 3).T
+    return ColourCloud(cloud.points @ turn + scene.data.xpos[body], cloud.normals @ turn, cloud.colours)
 
 
 def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
@@ -262,8 +291,13 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
     columns, height = (3, 4.6) if raw is not None else (2, 4.2)
     width = max(columns * height * ratio, 7.0)  # the legend's
-    figure, grid = plt.subplots(2, columns, figsize=(width, 2 * height + 0.7), dpi=DPI)
-    panels = list(grid.ravel())
+    tall = width * (0.8 / ratio + 0.12)  # of the view from the side, as wide as the page
+    figure = plt.figure(figsize=(width, tall + 2 * height + 0.7), dpi=DPI)
+    places = figure.add_gridspec(3, columns, height_ratios=(tall, height, height))
+    furnished = figure.add_subplot(places[0, :])
+    panels = [figure.add_subplot(places[row, column]) for row in (1, 2) for column in range(columns)]
+    views = [furnished, *panels[: 2 * columns - 3]]
+    _draw_furnished(furnished, scene)
 
     if raw is not None:
         vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
@@ -292,8 +326,7 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     lines = math.ceil(len(handles) / across)
     figure.tight_layout(rect=(0, 0.01 + LEGEND_LINE_IN * lines / figure.get_figheight(), 1, 0.985))
-    views = [view.get_array() for axes in grid.ravel() for view in axes.images[:1]][: 2 * columns - 3]
-    return figure, _palette(views, shown)
+    return figure, _palette([picture.get_array() for axes in views for picture in axes.images[:1]], shown)
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:

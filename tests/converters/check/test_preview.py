@@ -64,6 +64,19 @@ def test_every_category_has_a_colour_of_its_own_and_is_drawn(scene):
     assert (np.abs(colours(scene / "p.png") - shoe).max(axis=2) <= 4).sum() > 50  # the legend's patch and the object
 
 
+def test_the_view_from_the_side_shows_furniture_in_its_own_colours(scene):
+    """A magenta basket is seen in the uppermost picture, and nothing of it in the others' place."""
+    preview(scene, scene / "before.png")
+    texture = scene / "assets" / "basket_0.png"
+    with Image.open(texture) as image:
+        Image.new("RGB", image.size, (255, 0, 255)).save(texture)
+    preview(scene, scene / "after.png")
+    before, after = (colours(scene / f"{name}.png").astype(int) for name in ("before", "after"))
+    magenta = [(p[..., 0] > 90) & (p[..., 2] > 90) & (p[..., 1] < 40) for p in (before, after)]
+    rows = np.flatnonzero(magenta[1].sum(1) > magenta[0].sum(1))
+    assert magenta[1].sum() > magenta[0].sum() + 15 and rows.max() < 0.5 * len(after)
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
