@@ -25,7 +25,7 @@ for words in (
 """
 
 
-@pytest.mark.skipif(not packaged_weights().is_dir(), reason="topological_nav/weights is not there")
+@pytest.mark.skipif(not packaged_weights().is_dir(), reason="topological_nav/weights/exported is not there")
 def test_without_warp_the_extra_is_named_before_any_work(tmp_path):
     (tmp_path / "absent" / "warp").mkdir(parents=True)
     text = "raise ModuleNotFoundError(\"No module named 'warp'\", name='warp')\n"
