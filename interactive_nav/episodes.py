@@ -12,9 +12,9 @@ import sys
 from collections.abc import Sequence
 
 import interactive_nav
-from interactive_nav.task.episode_files import EpisodeFile, EpisodeFileError, draw, load, save, starts_of
+from interactive_nav.task.episode_files import EpisodeFile, EpisodeFileError, draw, load, load_all, save, starts_of
 
-__all__ = ["EpisodeFile", "EpisodeFileError", "draw", "load", "main", "save", "starts_of"]
+__all__ = ["EpisodeFile", "EpisodeFileError", "draw", "load", "load_all", "main", "save", "starts_of"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import hashlib
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -14,8 +13,7 @@ from typing import Any
 import pyarrow as pa
 from rich.console import Console
 
-from interactive_nav.episodes import EpisodeFile, EpisodeFileError
-from interactive_nav.episodes import load as load_episodes
+from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_all
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError, reports_errors
@@ -36,9 +34,9 @@ ROWS = "evaluation/episodes.parquet"
 """Of a run folder's own evaluation."""
 
 
-def _read_episodes(path: str) -> EpisodeFile:
+def _read_episodes(paths: Sequence[str]) -> tuple[EpisodeFile, str]:
     try:
-        return load_episodes(path)
+        return load_all(paths)
     except EpisodeFileError as error:
         raise ConfigError(f"--episode-file: {error}") from None
 
@@ -64,7 +62,12 @@ def parser() -> argparse.ArgumentParser:
         "--policies say what to play), and environment settings to change",
     )
     made.add_argument("--episodes", type=int, default=200, help="fixed episodes for each policy (default 200)")
-    made.add_argument("--episode-file", metavar="FILE", help="play these (python -m interactive_nav.episodes make)")
+    made.add_argument(
+        "--episode-file",
+        action="append",
+        metavar="FILE",
+        help="play these (python -m interactive_nav.episodes make); may be given several times",
+    )
     made.add_argument("--balanced", action="store_true", help="scenes take turns; otherwise each episode draws one")
     names = ",".join((LEARNED, *YARDSTICKS))
     made.add_argument(
@@ -123,7 +126,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
     folders = runs or [None]
     configs = [_wanted(folder, policies, arguments, console) for folder in folders]
-    fixed = _read_episodes(arguments.episode_file) if arguments.episode_file else None
+    fixed, digest = _read_episodes(arguments.episode_file) if arguments.episode_file else (None, "")
     # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
     kinds = [replace(config.env, k_int=0.0) for config in configs]
     order = sorted(range(len(folders)), key=lambda i: kinds.index(kinds[i]))
@@ -139,7 +142,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             checkpoint=arguments.checkpoint,
             deterministic=not arguments.stochastic,
             settings=tuple(sorted(word for word in arguments.words if "=" in word)),
-            episode_file=_digest(arguments.episode_file) if fixed else "",
+            episode_file=digest,
         )
         out = _place(arguments, folder, config, asked)
         claim(out.parent)
@@ -152,10 +155,6 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
         _tell(console, rows, config, player.env, out)
     return 0
-
-
-def _digest(path: str) -> str:
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
 
 
 def _tell(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out: Path) -> None:

@@ -14,6 +14,7 @@ import hashlib
 import json
 import math
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -259,6 +260,30 @@ def load(path: str | Path) -> EpisodeFile:
     except ValueError as error:
         raise EpisodeFileError(f"{path}: {error}; make it again") from None
     return file
+
+
+def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
+    """Episodes of several files one after the other, as those of one; and the digest of the files.
+
+    Args:
+        paths: at least one.
+
+    Raises:
+        EpisodeFileError: as `load` does; or the files are of different robots or small objects.
+    """
+    files = [load(path) for path in paths]
+    first = files[0]
+    for path, other in zip(paths, files, strict=True):
+        if (other.robot, other.objects_digest) != (first.robot, first.objects_digest):
+            raise EpisodeFileError(
+                f"{path}: made for robot '{other.robot}' with {len(other.objects)} small objects, {paths[0]} for "
+                f"'{first.robot}' with {len(first.objects)} or other models; play them one by one"
+            )
+    scenes = tuple(dict.fromkeys(scene for file in files for scene in file.scenes))
+    rows = [row | {"scene": scenes.index(file.scenes[row["scene"]])} for file in files for row in file.episodes]
+    contents = [Path(path).read_bytes() for path in paths]
+    content = contents[0] if len(paths) == 1 else b"".join(hashlib.sha256(data).digest() for data in contents)
+    return dataclasses.replace(first, scenes=scenes, episodes=tuple(rows)), hashlib.sha256(content).hexdigest()[:16]
 
 
 def _check(row: dict[str, Any], index: int, file: EpisodeFile) -> None:

@@ -162,6 +162,26 @@ def test_damaged_files_are_named(made, tmp_path, change, message):
         episodes.load(path)
 
 
+def test_several_files_are_one(env, made, room, tmp_path):
+    """Scenes of both, once each; every row keeps its scene."""
+    alone = interactive_nav.make("turtlebot", [room], backend="native", num_objects=3)
+    second = episodes.draw(alone, 2, seed=9)
+    for name, file in (("a", made), ("b", second)):
+        episodes.save(file, tmp_path / f"{name}.json")
+    both, digest = episodes.load_all([tmp_path / "b.json", tmp_path / "a.json"])
+    assert [name for name, _ in both.scenes] == ["room", "two_rooms"] and len(both.episodes) == 8
+    starts = episodes.starts_of(both, env)
+    for part, rows in ((second, slice(0, 2)), (made, slice(2, 8))):
+        expected = episodes.starts_of(part, env)
+        np.testing.assert_array_equal(starts.scene_index[rows], expected.scene_index)
+        np.testing.assert_array_equal(starts.small_xy_w[rows], expected.small_xy_w)
+    one, of_one = episodes.load_all([tmp_path / "a.json"])
+    assert one == made and of_one == hashlib.sha256((tmp_path / "a.json").read_bytes()).hexdigest()[:16] != digest
+    episodes.save(dataclasses.replace(second, robot="fetch"), tmp_path / "c.json")
+    with pytest.raises(EpisodeFileError, match=r"c.json: made for robot .fetch. with 3 small objects, "):
+        episodes.load_all([tmp_path / "a.json", tmp_path / "c.json"])
+
+
 def test_packed_files(made, tmp_path):
     plain, packed = tmp_path / "episodes.json", tmp_path / "episodes.json.gz"
     episodes.save(made, plain)

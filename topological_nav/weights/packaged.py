@@ -1,6 +1,6 @@
 """Which networks, policy and maps are used where none are named: the user's own runs, else those of the package.
 
-The package's lie in `topological_nav/weights/exported/`, a folder as `export` writes it, laid out like `runs/topological`:
+The package's lie in `topological_nav/weights/exported/`, as `export` writes them, laid out like `runs/topological`:
 
 rooms/ passages/ policy/   networks; the policy may be absent
 maps/SCENE.npz             may be absent: then a scene's map is made when it is first needed

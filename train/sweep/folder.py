@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import sys
@@ -19,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from interactive_nav.task.episode_files import load_all
 from interactive_nav_common.files import remove_partial, write_text
 from interactive_nav_common.locks import is_locked
 from interactive_nav_common.rows import read_notes
@@ -106,15 +108,23 @@ class SweepFolder:
     def asked(self, run: RunSpec) -> EvaluationAsked:
         """The evaluation that the sweep wants of a run."""
         wanted: EvaluateConfig = self.sweep.config.evaluate
+        files = self.episode_files(run)
+        fixed, digest = _read(files) if files else (None, "")
         return EvaluationAsked(
             scenes=tuple(Path(scene).name for scene in wanted.scenes or run.config.env.scenes),
             policies=("learned",),
-            episodes=wanted.episodes,
-            seed=wanted.seed,
-            balanced=wanted.balanced,
+            episodes=len(fixed.episodes) if fixed else wanted.episodes,
+            seed=fixed.seed if fixed else wanted.seed,
+            balanced=wanted.balanced and fixed is None,
             checkpoint=wanted.checkpoint,
             deterministic=not wanted.stochastic,
+            episode_file=digest,
         )
+
+    def episode_files(self, run: RunSpec) -> tuple[str, ...]:
+        """Files of the fixed episodes that a run is to play."""
+        files = self.sweep.config.evaluate.episode_files
+        return tuple(file.replace("{robot}", run.config.env.robot) for file in files)
 
     def evaluated(self, run: RunSpec) -> bool:
         """Rows are there, as wanted, of the run as far as it is trained."""
@@ -139,6 +149,9 @@ class SweepFolder:
     def try_again(self, run: str) -> None:
         """Forgets that a run was given up."""
         (self.root / "failed" / f"{run}.json").unlink(missing_ok=True)
+
+
+_read = functools.cache(load_all)
 
 
 def _tail(path: Path) -> list[str]:
@@ -189,6 +202,8 @@ def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str
         yield "--stochastic" if wanted.stochastic else "--no-stochastic"
         yield from ("--balanced",) if wanted.balanced else ()
         yield from ("--batch", str(wanted.batch)) if wanted.batch else ()
+        files = folder.episode_files(next(run for run in folder.sweep.runs if run.name == runs[0]))
+        yield from (word for file in files for word in ("--episode-file", file))
         yield from ("--scenes", *wanted.scenes) if wanted.scenes else ()
 
     return [sys.executable, *program, *words()]

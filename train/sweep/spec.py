@@ -52,6 +52,8 @@ class EvaluateConfig(Settings):
     """Sample actions instead of taking their mode."""
     record: Natural = 8
     """First episodes whose paths are kept for pictures."""
+    episode_files: tuple[str, ...] = ()
+    """Files of fixed episodes to play instead of drawn ones; `{robot}` stands for that of each run."""
     batch: AtLeastOne | None = None
     """Episodes played at a time; auto: by backend."""
 

@@ -189,7 +189,8 @@ def test_the_robots_navigator_uses_the_package_too(made, exported, here, capsys)
 
 
 needs_weights = pytest.mark.skipif(
-    not packaged_weights().is_dir(), reason="topological_nav/weights/exported is not there: no weights are committed yet"
+    not packaged_weights().is_dir(),
+    reason="topological_nav/weights/exported is not there: none are committed",
 )
 
 
