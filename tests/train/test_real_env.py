@@ -47,7 +47,7 @@ def trained(tmp_path_factory):
     return root, config, result, folder, digests(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_seed_gives_the_same_policy_again(trained):
     """On C MuJoCo, with threads."""
     root, *_, first = trained

@@ -240,6 +240,7 @@ def test_images_are_bounded_in_their_own_type(room, dtype, high):
     assert space["state"] == gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
 
 
+@pytest.mark.heavy
 def test_each_environment_of_a_batch_keeps_its_scene(room, two_rooms):
     settings = {"scenes": [room, two_rooms], "backend": "native", "num_objects": 0, "episode_steps": 2}
     settings["scene_choice"] = "slot"

@@ -145,6 +145,7 @@ def test_navigate_works_with_the_package_alone(made, exported, here, capsys):
     assert load_map(kept).about == there.about
 
 
+@pytest.mark.heavy
 def test_a_map_of_own_runs_is_made_but_never_written_over(made, here, capsys):
     for task, run in (("rooms", made.rooms), ("passages", made.passages)):
         shutil.copytree(run, RUNS / task)

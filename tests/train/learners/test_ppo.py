@@ -68,7 +68,7 @@ def make_config(updates: int, **settings: Any) -> TrainConfig:
     return TrainConfig(env=EnvConfig(scenes=("toy",)), ppo=config, run=run)
 
 
-@pytest.mark.parametrize("schedule", ["constant", "adaptive_kl"])
+@pytest.mark.parametrize("schedule", [pytest.param("constant", marks=pytest.mark.heavy), "adaptive_kl"])
 def test_updates_equal_those_of_brax(schedule):
     """Two updates from one seed end at the parameters that Brax's own loop ends at."""
     brax_compat.install()
