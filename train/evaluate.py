@@ -30,15 +30,20 @@ from train.scoring.rollout import Player
 from train.scoring.row_files import EvaluationAsked, paths_beside
 from train.scoring.rows import score_table
 
+EPISODES = 200
 ROWS = "evaluation/episodes.parquet"
 """Of a run folder's own evaluation."""
 
 
-def _read_episodes(paths: Sequence[str]) -> tuple[EpisodeFile, str]:
+def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile, str]:
+    """The first episodes of files, or all, and the files' digest."""
     try:
-        return load_all(paths)
+        file, digest = load_all(paths)
     except EpisodeFileError as error:
         raise ConfigError(f"--episode-file: {error}") from None
+    if most is not None and most > len(file.episodes):
+        raise ConfigError(f"--episodes is {most}, expected at most {len(file.episodes)}, which --episode-file has")
+    return dataclasses.replace(file, episodes=file.episodes[:most]), digest
 
 
 def _config_of_yardsticks(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
@@ -61,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
         help="folders that `python -m train` wrote (several share what is compiled; without one, --scenes, --out and "
         "--policies say what to play), and environment settings to change",
     )
-    made.add_argument("--episodes", type=int, default=200, help="fixed episodes for each policy (default 200)")
+    made.add_argument("--episodes", type=int, help=f"for each policy (default {EPISODES}, of files all)")
     made.add_argument(
         "--episode-file",
         action="append",
@@ -126,7 +131,8 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
     folders = runs or [None]
     configs = [_wanted(folder, policies, arguments, console) for folder in folders]
-    fixed, digest = _read_episodes(arguments.episode_file) if arguments.episode_file else (None, "")
+    given = arguments.episode_file
+    fixed, digest = _read_episodes(given, arguments.episodes) if given else (None, "")
     # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
     kinds = [replace(config.env, k_int=0.0) for config in configs]
     order = sorted(range(len(folders)), key=lambda i: kinds.index(kinds[i]))
@@ -136,7 +142,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         asked = EvaluationAsked(
             scenes=tuple(Path(scene).name for scene in config.env.scenes),
             policies=policies,
-            episodes=len(fixed.episodes) if fixed else arguments.episodes,
+            episodes=len(fixed.episodes) if fixed else arguments.episodes or EPISODES,
             seed=fixed.seed if fixed else arguments.seed,
             balanced=arguments.balanced and fixed is None,
             checkpoint=arguments.checkpoint,
@@ -149,10 +155,14 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         if player is None or kinds[i] != built:
             player = None  # the old one's memory goes before the new one's comes
             player, built = Player(build_env(config.env)), kinds[i]
-        rows, played = evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch)
         trained_steps = folder.origin().get("env_steps") if folder else None
-        write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
-        write_parquet(rows, out, {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)})
+        notes = {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)}
+        rows, stood = pa.table({}), out.exists()
+        for rows, played in evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch):
+            # What is stopped keeps what has been played; whole rows that stood there give way to whole ones only.
+            if set(played) == set(policies) or not stood:
+                write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
+                write_parquet(rows, out, notes)
         _tell(console, rows, config, player.env, out)
     return 0
 

@@ -326,7 +326,7 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     lines = math.ceil(len(handles) / across)
     figure.tight_layout(rect=(0, 0.01 + LEGEND_LINE_IN * lines / figure.get_figheight(), 1, 0.985))
-    return figure, _palette([picture.get_array() for axes in views for picture in axes.images[:1]], shown)
+    return figure, _palette([np.asarray(picture.get_array()) for axes in views for picture in axes.images[:1]], shown)
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:

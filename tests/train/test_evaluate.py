@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -25,6 +26,8 @@ from train.runs.run_folder import RunFolder
 from train.scoring import rollout
 from train.scoring.row_files import paths_beside
 from train.scoring.rows import score_table
+
+SPARSE = str(Path(__file__).parents[2] / "scenes_mjcf" / "episodes" / "sparse-turtlebot-test.json.gz")
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +166,32 @@ def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
     assert pq.read_table(rows)["policy"].to_pylist() == ["random"] * 3 and paths_beside(rows).is_file()
 
 
+def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monkeypatch):
+    """Ctrl-C in the second policy: the first one's rows are there; whole rows of before are not given up for them."""
+    out, words = tmp_path / "rows.parquet", [str(run.path), "--episodes", "3", "--policies", "random,follower"]
+    played = rollout.Player.play
+    count = []
+
+    def stopped(self, *arguments):
+        count.append(1)
+        if len(count) % 2 == 0:
+            raise KeyboardInterrupt
+        return played(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rollout.Player, "play", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate.main([*words, "--out", str(out)], build_env=build_toy)
+    assert pq.read_table(out)["policy"].to_pylist() == ["random"] * 3
+    assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 0
+    whole = out.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(rollout.Player, "play", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate.main([*words, "--out", str(out)], build_env=build_toy)
+    assert out.read_bytes() == whole and pq.read_table(out).num_rows == 6
+
+
 def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
     """Paths come first: whoever finds rows finds paths that are as new; a run that is only read is left as it is."""
     before = {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if "evaluation" not in str(path)}
@@ -192,6 +221,7 @@ def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
         (["--policies", "namo:x"], "policy namo: got 'namo:x', expected a weight, as in namo:0.5"),
         (["--policies", "namo:2"], "policy namo: weight is 2.0, expected between 0 and 1"),
         (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: cannot read"),
+        (["--episode-file", SPARSE, "--episodes", "1001"], "--episodes is 1001, expected at most 1000"),
         (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
         (["--episodes", "0"], "--episodes is 0, expected at least 1"),
         (["--seed", str(2**70)], "--seed 1180591620717411303424: expected 0 or more and 64 bits"),

@@ -116,7 +116,7 @@ def evaluate(
     console: Console,
     fixed: EpisodeFile | None = None,
     batch: int | None = None,
-) -> tuple[pa.Table, dict[str, Episodes]]:
+) -> Iterator[tuple[pa.Table, dict[str, Episodes]]]:
     """Plays the same fixed episodes with each policy: drawn from a seed, or those of a file.
 
     Args:
@@ -129,8 +129,8 @@ def evaluate(
         fixed: episodes to play instead of drawn ones.
         batch: episodes played at a time; None: by backend.
 
-    Returns:
-        Rows of all policies, one an episode; and the episodes by policy.
+    Yields:
+        After each policy, rows of all that have played, one an episode; and their episodes by policy.
     """
     env = player.env
     # Everything that can be refused is refused before the first episode.
@@ -160,7 +160,7 @@ def evaluate(
         tables.append(table)
         note = f" ({policy.note})" if isinstance(policy, Planner) and policy.note else ""
         console.print(f"{name}: {asked.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
-    return pa.concat_tables(tables), played
+        yield pa.concat_tables(tables), played
 
 
 def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: EvaluationAsked) -> dict[str, Any]:

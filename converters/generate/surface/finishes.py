@@ -106,7 +106,7 @@ def _hang(p: np.ndarray, colour: np.ndarray, room: Room, count: int, rng: np.ran
         sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
         at = (p[:, [1 - axis, 2]] - middle) / half
         on = (np.abs(p[:, axis] - wall) < 0.08) & (np.abs(at) < 1).all(axis=1)
-        rim = ((1 - np.abs(at)) * half < 0.035).any(axis=1)
+        rim = np.asarray(((1 - np.abs(at)) * half < 0.035).any(axis=1))
         hill = at[:, 1] < horizon + 0.15 * np.sin(5 * at[:, 0] + 9 * sun)
         inner = np.where(hill[:, None], land, sky)
         shines = np.hypot(at[:, [0]] - sun, at[:, [1]] - 0.5) < 0.16
