@@ -41,7 +41,7 @@ from converters.structure.maps import FloorPlan, main_direction, make_floor_plan
 from converters.structure.walls import wall_boxes
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest
-from converters.write.texture import bake_object, bake_structure, colour_cloud
+from converters.write.texture import bake_object, bake_structure, colour_cloud, simplify
 from interactive_nav_common.files import part_folder, publish
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
@@ -173,13 +173,15 @@ def _structure_visual(
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
-    filled, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
+    patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
     both = ColourCloud(
         *(np.vstack([getattr(cloud, f), getattr(patch_cloud, f)]) for f in ("points", "normals", "colours"))
     )
-    area = float(face_areas(filled.vertices, filled.faces[filled.patch_plane >= 0]).sum())
-    visual = bake_structure(filled.vertices, filled.faces, both, config.structure_faces, config.structure_texture)
-    return visual, area
+    area = float(face_areas(patches.vertices, patches.faces).sum())
+    most = max(config.structure_faces - len(patches.faces), config.structure_faces // 2)
+    scan = simplify(level, raw.scan.faces[kept], most)
+    whole = (np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])]))
+    return bake_structure(*whole, both, config.structure_texture), area
 
 
 def _object_visual(cloud: ColourCloud, annotated: PlacedObject, max_faces: int, size: int) -> tuple[VisualMesh, float]:

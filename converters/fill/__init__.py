@@ -1,1 +1,1 @@
-"""What furniture hid of floor and walls, closed without cracks."""
+"""What furniture hid of floor and walls, covered by patches."""

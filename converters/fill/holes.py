@@ -15,7 +15,7 @@ from converters.bodies.objects import PlacedObject, to_world
 from converters.fill.patches import (
     BESIDE_M,
     WALL_TOLERANCE_M,
-    Filled,
+    Patches,
     Plane,
     fill_planes,
     floor_plane,
@@ -49,7 +49,7 @@ SKIRT_M = 0.25
 """Width of the floor strip that joins a wall patch to the floor."""
 RIM_M = 0.05
 """The uppermost part of a wall that is not filled: the scan's own edge is ragged."""
-BEHIND_M = 0.25
+BACK_M = 0.25
 """So far behind a wall no floor is filled."""
 CORNER_M = 0.15
 """Two walls that end this near to their common line meet in it."""
@@ -231,7 +231,7 @@ def floor_sides(plane: Plane, region: BaseGeometry, extent: BaseGeometry) -> tup
         Strip to add to the floor's region, strip to take out of it, strip that no other wall may take out of it.
     """
     strips = []
-    for geometry, direction, width in ((region, 1.0, SKIRT_M), (extent, -1.0, BEHIND_M), (extent, 1.0, BEHIND_M)):
+    for geometry, direction, width in ((region, 1.0, SKIRT_M), (extent, -1.0, BACK_M), (extent, 1.0, BACK_M)):
         strips.append([])
         for piece in polygons_of(geometry):
             foot = piece.intersection(shapely.box(piece.bounds[0], LIFT_M - 1e-6, piece.bounds[2], LIFT_M + 1e-6))
@@ -312,8 +312,8 @@ def fill_holes(
     plan: FloorPlan,
     objects: tuple[PlacedObject, ...],
     cloud: ColourCloud,
-) -> tuple[Filled, ColourCloud]:
-    """The cleaned scan with floor and walls closed where furniture hid them, and coloured points on the patches.
+) -> tuple[Patches, ColourCloud]:
+    """What furniture hid of floor and walls, and coloured points on it.
 
     Args:
         vertices: (n, 3) of the levelled scan, m.
@@ -327,7 +327,7 @@ def fill_holes(
     filled = fill_planes(vertices, faces, wanted)
     points, normals, colours = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 3))]
     for k, (plane, _, tolerance) in enumerate(wanted):
-        patch = filled.faces[filled.patch_plane == k]
+        patch = filled.faces[filled.plane == k]
         near = np.abs(plane.distance(cloud.points)) < tolerance
         seen = np.flatnonzero(near & (np.abs(cloud.normals @ plane.normal) > 0.7))
         if len(patch) == 0 or len(seen) == 0:

@@ -1,10 +1,9 @@
-"""Cleaned scan in; holes that furniture left in floor and walls closed with plane patches that join without cracks.
+"""Cleaned scan in; holes that furniture left in floor and walls covered with plane patches, out.
 
 Wall planes are found by RANSAC, as the floor's was (`converters.structure.floor`), whose waves are taken out by now.
-In each plane the patch is the difference between what ought to be surface there and what the scan shows. Its border
-runs through the very vertices of the scan's border: a patch vertex that falls on a scan edge splits that face, one on
-another patch's edge splits that edge, so that scan and patches are one mesh. Where the scan's border stands out of the
-plane or ends before it, `converters.fill.join` closes what is left.
+In each plane the patch is the difference between what ought to be surface there and what the scan shows. It lies
+behind the scan and reaches under its border on all sides, so that no crack shows from within the room. The picture's
+mesh never collides: nothing needs to be joined.
 """
 
 from __future__ import annotations
@@ -13,14 +12,10 @@ import dataclasses
 
 import numpy as np
 import shapely
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from converters.fill.join import SAME_M, border_edges, close_cracks, cut_teeth, on_segments, split_at
-from converters.fill.loops import close_loops, without_dust, without_flaps
 from converters.geometry.faces import face_areas, face_labels
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
 
@@ -32,9 +27,17 @@ MIN_WALL_M2 = 0.5
 MAX_WALLS = 60
 BESIDE_M = 0.10
 """Surface parallel to a plane and this near to it stands in its place."""
-IN_PLANE_M = 0.005
-"""Border of surfaces across a plane, this near to it, is border in it."""
 MIN_PATCH_M2 = 1e-6
+OVERLAP_M = 0.10
+"""So far a patch reaches under the scan around it: as far as a seen surface may lie off its plane."""
+FREE_M = 0.06
+"""So far it reaches beyond its region where nothing was seen: behind a wall, under a floor, past a corner."""
+SLIT_M = 0.01
+"""Narrower pieces are no holes: the scan's faces and the region's outline are ragged."""
+OUTLINE_M = 0.02
+"""A patch's own outline is simplified to this: the scan hides it."""
+BEHIND_M = 0.002
+"""Of a patch's border from the rearmost scan around it: enough for depth buffers, and above the collision floor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,163 +158,67 @@ def polygons_of(geometry: BaseGeometry) -> list[Polygon]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Filled:
-    """The scan with its patches, one mesh."""
+class Patches:
+    """Triangles that cover what the scan does not show; they look along their planes' normals."""
 
     vertices: np.ndarray
-    """(n', 3): the given ones first, in their order."""
+    """(k, 3) m."""
     faces: np.ndarray
-    """(m', 3): scan faces (some split), then patches."""
-    source_face: np.ndarray
-    """(m',) the given face that each comes from, -1 for patches."""
-    patch_plane: np.ndarray
-    """(m',) index of the plane that a patch face lies in, -1 for scan faces."""
+    """(j, 3)."""
+    plane: np.ndarray
+    """(j,) index of the plane that each face lies in."""
 
 
-def _insert_on_rings(rings: list[np.ndarray], flat: np.ndarray) -> list[np.ndarray]:
-    """Adds to each closed ring ((k, 2), last = first) those of the points that lie on its segments."""
-    if len(flat) == 0:
-        return rings
-    tree = KDTree(flat)
-    result = []
-    for ring in rings:
-        points = [ring[0]]
-        for a, b in zip(ring[:-1], ring[1:], strict=True):
-            length = float(np.linalg.norm(b - a))
-            near = np.asarray(tree.query_ball_point((a + b) / 2, length / 2 + SAME_M), np.int64)
-            if len(near) and length > 0:
-                share = (flat[near] - a) @ (b - a) / length**2
-                off = np.linalg.norm(a + share[:, None] * (b - a) - flat[near], axis=1)
-                inside = (off < SAME_M) & (share > SAME_M / length) & (share < 1 - SAME_M / length)
-                for s in np.sort(np.unique(np.round(share[inside], 9))):
-                    points.append(a + s * (b - a))
-            points.append(b)
-        result.append(np.array(points))
-    return result
+def patches_of(
+    vertices: np.ndarray, faces: np.ndarray, plane: Plane, region: BaseGeometry, tolerance_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the scan does not show of a plane's region, with an overlap; vertices (k, 3) and faces (j, 3).
+
+    Args:
+        vertices: (n, 3) of the scan, m.
+        faces: (m, 3) that stay.
+        plane: its normal looks into the room.
+        region: that ought to be surface, plane coordinates.
+        tolerance_m: distance within which scan faces count as the plane's surface.
+    """
+    shown = faces[seen_in_plane(vertices, faces, plane, tolerance_m)]
+    seen = _union(vertices, shown, plane) if len(shown) else Polygon()
+    spots, depth = plane.flatten(vertices[np.unique(shown)]), plane.distance(vertices[np.unique(shown)])
+    missing = shapely.make_valid(region.difference(seen)).buffer(-SLIT_M / 2).buffer(SLIT_M / 2, quad_segs=1)
+    around = shapely.union_all([*polygons_of(seen), *polygons_of(region)], grid_size=1e-6)
+    points, triangles = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
+    for polygon in polygons_of(missing):
+        under = polygon.buffer(OVERLAP_M, quad_segs=1).intersection(around)
+        grown = shapely.union_all([*polygons_of(under), polygon.buffer(FREE_M, quad_segs=1)], grid_size=1e-6)
+        grown = grown.simplify(OUTLINE_M).segmentize(OVERLAP_M)
+        for piece in polygons_of(shapely.make_valid(grown)):
+            corners = np.array(
+                [t.exterior.coords[:3] for t in shapely.get_parts(shapely.constrained_delaunay_triangles(piece))]
+            ).reshape(-1, 3, 2)
+            e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+            turned = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0
+            corners[turned] = corners[turned][:, ::-1]
+            flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+            triangles.append(index.reshape(-1, 3) + sum(map(len, points)))
+            near = KDTree(spots).query_ball_point(flat, OVERLAP_M) if len(spots) else [[]] * len(flat)
+            back = np.array([depth[at].min() if at else 0.0 for at in near]) - BEHIND_M
+            points.append(plane.lift(flat) + back[:, None] * plane.normal)
+    return np.vstack(points), np.vstack(triangles)
 
 
-def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plane, BaseGeometry, float]]) -> Filled:
-    """Adds the missing surface of each plane to the mesh.
+def fill_planes(vertices: np.ndarray, faces: np.ndarray, wanted: list[tuple[Plane, BaseGeometry, float]]) -> Patches:
+    """The missing surface of each plane.
 
     Args:
         vertices: (n, 3) of the scan, m.
         faces: (m, 3) that stay.
         wanted: plane, region of it that ought to be surface (in its coordinates), and the distance within which
             scan faces count as its surface.
-
-    Returns:
-        The joined mesh; patch faces look along the planes' normals.
     """
-    total = len(vertices)
-    edges, owner = border_edges(faces)
-    patches: list[tuple[int, list[np.ndarray], Polygon]] = []
-    borders: list[np.ndarray] = []
-    for k, (plane, region, tolerance) in enumerate(wanted):
-        inside = seen_in_plane(vertices, faces, plane, tolerance)
-        close = np.abs(plane.distance(vertices)) < IN_PLANE_M  # a wall's lower edge borders the floor, too
-        borders.append(edges[np.isin(owner, inside) | close[edges].all(axis=1)])
-        seen = _union(vertices, faces[inside], plane) if len(inside) else Polygon()
-        missing = shapely.make_valid(region.difference(seen))
-        flat = plane.flatten(vertices[np.unique(borders[k])])
-        for polygon in polygons_of(missing):
-            rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
-            patches.append((k, _insert_on_rings(rings, flat), polygon))
-    # Vertices that patches of other planes have on this plane (the line where floor and wall meet).
-    lifted = {i: wanted[k][0].lift(np.vstack(rings)) for i, (k, rings, _) in enumerate(patches)}
-    for i, (k, rings, polygon) in enumerate(patches):
-        plane = wanted[k][0]
-        others = [lifted[j] for j in lifted if patches[j][0] != k]
-        if others:
-            points = np.vstack(others)
-            points = points[np.abs(plane.distance(points)) < SAME_M]
-            patches[i] = (k, _insert_on_rings(rings, plane.flatten(points)), polygon)
-
-    corners_of, patch_plane, spots = _triangulate(vertices, borders, wanted, patches)
-    # New points at one place, from whichever patch, are one vertex.
-    new_points, same = _merged(spots)
-    corners_of = (
-        np.where(corners_of < 0, total + same[np.maximum(-corners_of - 1, 0)], corners_of) if len(same) else corners_of
+    found = [patches_of(vertices, faces, *plane) for plane in wanted]
+    first = np.cumsum([0, *(len(points) for points, _ in found)])
+    return Patches(
+        np.vstack([points for points, _ in found]),
+        np.vstack([triangles + start for (_, triangles), start in zip(found, first, strict=False)]),
+        np.repeat(np.arange(len(found)), [len(triangles) for _, triangles in found]),
     )
-    whole = (np.diff(np.sort(corners_of, axis=1), axis=1) > 0).all(axis=1)
-    corners_of, patch_plane = corners_of[whole], patch_plane[whole]
-    joined = np.vstack([vertices, new_points])
-    split, source = split_at(joined, faces, np.arange(total, len(joined)))
-    plane_of = np.concatenate([np.full(len(split), -1), patch_plane])
-    source = np.concatenate([source, np.full(len(corners_of), -1)])
-    joined, all_faces, cut = cut_teeth(joined, np.vstack([split, corners_of]), plane_of)
-    plane_of, source = plane_of[cut], source[cut]
-    more, more_plane = close_cracks(joined, all_faces, plane_of)
-    all_faces, plane_of = np.vstack([all_faces, more]), np.concatenate([plane_of, more_plane])
-    source = np.concatenate([source, np.full(len(more), -1)])
-    keep = without_flaps(all_faces, plane_of >= 0)
-    all_faces, plane_of, source = all_faces[keep], plane_of[keep], source[keep]
-    keep = without_dust(joined, all_faces, plane_of)
-    all_faces, plane_of, source = all_faces[keep], plane_of[keep], source[keep]
-    all_faces, given, plane_of = close_loops(joined, all_faces, plane_of)
-    return Filled(joined, all_faces, np.where(given >= 0, source[given], -1), plane_of)
-
-
-def _merged(spots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points without duplicates (to `SAME_M`), and for each given one the index of what stands for it."""
-    if len(spots) == 0:
-        return spots.reshape(-1, 3), np.zeros(0, np.int64)
-    pairs = KDTree(spots).query_pairs(SAME_M, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(spots),) * 2)
-    group = connected_components(graph, directed=False)[1]
-    first = np.unique(group, return_index=True)[1]
-    return spots[first], group
-
-
-def _triangulate(
-    vertices: np.ndarray,
-    borders: list[np.ndarray],
-    wanted: list[tuple[Plane, BaseGeometry, float]],
-    patches: list[tuple[int, list[np.ndarray], Polygon]],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Constrained Delaunay triangles of every patch over its ring points.
-
-    A ring point at a scan border vertex is that vertex; one inside a scan border edge lies on that edge, in
-    space; any other lies in the plane.
-
-    Returns:
-        faces (k, 3): vertex indices, or -1 - i for new point i; plane (k,); new points (i, 3).
-    """
-    faces, planes = [], []
-    spots: list[np.ndarray] = []
-    for number in sorted({k for k, _, _ in patches}):
-        plane, near = wanted[number][0], borders[number]
-        corner = np.unique(near)
-        tree = KDTree(plane.flatten(vertices[corner])) if len(corner) else None
-        starts, ends = vertices[near[:, 0]], vertices[near[:, 1]]
-        for _, rings, _ in (p for p in patches if p[0] == number):
-            points = np.vstack([ring[:-1] for ring in rings])
-            identity = np.full(len(points), -1, np.int64)
-            known = np.zeros(len(points), bool)
-            if tree is not None:
-                distance, at = (np.asarray(v) for v in tree.query(points))
-                known = distance < SAME_M
-                identity[known] = corner[at[known]]
-            edge, share = on_segments(points, plane.flatten(starts), plane.flatten(ends))
-            on_plane = plane.lift(points)
-            for i in np.flatnonzero(~known):
-                spot = on_plane[i]
-                if edge[i] >= 0:
-                    spot = starts[edge[i]] + share[i] * (ends[edge[i]] - starts[edge[i]])
-                spots.append(spot)
-                identity[i] = -len(spots)
-            outline = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
-            lookup = KDTree(points)
-            for piece in polygons_of(outline):
-                triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(piece))
-                corners = np.array([np.asarray(t.exterior.coords)[:3] for t in triangles]).reshape(-1, 3, 2)
-                distance, at = (np.asarray(v) for v in lookup.query(corners))
-                e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-                turned = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0
-                index = identity[at]
-                index[turned] = index[turned][:, ::-1]
-                fits = (distance < SAME_M).all(axis=1)
-                faces.append(index[fits])
-                planes.append(np.full(int(fits.sum()), number))
-    if not faces:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
-    return np.vstack(faces), np.concatenate(planes), np.array(spots).reshape(-1, 3)

@@ -168,19 +168,16 @@ def bake_structure(
     vertices: np.ndarray,
     faces: np.ndarray,
     cloud: ColourCloud,
-    max_faces: int,
     size: int,
 ) -> VisualMesh:
-    """Simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
+    """The simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
 
     Args:
-        vertices: (n, 3) of the scan with its patches, m.
-        faces: (m, 3) that stay.
+        vertices: (n, 3) of the simplified scan with its patches, m.
+        faces: (m, 3).
         cloud: coloured points of scan and patches.
-        max_faces: of the simplified scan.
         size: of the texture, pixels.
     """
-    vertices, faces = simplify(vertices, faces, max_faces)
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, _ = texel_surface(vertices, faces, uv, uv_faces, size)
     distance, index = KDTree(cloud.points).query(point, k=min(3, len(cloud.points)))

@@ -107,12 +107,10 @@ def test_simplify_keeps_the_shape_and_the_limit():
     assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(sphere.volume, rel=0.03)
 
 
-def test_structure_is_simplified_and_takes_the_clouds_colours():
-    sphere = trimesh.creation.icosphere(3)
-    visual = bake_structure(
-        np.asarray(sphere.vertices), np.asarray(sphere.faces), cloud_over(sphere, (90, 90, 90)), 100, 64
-    )
-    assert len(visual.faces) <= 102 and visual.uv_faces.shape == visual.faces.shape
+def test_structure_takes_the_clouds_colours():
+    sphere = trimesh.creation.icosphere(2)
+    visual = bake_structure(np.asarray(sphere.vertices), np.asarray(sphere.faces), cloud_over(sphere, (90, 90, 90)), 64)
+    assert len(visual.faces) == len(sphere.faces) and visual.uv_faces.shape == visual.faces.shape
     assert (visual.image == 90).all()
 
 
