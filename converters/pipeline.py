@@ -173,14 +173,13 @@ def _structure_visual(
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
-    patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud)
+    scan = simplify(level, raw.scan.faces[kept], config.structure_faces)
+    patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
     both = ColourCloud(
         *(np.vstack([getattr(cloud, f), getattr(patch_cloud, f)]) for f in ("points", "normals", "colours"))
     )
     area = float(face_areas(patches.vertices, patches.faces).sum())
-    most = max(config.structure_faces - len(patches.faces), config.structure_faces // 2)
-    scan = simplify(level, raw.scan.faces[kept], most)
-    whole = (np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])]))
+    whole = np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])])
     return bake_structure(*whole, both, config.structure_texture), area
 
 

@@ -312,6 +312,7 @@ def fill_holes(
     plan: FloorPlan,
     objects: tuple[PlacedObject, ...],
     cloud: ColourCloud,
+    shown: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Patches, ColourCloud]:
     """What furniture hid of floor and walls, and coloured points on it.
 
@@ -322,9 +323,10 @@ def fill_holes(
         plan: of the floor.
         objects: as annotated.
         cloud: coloured points of the cleaned scan; each patch takes the colours seen around it in its plane.
+        shown: vertices and faces of the simplified scan, which draws back from holes: patches reach under its border.
     """
     wanted = hidden_surfaces(plan, wall_planes(vertices, faces, labels), vertices, faces, objects)
-    filled = fill_planes(vertices, faces, wanted)
+    filled = fill_planes(*shown, wanted)
     points, normals, colours = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros((0, 3))]
     for k, (plane, _, tolerance) in enumerate(wanted):
         patch = filled.faces[filled.plane == k]

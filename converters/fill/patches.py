@@ -190,7 +190,7 @@ def patches_of(
     for polygon in polygons_of(missing):
         under = polygon.buffer(OVERLAP_M, quad_segs=1).intersection(around)
         grown = shapely.union_all([*polygons_of(under), polygon.buffer(FREE_M, quad_segs=1)], grid_size=1e-6)
-        grown = grown.simplify(OUTLINE_M).segmentize(OVERLAP_M)
+        grown = grown.simplify(OUTLINE_M).segmentize(1.5 * OVERLAP_M)
         for piece in polygons_of(shapely.make_valid(grown)):
             corners = np.array(
                 [t.exterior.coords[:3] for t in shapely.get_parts(shapely.constrained_delaunay_triangles(piece))]
