@@ -86,7 +86,7 @@ def test_no_ray_from_within_the_room_passes_floor_or_wall(relief_m):
         assert hidden.sum() > 500
         assert (closed[hidden] > 0).mean() >= (1.0 if relief_m < 0.02 else 0.998)
         # Hardly anything that was seen is covered, and then by millimetres; what was hidden is near where it was.
-        assert (seen & (closed < holed - 1e-6)).sum() < 0.01 * seen.sum()
+        assert (seen & (closed < holed - 1e-6)).sum() < 0.015 * seen.sum()
         assert (holed - closed)[seen].max() < 1.5 * relief_m + 1e-6
         assert np.median(np.abs(closed - intact)[hidden]) < 0.06
 
