@@ -99,11 +99,7 @@ def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
     pose[:3, 3] = position
     pieces = item.pieces
     if category == "door":
-        box = upright_box(vertices)
-        yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
-        if box.half[1] > box.half[0]:
-            yaw += math.pi / 2
-        turn = yaw_matrix(yaw)
+        turn = leaf_turn(vertices)
         pose[:3, :3] = turn
         vertices = vertices @ turn
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
@@ -111,6 +107,13 @@ def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
     cad = CadModel(category, name, vertices, faces, colours, pieces, item.mass_kg, item.friction)
     none = np.zeros((0, 3))
     return Annotation(category, name, pose, "__SYM_NONE", none, none), cad
+
+
+def leaf_turn(leaf: np.ndarray) -> np.ndarray:
+    """(3, 3) yaw that a door's leaf, (n, 3), is turned by from the x axis."""
+    box = upright_box(leaf)
+    yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
+    return yaw_matrix(yaw + math.pi / 2 if box.half[1] > box.half[0] else yaw)
 
 
 def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> Hinge:

@@ -218,7 +218,7 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
         return corner_uv, images[0]
     # A plain colour needs a few pixels, so that rounding does not reach a neighbour.
     tiles = [np.tile(i, (4, 4, 1)) if i.shape[:2] == (1, 1) else i for i in images]
-    tiles = [_at_most(t, MAX_TEXTURE_PX) for t in tiles]
+    tiles = [at_most(t, MAX_TEXTURE_PX) for t in tiles]
     width, height = max(t.shape[1] for t in tiles), sum(t.shape[0] for t in tiles)
     joint = np.zeros((height, width, 3), np.uint8)
     result = np.empty_like(corner_uv)
@@ -238,7 +238,8 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
     return result, joint
 
 
-def _at_most(image: np.ndarray, side: int) -> np.ndarray:
+def at_most(image: np.ndarray, side: int) -> np.ndarray:
+    """The image shrunk until no side is longer."""
     largest = max(image.shape[:2])
     if largest <= side:
         return image

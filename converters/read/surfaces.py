@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+import dataclasses
 
+import numpy as np
+import trimesh
+
+from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, FLOOR, UNLABELLED, WALL
 
@@ -17,12 +21,49 @@ WALL_SHARE = 0.6
 CEILING_FROM_M = 1.8
 FLOOR_SHARE = 0.05
 """Least share of the scan's footprint that must lie level at the floor's height."""
+LONG_M, FINE_M = 0.5, 0.15
+"""Faces with longer edges than the first are cut until none is longer than the second."""
+TINY = 1e-9
 
 
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(m, 3) normals of the faces, as long as their areas (m2)."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a) / 2
+
+
+def densified(mesh: TexturedMesh, labels: np.ndarray | None) -> tuple[TexturedMesh, np.ndarray | None]:
+    """The mesh with faces of long edges cut into smaller ones: the stages take a scan's vertices for its surface.
+
+    Scans are fine everywhere; rooms that were modelled are not. Faces whose edges are all up to `LONG_M` stay.
+
+    Args:
+        mesh: m.
+        labels: (n,) of the vertices, or None; a new vertex takes that of its face's first corner.
+    """
+    corners = mesh.vertices[mesh.faces]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    long = np.flatnonzero(edge > LONG_M)
+    if not len(long):
+        return mesh, labels
+    # Texture coordinates ride along as further columns, too small to count as length.
+    uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
+    rows = np.concatenate([corners[long], TINY * uv[long]], axis=2).reshape(-1, 5)
+    fine, faces, of = trimesh.remesh.subdivide_to_size(
+        rows, np.arange(len(rows)).reshape(-1, 3), FINE_M, max_iter=16, return_index=True
+    )
+    stay = np.delete(np.arange(len(mesh.faces)), long)
+    whole = dataclasses.replace(
+        mesh,
+        vertices=np.vstack([mesh.vertices, fine[:, :3]]),
+        faces=np.vstack([mesh.faces[stay], faces + len(mesh.vertices)]),
+        corner_uv=None if mesh.corner_uv is None else np.concatenate([uv[stay], fine[faces, 3:] / TINY]),
+    )
+    if labels is None:
+        return whole, None
+    own = np.zeros(len(fine), np.int64)
+    own[faces] = labels[mesh.faces[long[of], 0]][:, None]
+    return whole, np.concatenate([labels, own])
 
 
 def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: float) -> np.ndarray:

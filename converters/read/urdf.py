@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -50,20 +51,20 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str) -> RigidObject:
         root = ElementTree.parse(path).getroot()
         links = {str(e.get("name")): e for e in root.findall("link")}
         places = _link_places(path, root, links)
-        visual = [_place(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual")]
-        solid = [_place(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision")]
+        visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual")]
+        solid = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision")]
         masses = [_value(e, "inertial/mass") for e in links.values()]
         frictions = [_value(e, "contact/lateral_friction") for e in links.values()]
     except (ElementTree.ParseError, ValueError, KeyError, LookupError) as error:
         if isinstance(error, SceneRejected):
             raise
         raise SceneRejected(f"{path}: not readable as URDF ({type(error).__name__}: {error})") from error
-    surface = _joined(visual or solid)
+    surface = joined(visual or solid)
     if surface is None:
         raise SceneRejected(f"{path}: names no mesh to see or to collide with; expected a <visual> with geometry")
     if not solid:
         source.note(f"{relative}: has no collision mesh; the visual one is decomposed")
-    body = _joined(solid) or surface
+    body = joined(solid) or surface
     mass = sum(m for m in masses if m is not None)
     friction = [f for f in frictions if f is not None and f > 0]
     if mass <= 0:
@@ -78,7 +79,12 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str) -> RigidObject:
     )
 
 
-def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
+def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
+    """As many numbers as the default has, from text.
+
+    Raises:
+        ValueError: another count, not finite, or beyond 1e6.
+    """
     values = np.array((text or "").split() or default, float)
     if values.shape != np.shape(default) or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e6:
         raise ValueError(f"'{text}' is not {len(default)} usable numbers")
@@ -87,7 +93,7 @@ def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
 
 def _value(link: ElementTree.Element, tag: str) -> float | None:
     element = link.find(tag)
-    return None if element is None else float(_numbers(element.get("value"), (0.0,))[0])
+    return None if element is None else float(numbers(element.get("value"), (0.0,))[0])
 
 
 def _origin(element: ElementTree.Element) -> np.ndarray:
@@ -95,8 +101,8 @@ def _origin(element: ElementTree.Element) -> np.ndarray:
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
-    matrix = trimesh.transformations.euler_matrix(*_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)), axes="sxyz")
-    matrix[:3, 3] = _numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
+    matrix = trimesh.transformations.euler_matrix(*numbers(origin.get("rpy"), (0.0, 0.0, 0.0)), axes="sxyz")
+    matrix[:3, 3] = numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
     return matrix
 
 
@@ -143,10 +149,10 @@ def _geometries(source: SourceFolder, path: Path, link: ElementTree.Element, kin
                 raise SceneRejected(f"{path}: names the mesh '{name}', which is not there; put it beside the URDF")
             inside = source.inside(target)
             mesh = read_surface(source, inside, "") if kind == "visual" else _bare(source, inside)
-            mesh = _place(mesh, np.diag([*_numbers(shape.get("scale"), (1.0, 1.0, 1.0)), 1.0]))
+            mesh = placed(mesh, np.diag([*numbers(shape.get("scale"), (1.0, 1.0, 1.0)), 1.0]))
         else:
-            mesh = _primitive(path, shape)
-        found.append(_place(mesh, _origin(element)))
+            mesh = primitive(path, shape.tag, shape.get)
+        found.append(placed(mesh, _origin(element)))
     return found
 
 
@@ -158,21 +164,33 @@ def _bare(source: SourceFolder, relative: str) -> TexturedMesh:
     return TexturedMesh(mesh.vertices, mesh.faces, None, None)
 
 
-def _primitive(path: Path, shape: ElementTree.Element) -> TexturedMesh:
-    if shape.tag == "box":
-        solid = trimesh.creation.box(_numbers(shape.get("size"), (0.0, 0.0, 0.0)))
-    elif shape.tag == "cylinder":
+def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> TexturedMesh:
+    """A box, cylinder or sphere, uncoloured.
+
+    Args:
+        path: named in errors.
+        kind: of shape.
+        text: a dimension's name -> its text, m.
+
+    Raises:
+        SceneRejected: another kind.
+        ValueError: a dimension that is no number.
+    """
+    if kind == "box":
+        solid = trimesh.creation.box(numbers(text("size"), (0.0, 0.0, 0.0)))
+    elif kind == "cylinder":
         solid = trimesh.creation.cylinder(
-            _numbers(shape.get("radius"), (0.0,))[0], _numbers(shape.get("length"), (0.0,))[0], sections=16
+            numbers(text("radius"), (0.0,))[0], numbers(text("length"), (0.0,))[0], sections=16
         )
-    elif shape.tag == "sphere":
-        solid = trimesh.creation.icosphere(2, _numbers(shape.get("radius"), (0.0,))[0])
+    elif kind == "sphere":
+        solid = trimesh.creation.icosphere(2, numbers(text("radius"), (0.0,))[0])
     else:
-        raise SceneRejected(f"{path}: geometry <{shape.tag}>, expected mesh, box, cylinder or sphere")
+        raise SceneRejected(f"{path}: geometry <{kind}>, expected mesh, box, cylinder or sphere")
     return TexturedMesh(np.asarray(solid.vertices, float), np.asarray(solid.faces, np.int64), None, None)
 
 
-def _place(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
+def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
+    """The mesh moved by a (4, 4) matrix; one that mirrors turns the faces' order."""
     faces = mesh.faces if np.linalg.det(matrix[:3, :3]) > 0 else mesh.faces[:, ::-1]
     corner_uv = mesh.corner_uv
     if faces is not mesh.faces and corner_uv is not None:
@@ -182,7 +200,8 @@ def _place(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
     )
 
 
-def _joined(meshes: list[TexturedMesh]) -> TexturedMesh | None:
+def joined(meshes: list[TexturedMesh]) -> TexturedMesh | None:
+    """All meshes as one; None of none."""
     if not meshes:
         return None
     result = meshes[0]

@@ -79,7 +79,7 @@ def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> 
     inside = depth_in_hulls(points, placed.hulls_b)
     near = (distance < NEAR_OTHER_M) | (inside < 0.02)
     over = ((points > low - 0.03) & (points < high + [0.03, 0.03, LYING_ABOVE_M])).all(axis=1)
-    own = np.isin(label, CATEGORY_LABELS[placed.category])
+    own = np.isin(label, CATEGORY_LABELS.get(placed.category, ()))
     structure = np.isin(label, STRUCTURE_LABELS) & ~own
     gone = (own & ((distance < NEAR_OWN_M) | (inside < NEAR_OWN_M / 2))) | (~structure & near)
     gone |= np.isin(label, SMALL_LABELS) & over
@@ -134,7 +134,7 @@ def _take_rest_of_instances(
     n_vertices: int,
 ) -> None:
     """Extends `owner` in place: a connected piece of a category's label that is mostly cut goes entirely."""
-    index = np.flatnonzero(np.isin(label, CATEGORY_LABELS[category]))
+    index = np.flatnonzero(np.isin(label, CATEGORY_LABELS.get(category, ())))
     if len(index) == 0:
         return
     piece = face_pieces(faces[index], n_vertices)

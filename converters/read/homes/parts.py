@@ -1,0 +1,225 @@
+"""Placed parts of a home in; structure as a scan, furniture as models and annotations, out.
+
+Authors of simulated homes fix most furniture to the world to save time. Here a part moves if its name says that it is
+of a movable category, whatever its source calls it; what stands on such a part moves with it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+
+from converters.geometry.faces import merge_vertices
+from converters.geometry.pieces import convex_pieces
+from converters.read.cad import clean_surface
+from converters.read.files import SourceFolder
+from converters.read.gibson import read_licence
+from converters.read.interactive_gibson import assume_hinge, leaf_turn
+from converters.read.meshes import colours_of_faces
+from converters.read.obj import TexturedMesh, at_most, join_meshes
+from converters.read.storeys import label_storeys
+from converters.read.surfaces import densified
+from converters.read.urdf import joined, placed
+from converters.records.errors import SceneRejected
+from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh
+from scenes_mjcf.categories import CATEGORIES, Category
+
+ALIASES = {
+    "ball": "toy",
+    "bedsidetable": "nightstand",
+    "bookshelf": "bookcase",
+    "cabinet": "sideboard",
+    "chestofdrawers": "dresser",
+    "couch": "sofa",
+    "cupboard": "wardrobe",
+    "dustbin": "bin",
+    "foldingdoor": "structure",
+    "garbage": "bin",
+    "kitchencabinet": "counter",
+    "refrigerator": "fridge",
+    "settee": "sofa",
+    "slidingdoor": "structure",
+    "trash": "bin",
+    "trashcan": "bin",
+    "tvcabinet": "tv_bench",
+    "tvstand": "tv_bench",
+}
+"""Names that others give to our categories."""
+OTHER_STRUCTURE = 38
+"""NYU40's word for what is built in and nothing else."""
+TEXTURE_PX = 512
+STANDS_M = 0.15
+"""Of its base above the floor: what is higher stands on something else, or hangs."""
+RESTS_M = 0.10
+"""What stands on a part may begin so far above the part's top."""
+DOOR_MOST_M = 1.3
+"""Wider leaves fold or slide: they stay where they are."""
+FLOOR_BIN_M = 0.05
+FLOOR_SHARE = 0.2
+"""Of the largest level's area that the floor has at least."""
+MASS_FACTOR = 2.0
+"""A mass that far outside of its category's range is a placeholder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One rigid thing."""
+
+    name: str
+    pose: np.ndarray
+    """(4, 4) own frame -> home, unscaled."""
+    surface: TexturedMesh
+    """Own frame, m."""
+    collision: TexturedMesh | None
+    static: bool
+    mass_kg: float | None = None
+    friction: float | None = None
+
+
+def category_of(name: str) -> Category | None:
+    """The category that a part's name tells, by its last words: an English compound is what its last word says.
+
+    `DeskPortrait` is no desk, `KitchenTable_01` a table. Numbers and single letters are not counted.
+    """
+    words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name) if len(w) > 1]
+    known = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
+    known |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
+    for first in range(len(words)):
+        found = known.get("".join(words[first:])) or known.get("".join(words[first:]).removesuffix("s"))
+        if found is not None:
+            return found
+    return None
+
+
+def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
+    """The record of a home that is made of parts.
+
+    Raises:
+        SceneRejected: nothing built in that has a floor.
+    """
+    bounds = [_bounds(part) for part in parts]
+    floor_m = _floor_height(source, parts)
+    moves = [_moves(part, low, high, floor_m) for part, (low, high) in zip(parts, bounds, strict=True)]
+    carried = _carriers(bounds, moves, floor_m)
+    structure = [p for p, moving, by in zip(parts, moves, carried, strict=True) if not moving and by is None]
+    if not structure:
+        raise SceneRejected(f"{source.root}: no part is built in; expected floor and walls")
+    shells = [placed(_small(p.surface), p.pose) for p in structure]
+    mesh = joined(shells)
+    assert mesh is not None
+    mesh, _ = densified(mesh, None)
+    labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
+    labels[labels == UNLABELLED] = OTHER_STRUCTURE
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    pairs = [
+        _furniture(source, part, [parts[k] for k, by in enumerate(carried) if by == i], middle)
+        for i, (part, moving) in enumerate(zip(parts, moves, strict=True))
+        if moving
+    ]
+    riders = sum(by is not None for by in carried)
+    if riders:
+        source.note(f"{riders} things stand on furniture and move with it")
+    grey = np.full((len(mesh.vertices), 3), 170, np.uint8) if mesh.texture is None else None
+    return RawScene(
+        name=source.root.resolve().name,
+        source_format=layout,
+        scan=ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture),
+        cads={a.cad_id: c for a, c in pairs},
+        annotations=tuple(a for a, _ in pairs),
+        floor_height_m=floor_m,
+        given_map=None,
+        licence=read_licence(source),
+        sources=dict(sorted(source.sha256.items())),
+        warnings=tuple(source.warnings),
+    )
+
+
+def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    points = part.surface.vertices @ part.pose[:3, :3].T + part.pose[:3, 3]
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _small(mesh: TexturedMesh) -> TexturedMesh:
+    return mesh if mesh.texture is None else dataclasses.replace(mesh, texture=at_most(mesh.texture, TEXTURE_PX))
+
+
+def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> bool:
+    """True for furniture that stands on the floor."""
+    category = category_of(part.name)
+    if category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M:
+        return False
+    movable = not part.static if category is None else category.is_object
+    return movable and abs(low[2] - floor_m) < STANDS_M
+
+
+def _carriers(bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], floor_m: float) -> list[int | None]:
+    """For each part the number of the movable one that it stands on, or lies in, if any."""
+    carried: list[int | None] = [None] * len(bounds)
+    for i, (low, high) in enumerate(bounds):
+        if moves[i] or low[2] - floor_m < STANDS_M:
+            continue
+        x, y = (low + high)[:2] / 2
+        for k, (base, top) in enumerate(bounds):
+            over = base[0] < x < top[0] and base[1] < y < top[1]
+            if moves[k] and over and base[2] < low[2] < top[2] + RESTS_M:
+                carried[i] = k
+    return carried
+
+
+def _floor_height(source: SourceFolder, parts: list[Part]) -> float:
+    """The lowest level that holds a fifth of the largest level's area; faces that look up count.
+
+    Raises:
+        SceneRejected: nothing is level.
+    """
+    area: dict[int, float] = {}
+    for part in parts:
+        corners = (part.surface.vertices @ part.pose[:3, :3].T + part.pose[:3, 3])[part.surface.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        level = normal[:, 2] > 0.95 * np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+        bins = np.round(corners[level, :, 2].mean(axis=1) / FLOOR_BIN_M).astype(int)
+        for k, a in zip(bins.tolist(), normal[level, 2].tolist(), strict=True):
+            area[k] = area.get(k, 0.0) + a
+    if not area:
+        raise SceneRejected(f"{source.root}: no part has a level face that looks up; expected a floor, z up")
+    return FLOOR_BIN_M * min(k for k, a in area.items() if a >= FLOOR_SHARE * max(area.values()))
+
+
+def _furniture(
+    source: SourceFolder, part: Part, riders: list[Part], structure: np.ndarray
+) -> tuple[Annotation, CadModel]:
+    """One movable part with what stands on it."""
+    surface, collision = _small(part.surface), part.collision
+    for rider in riders:
+        by = np.linalg.inv(part.pose) @ rider.pose
+        surface = join_meshes(surface, placed(_small(rider.surface), by))
+        if collision is not None:
+            collision = join_meshes(collision, placed(rider.collision or rider.surface, by))
+    vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
+    vertices, faces, colours = clean_surface(source, part.name, vertices, faces, colours_of_faces(surface)[keep])
+    pieces = None if collision is None else convex_pieces(collision.vertices, collision.faces)
+    category = category_of(part.name)
+    name, pose, hinge = "other" if category is None else category.name, part.pose, None
+    if name == "door":
+        turn = leaf_turn(vertices)
+        vertices, pose = vertices @ turn, pose.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn
+        pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
+        hinge = assume_hinge(vertices, pose, structure)
+    cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", part.name)
+    cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction)
+    none = np.zeros((0, 3))
+    return Annotation(name, cad_id, pose, "__SYM_NONE", none, none, hinge), cad
+
+
+def _mass(source: SourceFolder, part: Part, category: str) -> float | None:
+    """The part's own mass where it is plausible; else None, and the category's density gives it."""
+    material = CATEGORIES[category].material
+    assert material is not None
+    low, high = material.mass_range_kg
+    if part.mass_kg is None or low / MASS_FACTOR <= part.mass_kg <= high * MASS_FACTOR:
+        return part.mass_kg
+    source.note(f"{part.name}: {part.mass_kg:g} kg is a placeholder; a {category} weighs {low:g} to {high:g} kg")
+    return None
