@@ -25,6 +25,9 @@ from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
 from scenes_mjcf.schema import CATEGORIES
 
+FORMATS = ("gibson", "interactive-gibson", "scan2cad", "sdf")
+"""`READERS` of `converters.read.source`, which need not be imported to say so."""
+
 
 class Interrupted(BaseException):
     """SIGTERM arrived; unwinds like Ctrl-C so that every `finally` runs."""
@@ -36,7 +39,10 @@ def _on_sigterm(signum: int, frame: FrameType | None) -> None:
 
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import ConvertConfig, convert_building
+    from converters.recipes import check_conversion, parse_settings
 
+    settings = parse_settings(arguments.settings)
+    check_conversion(settings, "settings")
     config = ConvertConfig(
         format=arguments.format,
         split=arguments.split,
@@ -48,6 +54,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         strict=arguments.strict,
         timeout_s=arguments.timeout,
     )
+    config = dataclasses.replace(config, **settings)
     warn = warn_once(console)
     with stage_progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
@@ -216,9 +223,15 @@ def _add_convert(commands: _Commands) -> None:
     )
     command.add_argument(
         "--format",
-        choices=("auto", "gibson", "interactive-gibson", "scan2cad"),
+        choices=("auto", *FORMATS),
         default="auto",
         help="layout of SRC (default: told from its files)",
+    )
+    command.add_argument(
+        "settings",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="structure_faces, object_faces (triangles drawn), structure_texture, object_texture (pixels)",
     )
     command.add_argument("--split", choices=("train", "test"), default="train", help="recorded in scene.json")
     command.add_argument(
@@ -242,7 +255,7 @@ def _add_propose(commands: _Commands) -> None:
     command = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
     command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
-    command.add_argument("--format", choices=("auto", "gibson", "interactive-gibson", "scan2cad"), default="auto")
+    command.add_argument("--format", choices=("auto", *FORMATS), default="auto")
     command.add_argument(
         "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
     )

@@ -24,7 +24,7 @@ from converters.check.gates import evaluate
 from converters.check.settle import Settled, settle
 from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import face_areas
+from converters.geometry.faces import face_areas, simplify, simplify_parts
 from converters.propose.proposals import propose_instances
 from converters.propose.report import floor_of
 from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
@@ -41,7 +41,7 @@ from converters.structure.maps import FloorPlan, main_direction, make_floor_plan
 from converters.structure.walls import wall_boxes
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest
-from converters.write.texture import bake_object, bake_structure, colour_cloud, simplify
+from converters.write.texture import bake_object, bake_structure, colour_cloud
 from interactive_nav_common.files import part_folder, publish
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
@@ -173,6 +173,10 @@ def _structure_visual(
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
+    if raw.picture:
+        drawn, faces = simplify_parts(raw.picture, config.structure_faces)
+        drawn = drawn + (vertices_w[0] - raw.scan.vertices[0])
+        return bake_structure(drawn, faces, cloud, config.structure_texture), 0.0
     scan = simplify(level, raw.scan.faces[kept], config.structure_faces)
     patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
     both = ColourCloud(

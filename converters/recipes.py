@@ -134,6 +134,18 @@ def parse_settings(words: Iterable[str]) -> dict[str, Any]:
     return settings
 
 
+def check_conversion(settings: dict[str, Any], where: str) -> None:
+    """Refuses settings of a conversion that do not exist, or are no whole numbers.
+
+    Raises:
+        GenerationError: one of these.
+    """
+    _refuse_unknown(settings, _CONVERSION, where)
+    for key, value in settings.items():
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise GenerationError(f"{where}: {key} is {value!r}, expected a whole number of 0 or more")
+
+
 def parse_recipes(data: Any, where: str) -> Recipes:
     """Decoded YAML -> recipes.
 
@@ -151,10 +163,7 @@ def parse_recipes(data: Any, where: str) -> Recipes:
     conversion = data.get("conversion") or {}
     if not isinstance(conversion, dict):
         raise GenerationError(f"{where}: conversion is {conversion!r}, expected a mapping")
-    _refuse_unknown(conversion, _CONVERSION, f"{where}: conversion")
-    for key, value in conversion.items():
-        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-            raise GenerationError(f"{where}: conversion: {key} is {value!r}, expected a whole number of 0 or more")
+    check_conversion(conversion, f"{where}: conversion")
     scenes = []
     for name, recipe in data["scenes"].items():
         here = f"{where}: scenes: {name}"

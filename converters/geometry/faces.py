@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import fast_simplification
 import numpy as np
+import trimesh
+
+LEAST_FACES = 24
+"""Of a part, however many there are."""
+SMALL_M = 0.6
+"""Longest side of a thing that may be drawn as its hull."""
 
 
 def face_labels(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -52,3 +59,34 @@ def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     faces = inverse.reshape(-1)[faces]
     keep = np.flatnonzero((faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0]))
     return vertices[first], faces[keep], keep
+
+
+def simplify(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadric simplification to at most about `max_faces` faces; equal positions are joined first."""
+    vertices, faces, _ = merge_vertices(vertices, faces)
+    if len(faces) > max_faces:
+        points, triangles = fast_simplification.simplify(
+            np.asarray(vertices, np.float64), faces.astype(np.int32), target_count=max_faces
+        )[:2]
+        vertices, faces, _ = merge_vertices(np.asarray(points, float), np.asarray(triangles, np.int64))
+    used, inverse = np.unique(faces, return_inverse=True)
+    return vertices[used], inverse.reshape(-1, 3)
+
+
+def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """All parts as one mesh of about so many faces, shared out by the roots of their areas.
+
+    A level plane that is simplified as part of a larger mesh loses its outline; by itself it has few enough faces to
+    stay. A small thing of many loose pieces, which cannot be simplified, becomes its convex hull.
+    """
+    weight = np.sqrt([face_areas(*part).sum() for part in parts])
+    most = np.maximum((max_faces * weight / weight.sum()).astype(int), LEAST_FACES)
+    done = []
+    for part, n in zip(parts, most.tolist(), strict=True):
+        vertices, faces = simplify(*part, n)
+        if len(faces) > 2 * n and np.ptp(vertices, axis=0).max() < SMALL_M:
+            hull = trimesh.convex.convex_hull(vertices)
+            vertices, faces = simplify(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64), n)
+        done.append((vertices, faces))
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in done)])
+    return np.vstack([v for v, _ in done]), np.vstack([f + k for (_, f), k in zip(done, first, strict=False)])

@@ -6,8 +6,12 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
+from converters.geometry.faces import face_areas
+
 MAX_PIECES = 16
 """Convex pieces of one object; the gates' limit (`hulls_per_object`)."""
+SLIVER_SHARE = 0.1
+"""Of a mesh's area that flat pieces may have."""
 CONVEX_SHARE = 0.9
 """A piece that fills this share of its convex hull counts as convex."""
 
@@ -31,15 +35,18 @@ def convex_pieces(
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1)
     points: list[np.ndarray] = []
+    flat_m2 = 0.0
     for group in groups:
         own = vertices[np.unique(faces[group])]
         full = hull_volume(own)
         if full <= 0:
+            flat_m2 += float(face_areas(vertices, faces[group]).sum())
             continue  # flat slivers
         if abs(trimesh.triangles.mass_properties(vertices[faces[group]]).volume) < CONVEX_SHARE * full:
             return None
         points.append(own)
-    if not points:
+    # Faces that share no vertices are flat pieces too, of a solid that only its source knows.
+    if not points or flat_m2 > SLIVER_SHARE * float(face_areas(vertices, faces).sum()):
         return None
     points = merge_pieces(points, most, None if slack is None else slack * float(np.ptp(vertices, axis=0).prod()))
     hulls = [trimesh.convex.convex_hull(p) for p in points]

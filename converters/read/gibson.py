@@ -175,9 +175,10 @@ def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, flo
 
 
 def read_licence(source: SourceFolder) -> str:
-    """First 400 characters of the folder's LICENCE, on one line."""
+    """First 400 characters of the folder's LICENCE or LICENSE, on one line."""
     licence = "unknown: the source folder has no LICENCE file"
-    if source.has("LICENCE"):
-        text = source.use("LICENCE", "").read_text(encoding="utf-8", errors="replace").strip()
+    name = "LICENCE" if source.has("LICENCE") else "LICENSE"
+    if source.has(name):
+        text = source.use(name, "").read_text(encoding="utf-8", errors="replace").strip()
         licence = " ".join(text.split())[:400] or licence
     return licence

@@ -21,7 +21,7 @@ WALL_SHARE = 0.6
 CEILING_FROM_M = 1.8
 FLOOR_SHARE = 0.05
 """Least share of the scan's footprint that must lie level at the floor's height."""
-LONG_M, FINE_M = 0.5, 0.15
+LONG_M, FINE_M = 0.5, 0.2
 """Faces with longer edges than the first are cut until none is longer than the second."""
 TINY = 1e-9
 

@@ -134,5 +134,7 @@ class RawScene:
     """Path relative to the source folder -> sha256."""
     storeys: tuple[Storey, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """From the lowest up, where there are several; `converters.read.storeys.split_storeys` takes them apart."""
+    picture: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    """Vertices (n, 3) and faces (m, 3) of the parts that a modelled structure is drawn with, in place of the scan."""
     warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """What the reader repaired or found missing, for scene.json."""

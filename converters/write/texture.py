@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fast_simplification
 import numpy as np
 import trimesh
 import xatlas
@@ -10,7 +9,7 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from converters.geometry.faces import merge_vertices, sample_faces
+from converters.geometry.faces import sample_faces, simplify
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, VisualMesh
 
@@ -85,18 +84,6 @@ def _uv_at(
     v, w = (d22 * q1 - d12 * q2) / safe, (d11 * q2 - d12 * q1) / safe
     uv = corner_uv[:, 0] * (1 - v - w)[:, None] + corner_uv[:, 1] * v[:, None] + corner_uv[:, 2] * w[:, None]
     return np.where(good[:, None], uv, fallback)
-
-
-def simplify(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quadric simplification to at most about `max_faces` faces; equal positions are joined first."""
-    vertices, faces, _ = merge_vertices(vertices, faces)
-    if len(faces) > max_faces:
-        points, triangles = fast_simplification.simplify(
-            np.asarray(vertices, np.float64), faces.astype(np.int32), target_count=max_faces
-        )[:2]
-        vertices, faces, _ = merge_vertices(np.asarray(points, float), np.asarray(triangles, np.int64))
-    used, inverse = np.unique(faces, return_inverse=True)
-    return vertices[used], inverse.reshape(-1, 3)
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

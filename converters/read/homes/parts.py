@@ -12,7 +12,7 @@ import re
 import numpy as np
 
 from converters.geometry.faces import merge_vertices
-from converters.geometry.pieces import convex_pieces
+from converters.geometry.pieces import MAX_PIECES, convex_pieces
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_licence
@@ -52,6 +52,8 @@ OTHER_STRUCTURE = 38
 TEXTURE_PX = 512
 STANDS_M = 0.15
 """Of its base above the floor: what is higher stands on something else, or hangs."""
+RAISED_M = 0.03
+"""What begins lower lies on the floor, and on nothing else."""
 RESTS_M = 0.10
 """What stands on a part may begin so far above the part's top."""
 DOOR_MOST_M = 1.3
@@ -131,6 +133,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
         floor_height_m=floor_m,
         given_map=None,
         licence=read_licence(source),
+        picture=tuple((shell.vertices, shell.faces) for shell in shells),
         sources=dict(sorted(source.sha256.items())),
         warnings=tuple(source.warnings),
     )
@@ -158,7 +161,7 @@ def _carriers(bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], fl
     """For each part the number of the movable one that it stands on, or lies in, if any."""
     carried: list[int | None] = [None] * len(bounds)
     for i, (low, high) in enumerate(bounds):
-        if moves[i] or low[2] - floor_m < STANDS_M:
+        if moves[i] or low[2] - floor_m < RAISED_M:
             continue
         x, y = (low + high)[:2] / 2
         for k, (base, top) in enumerate(bounds):
@@ -191,15 +194,14 @@ def _furniture(
     source: SourceFolder, part: Part, riders: list[Part], structure: np.ndarray
 ) -> tuple[Annotation, CadModel]:
     """One movable part with what stands on it."""
-    surface, collision = _small(part.surface), part.collision
+    surface, pieces = _small(part.surface), _pieces(part, np.eye(4))
     for rider in riders:
         by = np.linalg.inv(part.pose) @ rider.pose
-        surface = join_meshes(surface, placed(_small(rider.surface), by))
-        if collision is not None:
-            collision = join_meshes(collision, placed(rider.collision or rider.surface, by))
+        surface, more = join_meshes(surface, placed(_small(rider.surface), by)), _pieces(rider, by)
+        pieces = None if pieces is None or more is None else pieces + more
+    pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     vertices, faces, colours = clean_surface(source, part.name, vertices, faces, colours_of_faces(surface)[keep])
-    pieces = None if collision is None else convex_pieces(collision.vertices, collision.faces)
     category = category_of(part.name)
     name, pose, hinge = "other" if category is None else category.name, part.pose, None
     if name == "door":
@@ -208,10 +210,19 @@ def _furniture(
         pose[:3, :3] = pose[:3, :3] @ turn
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
         hinge = assume_hinge(vertices, pose, structure)
-    cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", part.name)
+    cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
     cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction)
     none = np.zeros((0, 3))
     return Annotation(name, cad_id, pose, "__SYM_NONE", none, none, hinge), cad
+
+
+def _pieces(part: Part, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
+    """Convex pieces of a part's collision mesh, moved; None where there is none or it is not made of them."""
+    if part.collision is None:
+        return None
+    solid = placed(part.collision, by)
+    vertices, faces, _ = merge_vertices(solid.vertices, solid.faces)
+    return convex_pieces(vertices, faces)
 
 
 def _mass(source: SourceFolder, part: Part, category: str) -> float | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from converters.geometry.faces import simplify
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud
 from converters.write.texture import (
@@ -14,7 +15,6 @@ from converters.write.texture import (
     colour_cloud,
     fill_image,
     quantise,
-    simplify,
     texel_surface,
 )
 
