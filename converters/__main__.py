@@ -41,20 +41,18 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import ConvertConfig, convert_building
     from converters.recipes import check_conversion, parse_settings
 
-    settings = parse_settings(arguments.settings)
-    check_conversion(settings, "settings")
+    check_conversion(settings := parse_settings(arguments.settings), "settings")
     config = ConvertConfig(
         format=arguments.format,
         split=arguments.split,
         jobs=arguments.jobs,
-        seed=arguments.seed,
         overwrite=arguments.overwrite,
         auto_align=arguments.auto_align or arguments.library is not None,
         library=arguments.library,
         strict=arguments.strict,
         timeout_s=arguments.timeout,
+        **{"seed": arguments.seed} | settings,
     )
-    config = dataclasses.replace(config, **settings)
     warn = warn_once(console)
     with stage_progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
@@ -221,12 +219,8 @@ def _add_convert(commands: _Commands) -> None:
         metavar="OUT",
         help="scene folder to make, its name becomes the scene's; several floors make OUT_0, OUT_1, ...",
     )
-    command.add_argument(
-        "--format",
-        choices=("auto", *FORMATS),
-        default="auto",
-        help="layout of SRC (default: told from its files)",
-    )
+    about = "layout of SRC (default: told from its files)"
+    command.add_argument("--format", choices=("auto", *FORMATS), default="auto", help=about)
     command.add_argument(
         "settings",
         nargs="*",

@@ -34,7 +34,7 @@ from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.gate import Gate
 from converters.records.raw import RawScene
-from converters.records.visual import ColourCloud, VisualMesh
+from converters.records.visual import ColourCloud, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
 from converters.structure.floor import level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
@@ -175,13 +175,12 @@ def _structure_visual(
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
     if raw.picture:
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
-        drawn = drawn + (vertices_w[0] - raw.scan.vertices[0])
-        return bake_structure(drawn, faces, cloud, config.structure_texture), 0.0
+        return bake_structure(
+            drawn + (vertices_w[0] - raw.scan.vertices[0]), faces, cloud, config.structure_texture
+        ), 0.0
     scan = simplify(level, raw.scan.faces[kept], config.structure_faces)
     patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
-    both = ColourCloud(
-        *(np.vstack([getattr(cloud, f), getattr(patch_cloud, f)]) for f in ("points", "normals", "colours"))
-    )
+    both = joined_clouds(cloud, patch_cloud)
     area = float(face_areas(patches.vertices, patches.faces).sum())
     whole = np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])])
     return bake_structure(*whole, both, config.structure_texture), area

@@ -33,3 +33,8 @@ class VisualMesh:
     """(m, 3) into `uv`."""
     image: np.ndarray
     """(h, w, 3) uint8, first row at the top."""
+
+
+def joined_clouds(*clouds: ColourCloud) -> ColourCloud:
+    """All clouds as one."""
+    return ColourCloud(*(np.vstack([getattr(c, f.name) for c in clouds]) for f in dataclasses.fields(ColourCloud)))

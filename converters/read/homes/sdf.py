@@ -158,7 +158,12 @@ class _Reader:
             elif shape.tag == "plane":
                 mesh = _plane(self._numbers(shape, "size", (1.0, 1.0), path))
             else:
-                mesh = primitive(path, shape.tag, shape.findtext)
+                try:
+                    mesh = primitive(path, shape.tag, shape.findtext)
+                except ValueError as error:
+                    raise SceneRejected(f"{path}: <{shape.tag}>: {error}") from error
+            if not np.isfinite(mesh.vertices).all() or not len(mesh.faces):
+                raise SceneRejected(f"{path}: a <{shape.tag}> of link '{link.get('name')}' has no usable size")
             if mesh.texture is None:
                 rgb = self._numbers(element, "material/diffuse", (*(c / 255 for c in GREY), 1.0), path)[:3]
                 colour = np.clip(np.round(255 * rgb), 0, 255).astype(np.uint8)
