@@ -7,8 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import multiprocessing
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from converters.bodies.physical import physical_properties, with_source
 from converters.bodies.placement import compare, upright
 from converters.check.gates import evaluate
 from converters.check.settle import Settled, settle
+from converters.clock import Clock, Report
 from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
 from converters.geometry.faces import face_areas, simplify, simplify_parts
@@ -46,24 +46,8 @@ from interactive_nav_common.files import part_folder, publish
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
-STAGES = {
-    "read": 1.0,
-    "align": 0.5,
-    "decompose": 25.0,
-    "cut": 3.0,
-    "map": 1.0,
-    "settle": 4.0,
-    "texture": 10.0,
-    "write": 1.0,
-    "gates": 3.0,
-}
-"""Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
-
 PARALLEL_OBJECTS = 8
 """From so many objects on, starting processes for their textures pays."""
-
-Report = Callable[[str, float], None]
-"""Called with the stage's name and the share of the whole work that is done, 0 to 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,31 +85,6 @@ class Converted:
     n_walls: int
     stage_s: dict[str, float]
     """Stage -> seconds."""
-
-
-class _Clock:
-    """Times the stages and turns their shares into one progress number."""
-
-    def __init__(self, report: Report) -> None:
-        self.report = report
-        self.seconds: dict[str, float] = {}
-        self.floors = 1
-        self._before = 0.0
-
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[Callable[[float], None]]:
-        per_floor = sum(STAGES.values()) - STAGES["read"]
-        total = STAGES["read"] + self.floors * per_floor
-        start = time.monotonic()
-
-        def inner(share: float) -> None:
-            self.report(name, min((self._before + STAGES[name] * min(share, 1.0)) / total, 1.0))
-
-        inner(0.0)
-        yield inner
-        inner(1.0)
-        self._before += STAGES[name]
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
 
 def with_retrieved(
@@ -264,7 +223,7 @@ def _report_objects(
             row["hinge_assumed"] = placed.hinge.assumed
 
 
-def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: _Clock, cache: Path) -> Converted:
+def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
     """Every stage after reading; writes into `folder`, which exists and is empty.
 
     Args:
@@ -374,7 +333,7 @@ def _convert(
     floors: int | None,
     warn: Callable[[str], None] | None = None,
 ) -> tuple[Converted, ...]:
-    clock = _Clock(report or (lambda stage, share: None))
+    clock = Clock(report or (lambda stage, share: None))
     with contextlib.ExitStack() as stack:
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(part_folder(target, config.overwrite))

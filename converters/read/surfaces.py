@@ -49,9 +49,10 @@ def densified(mesh: TexturedMesh, labels: np.ndarray | None) -> tuple[TexturedMe
     # Texture coordinates ride along as further columns, too small to count as length.
     uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
     rows = np.concatenate([corners[long], TINY * uv[long]], axis=2).reshape(-1, 5)
-    fine, faces, of = trimesh.remesh.subdivide_to_size(
+    cut = trimesh.remesh.subdivide_to_size(
         rows, np.arange(len(rows)).reshape(-1, 3), FINE_M, max_iter=16, return_index=True
     )
+    fine, faces, of = cut[0], cut[1], cut[-1]
     stay = np.delete(np.arange(len(mesh.faces)), long)
     whole = dataclasses.replace(
         mesh,

@@ -20,7 +20,8 @@ from PIL import Image
 from converters.__main__ import main
 from converters.check.gates import LIMITS
 from converters.check.settle import settle
-from converters.pipeline import STAGES, ConvertConfig, convert
+from converters.clock import STAGES
+from converters.pipeline import ConvertConfig, convert
 from converters.records.errors import SceneRejected
 from converters.records.gate import Limit
 from interactive_nav_common.errors import FileError
