@@ -1,0 +1,48 @@
+"""How long each stage of a conversion takes, and what share of it all is done."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+
+STAGES = {
+    "read": 1.0,
+    "align": 0.5,
+    "decompose": 25.0,
+    "cut": 3.0,
+    "map": 1.0,
+    "settle": 4.0,
+    "texture": 10.0,
+    "write": 1.0,
+    "gates": 3.0,
+}
+"""Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
+
+Report = Callable[[str, float], None]
+"""Called with the stage's name and the share of the whole work that is done, 0 to 1."""
+
+
+class Clock:
+    """Times the stages and turns their shares into one progress number."""
+
+    def __init__(self, report: Report) -> None:
+        self.report = report
+        self.seconds: dict[str, float] = {}
+        self.floors = 1
+        self._before = 0.0
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[Callable[[float], None]]:
+        per_floor = sum(STAGES.values()) - STAGES["read"]
+        total = STAGES["read"] + self.floors * per_floor
+        start = time.monotonic()
+
+        def inner(share: float) -> None:
+            self.report(name, min((self._before + STAGES[name] * min(share, 1.0)) / total, 1.0))
+
+        inner(0.0)
+        yield inner
+        inner(1.0)
+        self._before += STAGES[name]
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
