@@ -43,13 +43,9 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
 
     check_conversion(settings := parse_settings(arguments.settings), "settings")
     config = ConvertConfig(
-        format=arguments.format,
-        split=arguments.split,
-        jobs=arguments.jobs,
+        **{word: getattr(arguments, word) for word in ("format", "up", "unit", "split", "jobs", "library", "strict")},
         overwrite=arguments.overwrite,
         auto_align=arguments.auto_align or arguments.library is not None,
-        library=arguments.library,
-        strict=arguments.strict,
         timeout_s=arguments.timeout,
         **{"seed": arguments.seed} | settings,
     )
@@ -212,7 +208,9 @@ def _add_decompose_options(command: argparse.ArgumentParser) -> None:
 
 def _add_convert(commands: _Commands) -> None:
     command = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
-    command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
+    command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan, or one mesh file")
+    command.add_argument("--up", choices=("auto", *"xyz", "-x", "-y", "-z"), default="auto", help="axis of a mesh file")
+    command.add_argument("--unit", choices=("auto", "m", "cm", "mm", "ft", "in"), default="auto", help="of a mesh file")
     command.add_argument(
         "out",
         type=Path,

@@ -55,6 +55,9 @@ class ConvertConfig:
     """Choices of one conversion."""
 
     format: str = "auto"
+    up: str = dataclasses.field(default="auto", metadata=NOT_HASHED)
+    """Of a mesh file: its axis that points up."""
+    unit: str = dataclasses.field(default="auto", metadata=NOT_HASHED)
     split: str = dataclasses.field(default="train", metadata=NOT_HASHED)
     jobs: int = dataclasses.field(default=2, metadata=NOT_HASHED)
     seed: int = 0
@@ -338,7 +341,9 @@ def _convert(
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
-            raw = dataclasses.replace(read_source(source, config.format, config.strict), name=target.name)
+            raw = dataclasses.replace(
+                read_source(source, config.format, config.strict, config.up, config.unit), name=target.name
+            )
             scenes = split_storeys(raw)
         if warn is not None:
             for warning in raw.warnings:

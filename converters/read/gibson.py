@@ -15,7 +15,7 @@ from converters.read.cad import read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_npz
 from converters.read.obj import GREY, TexturedMesh, read_scan_obj
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_upright
+from converters.read.surfaces import check_upright, densified
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, GivenMap, RawScene, ScanMesh, Storey
 
@@ -59,6 +59,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
                 "expected one for each 'v' line; label the same mesh again"
             )
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, labels, heights[0])
+    mesh, labels = densified(mesh, labels)
     if labels is None:
         source.note(f"{LABELS} is absent: floor, walls and ceiling are told by shape")
         labels = label_storeys(mesh.vertices, mesh.faces, heights)

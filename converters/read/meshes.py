@@ -6,6 +6,7 @@ word about what is missing. A COLLADA file states its unit and up axis; the othe
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -18,10 +19,16 @@ from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals
 
 from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.geometry.upright import AXES, UNITS_M, find_unit, find_up, turn_upright
 from converters.read.files import SourceFolder, check_mesh
-from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, read_texture, texels, use_found
+from converters.read.obj import GREY, TexturedMesh, join_meshes, read_scan_obj, read_texture, texels, use_found
+from converters.read.storeys import label_storeys
+from converters.read.surfaces import densified, floor_level
 from converters.records.errors import SceneRejected
+from converters.records.raw import RawScene, ScanMesh
 
+SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
+"""Of files that may be a scan."""
 UP_AXES = {
     "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
     "Y_UP": Y_UP_TO_Z_UP,
@@ -103,6 +110,54 @@ def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMe
     for part in parts[1:]:
         surface = join_meshes(surface, _painted(path, part, turn))
     return surface
+
+
+def read_single_mesh(path: Path, strict: bool = False, up: str = "auto", unit: str = "auto") -> RawScene:
+    """Reads a scan that is one mesh file: floor, walls and ceiling are told by shape, all furniture stays part of it.
+
+    Args:
+        path: of the file; what it names must lie in its folder.
+        strict: refuse what would be repaired with a warning.
+        up: word of `AXES`, or `auto`: found.
+        unit: word of `UNITS_M`, or `auto`: told by the height.
+
+    Raises:
+        SceneRejected: missing or damaged, or neither its axes nor its unit can be told.
+    """
+    source = SourceFolder(path.parent, strict)
+    mesh = read_surface(source, source.inside(path), "give a mesh file")
+    axis = find_up(mesh.vertices, mesh.faces, str(path)) if up == "auto" else AXES[up]
+    vertices = mesh.vertices @ turn_upright(axis).T
+    word = find_unit(vertices, mesh.faces, str(path)) if unit == "auto" else unit
+    tilt = math.degrees(math.acos(float(np.clip(axis[2], -1.0, 1.0))))
+    if up == "auto" and tilt > 0.5:
+        source.note(f"{path.name}: turned by {tilt:.1f} degrees, so that its floor is level; --up z leaves it")
+    if word != "m" and unit == "auto":
+        source.note(f"{path.name}: taken to be in {word}; --unit says otherwise")
+    mesh = dataclasses.replace(mesh, vertices=vertices * UNITS_M[word])
+    floor_m = floor_level(mesh.vertices, mesh.faces, str(path))
+    mesh, _ = densified(mesh, None)
+    source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, furniture is part of them")
+    grey = np.full((len(mesh.vertices), 3), GREY[0], np.uint8) if mesh.texture is None else None
+    return RawScene(
+        name=path.stem,
+        source_format="mesh",
+        scan=ScanMesh(
+            mesh.vertices,
+            mesh.faces,
+            label_storeys(mesh.vertices, mesh.faces, (floor_m,)),
+            grey,
+            mesh.corner_uv,
+            mesh.texture,
+        ),
+        cads={},
+        annotations=(),
+        floor_height_m=floor_m,
+        given_map=None,
+        licence="unknown: a mesh file says none",
+        sources=dict(sorted(source.sha256.items())),
+        warnings=tuple(source.warnings),
+    )
 
 
 def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMesh:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.read import gibson, interactive_gibson, scan2cad
+from converters.read import gibson, interactive_gibson, meshes, scan2cad
 from converters.read.homes import sdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
@@ -34,10 +34,25 @@ def detect_format(source: Path) -> str:
     )
 
 
-def read_source(source: Path, layout: str = "auto", strict: bool = False) -> RawScene:
-    """Reads a raw folder in the given layout, or in the one that its files show.
+def read_source(
+    source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto"
+) -> RawScene:
+    """Reads a raw folder in the given layout, or in the one that its files show; or a single mesh file.
+
+    Args:
+        source: folder, or file.
+        layout: of `READERS`, or `auto`.
+        strict: refuse what would be repaired with a warning.
+        up: of a mesh file: its axis that points up, or `auto`.
+        unit: of a mesh file: its unit, or `auto`.
 
     Raises:
         SceneRejected: no known layout, or bad input.
     """
+    if source.is_file() and layout == "auto":
+        if source.suffix.lower() not in meshes.SUFFIXES:
+            raise SceneRejected(f"{source}: is no mesh file; expected one of {', '.join(meshes.SUFFIXES)}, or a folder")
+        return meshes.read_single_mesh(source, strict, up, unit)
+    if (up, unit) != ("auto", "auto"):
+        raise SceneRejected(f"{source}: --up and --unit are for a single mesh file; a folder's layout says both")
     return READERS[layout if layout != "auto" else detect_format(source)][1](source, strict)

@@ -21,8 +21,10 @@ WALL_SHARE = 0.6
 CEILING_FROM_M = 1.8
 FLOOR_SHARE = 0.05
 """Least share of the scan's footprint that must lie level at the floor's height."""
-LONG_M, FINE_M = 0.5, 0.2
-"""Faces with longer edges than the first are cut until none is longer than the second."""
+FLOOR_BIN_M, LEVEL_SHARE = 0.05, 0.2
+LONG_M, FINE_M = 0.8, 0.2
+"""Faces with longer edges than the first are cut until none is longer than the second: with edges of 0.8 m every
+point of a surface is within half a metre of a vertex, as objects must be."""
 TINY = 1e-9
 
 
@@ -32,18 +34,21 @@ def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a) / 2
 
 
-def densified(mesh: TexturedMesh, labels: np.ndarray | None) -> tuple[TexturedMesh, np.ndarray | None]:
+def densified(
+    mesh: TexturedMesh, labels: np.ndarray | None, long_m: float = LONG_M
+) -> tuple[TexturedMesh, np.ndarray | None]:
     """The mesh with faces of long edges cut into smaller ones: the stages take a scan's vertices for its surface.
 
-    Scans are fine everywhere; rooms that were modelled are not. Faces whose edges are all up to `LONG_M` stay.
+    Scans are fine everywhere; rooms that were modelled are not. Faces whose edges are all up to `long_m` stay.
 
     Args:
         mesh: m.
         labels: (n,) of the vertices, or None; a new vertex takes that of its face's first corner.
+        long_m: longest edge that may stay.
     """
     corners = mesh.vertices[mesh.faces]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    long = np.flatnonzero(edge > LONG_M)
+    long = np.flatnonzero(edge > long_m)
     if not len(long):
         return mesh, labels
     # Texture coordinates ride along as further columns, too small to count as length.
@@ -65,6 +70,26 @@ def densified(mesh: TexturedMesh, labels: np.ndarray | None) -> tuple[TexturedMe
     own = np.zeros(len(fine), np.int64)
     own[faces] = labels[mesh.faces[long[of], 0]][:, None]
     return whole, np.concatenate([labels, own])
+
+
+def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
+    """Height of the lowest level that has a fifth of the largest level's area, m; faces that look up count.
+
+    Raises:
+        SceneRejected: nothing is level.
+    """
+    area = face_vectors(vertices, faces)
+    level = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
+    height, size = vertices[faces[level], 2].mean(axis=1), area[level, 2]
+    if not len(height):
+        raise SceneRejected(f"{where}: has no level face that looks up; expected a floor, z up")
+    bins, index = np.unique(np.round(height / FLOOR_BIN_M).astype(np.int64), return_inverse=True)
+    total = np.bincount(index, size)
+    lowest = bins[total >= LEVEL_SHARE * total.max()].min()
+    near = np.abs(height - lowest * FLOOR_BIN_M) < FLOOR_BIN_M
+    order = np.argsort(height[near])
+    share = np.cumsum(size[near][order])
+    return float(height[near][order][np.searchsorted(share, share[-1] / 2)])
 
 
 def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: float) -> np.ndarray:

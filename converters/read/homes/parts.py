@@ -20,7 +20,7 @@ from converters.read.interactive_gibson import assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import densified
+from converters.read.surfaces import densified, floor_level
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh
@@ -49,6 +49,8 @@ ALIASES = {
 """Names that others give to our categories."""
 OTHER_STRUCTURE = 38
 """NYU40's word for what is built in and nothing else."""
+LONG_M = 0.5
+"""Edges of modelled structure up to this may stay: whether a part is wall is told by its vertices."""
 TEXTURE_PX = 512
 STANDS_M = 0.15
 """Of its base above the floor: what is higher stands on something else, or hangs."""
@@ -58,9 +60,6 @@ RESTS_M = 0.10
 """What stands on a part may begin so far above the part's top."""
 DOOR_MOST_M = 1.3
 """Wider leaves fold or slide: they stay where they are."""
-FLOOR_BIN_M = 0.05
-FLOOR_SHARE = 0.2
-"""Of the largest level's area that the floor has at least."""
 MASS_FACTOR = 2.0
 """A mass that far outside of its category's range is a placeholder."""
 
@@ -102,7 +101,10 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
         SceneRejected: nothing built in that has a floor.
     """
     bounds = [_bounds(part) for part in parts]
-    floor_m = _floor_height(source, parts)
+    whole = joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])
+    if whole is None:
+        raise SceneRejected(f"{source.root}: holds no part; expected a floor")
+    floor_m = floor_level(whole.vertices, whole.faces, str(source.root))
     moves = [_moves(part, low, high, floor_m) for part, (low, high) in zip(parts, bounds, strict=True)]
     carried = _carriers(bounds, moves, floor_m)
     structure = [p for p, moving, by in zip(parts, moves, carried, strict=True) if not moving and by is None]
@@ -111,7 +113,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
     shells = [placed(_small(p.surface), p.pose) for p in structure]
     mesh = joined(shells)
     assert mesh is not None
-    mesh, _ = densified(mesh, None)
+    mesh, _ = densified(mesh, None, LONG_M)
     labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
     labels[labels == UNLABELLED] = OTHER_STRUCTURE
     middle = mesh.vertices[mesh.faces].mean(axis=1)
@@ -169,25 +171,6 @@ def _carriers(bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], fl
             if moves[k] and over and base[2] < low[2] < top[2] + RESTS_M:
                 carried[i] = k
     return carried
-
-
-def _floor_height(source: SourceFolder, parts: list[Part]) -> float:
-    """The lowest level that holds a fifth of the largest level's area; faces that look up count.
-
-    Raises:
-        SceneRejected: nothing is level.
-    """
-    area: dict[int, float] = {}
-    for part in parts:
-        corners = (part.surface.vertices @ part.pose[:3, :3].T + part.pose[:3, 3])[part.surface.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-        level = normal[:, 2] > 0.95 * np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-        bins = np.round(corners[level, :, 2].mean(axis=1) / FLOOR_BIN_M).astype(int)
-        for k, a in zip(bins.tolist(), normal[level, 2].tolist(), strict=True):
-            area[k] = area.get(k, 0.0) + a
-    if not area:
-        raise SceneRejected(f"{source.root}: no part has a level face that looks up; expected a floor, z up")
-    return FLOOR_BIN_M * min(k for k, a in area.items() if a >= FLOOR_SHARE * max(area.values()))
 
 
 def _furniture(
