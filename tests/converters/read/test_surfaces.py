@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
-from converters.read.surfaces import check_upright, structure_labels
+from converters.geometry.faces import face_areas, face_labels
+from converters.read.gibson import read_gibson
+from converters.read.obj import TexturedMesh
+from converters.read.surfaces import FINE_M, check_upright, densified, floor_level, structure_labels
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, WALL
 from tests.converters import tiny_raw
@@ -65,3 +69,42 @@ def test_a_floor_at_another_height_or_unit(room):
         check_upright("scan", vertices, faces, None, 1.2)
     with pytest.raises(SceneRejected, match="check floors.txt, the mesh's axes"):
         check_upright("scan", vertices * 100, faces, None, tiny_raw.FLOOR_M)
+
+
+def large_room(size=(6.0, 5.0, 2.6)) -> TexturedMesh:
+    """Six walls of two triangles each, front inwards, textured by where they lie."""
+    box = trimesh.creation.box(size).apply_translation((0, 0, size[2] / 2))
+    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1]
+    uv = vertices[faces][..., :2] / 10 + 0.5
+    return TexturedMesh(vertices, faces, uv, np.zeros((8, 8, 3), np.uint8))
+
+
+def test_large_faces_are_cut_and_nothing_else_changes():
+    mesh = large_room()
+    fine, labels = densified(mesh, np.full(8, 7))
+    assert fine.corner_uv is not None and labels is not None and (labels == 7).all()
+    corners = fine.vertices[fine.faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= FINE_M
+    assert face_areas(fine.vertices, fine.faces).sum() == pytest.approx(face_areas(mesh.vertices, mesh.faces).sum())
+    np.testing.assert_allclose(fine.corner_uv, corners[..., :2] / 10 + 0.5, atol=1e-6)
+    again, _ = densified(fine, None)
+    assert again is fine
+    found = face_labels(structure_labels(fine.vertices, fine.faces, 0.0), fine.faces)
+    area = face_areas(fine.vertices, fine.faces)
+    assert area[found == FLOOR].sum() == pytest.approx(30.0, rel=0.02)
+    assert area[found == WALL].sum() > 0.85 * 2 * (6 + 5) * 2.6
+    assert floor_level(fine.vertices, fine.faces, "scan") == 0.0
+
+
+def test_objects_in_the_middle_of_large_faces_stand_in_the_scan(tmp_path):
+    """Distances are to the surface: all vertices of this room are metres away from its furniture."""
+    root = tiny_raw.write_gibson(tmp_path / "room")
+    low = [-3.0, -3.0, tiny_raw.FLOOR_M]
+    box = trimesh.creation.box((8.0, 8.0, 2.6)).apply_translation(np.array(low) + [4.0, 4.0, 1.3])
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"f {c + 1} {b + 1} {a + 1}" for a, b, c in box.faces]
+    (root / "mesh_z_up.obj").write_text("\n".join(lines) + "\n")
+    for name in ("floor_trav_0.png", "floor_0.png", "labels.npz"):
+        (root / name).unlink(missing_ok=True)
+    for extra in root.glob("*.npz"):
+        extra.unlink()
+    assert len(read_gibson(root).annotations) == len(tiny_raw.ITEMS)
