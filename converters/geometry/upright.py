@@ -67,7 +67,7 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str, seed: int = 0) 
         if all(abs(drawn[k] @ axis) < 0.3 for axis in axes):
             axes.append(_mean_direction(drawn[k], normal, area))
     if len(axes) == 2:
-        axes.append(np.cross(*axes))
+        axes.append(np.cross(axes[0], axes[1]))
     if len(axes) < 2:
         raise SceneRejected(f"{where}: shows one direction of surface only; say which axis points up with --up")
     spans = [np.ptp(_extent(middle @ axis, area)) for axis in axes]

@@ -35,7 +35,7 @@ def box_room(size: tuple[float, float, float], ceiling: bool) -> tuple[np.ndarra
 @given(st.integers(0, 2**31), st.sampled_from([1.0, 100.0, 1000.0]))
 def test_a_furnished_room_is_found_upright_from_any_turn(seed, scale):
     vertices, faces = tiny()
-    turn = Rotation.random(random_state=seed).as_matrix()
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     up = find_up(scale * vertices @ turn.T, faces, "scan")
     assert np.degrees(np.arccos(np.clip(up @ turn[:, 2], -1, 1))) < 0.5
     back = scale * vertices @ turn.T @ turn_upright(up).T
@@ -55,7 +55,7 @@ def test_the_real_room_is_found_upright(sample_data, part):
         "upper half gone": middle[:, 2] > 0.9,
     }[part]
     for seed in range(3):
-        turn = Rotation.random(random_state=seed).as_matrix()
+        turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
         up = find_up(vertices @ turn.T, faces[~gone], "scan")
         assert np.degrees(np.arccos(np.clip(up @ turn[:, 2], -1, 1))) < 1.0
 
@@ -77,7 +77,7 @@ def test_an_empty_room_without_a_ceiling_is_told_by_its_floor():
 )
 def test_what_does_not_tell_is_asked_for(room, message):
     with pytest.raises(SceneRejected, match=message):
-        find_up(*room, "scan")
+        find_up(room[0], room[1], "scan")
 
 
 @pytest.mark.parametrize("height", [0.5, 8.2, 50.0, 1e5])
