@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import glob
 import os
 import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import TypeAlias
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from converters.generating import Commands, add_generate, add_generate_scenes, add_launcher, add_models, positive
 from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.errors import UserError
@@ -27,6 +27,9 @@ from scenes_mjcf.schema import CATEGORIES
 
 FORMATS = ("gibson", "interactive-gibson", "scan2cad", "sdf")
 """`READERS` of `converters.read.source`, which need not be imported to say so."""
+
+if TYPE_CHECKING:
+    from converters.pipeline import ConvertConfig
 
 
 class Interrupted(BaseException):
@@ -49,6 +52,8 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         timeout_s=arguments.timeout,
         **{"seed": arguments.seed} | settings,
     )
+    if arguments.into:
+        return _convert_many(arguments, config, console)
     warn = warn_once(console)
     with stage_progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
@@ -72,6 +77,23 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
             soft_wrap=True,
         )
     return 0 if all(g.passed for result in results for g in result.gates) else 1
+
+
+def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console: Console) -> int:
+    from converters.many import convert_many
+    from converters.sets import make_runner
+
+    runner, side_by_side = make_runner(
+        arguments.launcher, arguments.ray_address, min(arguments.jobs, len(arguments.places)), len(arguments.places)
+    )
+    with stage_progress(console) as report:
+        failed = convert_many(
+            [Path(place) for place in arguments.places], arguments.into, config, runner, side_by_side, report,
+            lambda line: console.print(line, soft_wrap=True, highlight=False, markup=False),
+        )  # fmt: skip
+    if failed:
+        console.print(f"not converted, or with gates that fail: {', '.join(failed)}", soft_wrap=True, highlight=False)
+    return 1 if failed else 0
 
 
 def _object(arguments: argparse.Namespace, console: Console) -> int:
@@ -121,39 +143,6 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
-def _generate(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.generate import generate_building
-    from converters.recipes import building_of, parse_settings
-
-    settings = parse_settings(arguments.settings)
-    config = building_of(arguments.tier, settings, arguments.split, "settings")
-    with stage_progress(console) as report:
-        generate_building(arguments.out, arguments.seed, report, config)
-    console.print(
-        f"{arguments.out}: building of seed {arguments.seed}; convert it with "
-        f"'python -m converters convert {arguments.out} SCENE_DIR'",
-        soft_wrap=True,
-    )
-    return 0
-
-
-def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.sets import Wanted, generate_scenes
-
-    wanted = Wanted(**{f.name: getattr(arguments, f.name) for f in dataclasses.fields(Wanted)})
-    with stage_progress(console) as report:
-        failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
-    return 1 if failed else 0
-
-
-def _models(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.check.model_sheet import model_sheet
-
-    count = model_sheet(arguments.output, arguments.names)
-    console.print(f"{arguments.output}: picture of {count} models", soft_wrap=True)
-    return 0
-
-
 def _preview(arguments: argparse.Namespace, console: Console) -> int:
     from converters.check.preview import preview
 
@@ -176,21 +165,11 @@ def _propose(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is not a positive number")
-    return value
-
-
 def _positive_number(text: str) -> float:
     value = float(text)
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
-
-
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _add_decompose_options(command: argparse.ArgumentParser) -> None:
@@ -206,32 +185,41 @@ def _add_decompose_options(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_convert(commands: _Commands) -> None:
-    command = commands.add_parser("convert", help="turn a raw scan with alignments into a scene folder")
-    command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan, or one mesh file")
+def _add_convert(commands: Commands) -> None:
+    command = commands.add_parser(
+        "convert",
+        help="turn a raw scan with alignments into a scene folder, or many",
+        usage="%(prog)s [options] SRC OUT | SRC... --into DIR | @LIST --into DIR  [KEY=VALUE ...]",
+        fromfile_prefix_chars="@",
+    )
+    command.convert_arg_line_to_args = lambda arg_line: [arg_line] if arg_line.strip() else []
+    command.add_argument(
+        "places",
+        nargs="+",
+        metavar="SRC OUT",
+        help="folder with the raw scan, or a mesh file, and the scene folder to make, whose name becomes the scene's; "
+        "several floors make OUT_0, OUT_1, ...; @LIST is a file of one SRC a line; KEY=VALUE settings: structure_faces, "
+        "object_faces (triangles drawn), structure_texture, object_texture (pixels)",
+    )
+    command.add_argument(
+        "--into",
+        type=Path,
+        metavar="DIR",
+        help="convert every SRC into a folder here, each in a process of its own, with a row in conversions.parquet; "
+        "those that are there with the same options and inputs are kept",
+    )
+    add_launcher(command)
     command.add_argument("--up", choices=("auto", *"xyz", "-x", "-y", "-z"), default="auto", help="axis of a mesh file")
     command.add_argument("--unit", choices=("auto", "m", "cm", "mm", "ft", "in"), default="auto", help="of a mesh file")
-    command.add_argument(
-        "out",
-        type=Path,
-        metavar="OUT",
-        help="scene folder to make, its name becomes the scene's; several floors make OUT_0, OUT_1, ...",
-    )
     about = "layout of SRC (default: told from its files)"
     command.add_argument("--format", choices=("auto", *FORMATS), default="auto", help=about)
-    command.add_argument(
-        "settings",
-        nargs="*",
-        metavar="KEY=VALUE",
-        help="structure_faces, object_faces (triangles drawn), structure_texture, object_texture (pixels)",
-    )
     command.add_argument("--split", choices=("train", "test"), default="train", help="recorded in scene.json")
     command.add_argument(
         "--jobs",
-        type=_positive,
+        type=positive,
         default=os.cpu_count() or 1,
         metavar="N",
-        help="decompositions side by side (default: one a processor)",
+        help="decompositions side by side, with --into sources (default: one a processor)",
     )
     _add_decompose_options(command)
     command.set_defaults(run=_convert, writes=("{}", "{}_[0-9]*"))
@@ -243,7 +231,7 @@ def _add_convert(commands: _Commands) -> None:
     command.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ for --auto-align (default: SRC)")
 
 
-def _add_propose(commands: _Commands) -> None:
+def _add_propose(commands: Commands) -> None:
     command = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
     command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
@@ -255,7 +243,7 @@ def _add_propose(commands: _Commands) -> None:
     command.set_defaults(run=_propose, writes=("{}/proposals.*",))
 
 
-def _add_object(commands: _Commands) -> None:
+def _add_object(commands: Commands) -> None:
     command = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
     command.add_argument(
         "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"
@@ -279,55 +267,13 @@ def _add_object(commands: _Commands) -> None:
     command.set_defaults(run=_object, writes=("{}",))
 
 
-def _add_check(commands: _Commands) -> None:
+def _add_check(commands: Commands) -> None:
     command = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
     command.add_argument("scene", type=Path, metavar="SCENE_DIR")
     command.set_defaults(run=_check, writes=())
 
 
-def _add_generate(commands: _Commands) -> None:
-    command = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
-    command.add_argument("out", type=Path, metavar="OUT", help="folder to make")
-    command.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
-    command.add_argument("--tier", default="sparse", help="sparse (default), furnished or cluttered")
-    command.add_argument("--split", choices=("train", "test"), default="train", help="whose CAD models (default train)")
-    command.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="of the tier's buildings, such as floor_area_m2=80"
-    )
-    command.set_defaults(run=_generate, writes=("{}",))
-
-
-def _add_generate_scenes(commands: _Commands) -> None:
-    command = commands.add_parser(
-        "generate-scenes",
-        help="make the scenes of a recipe file, or so many homes of a tier: generate, convert, draw; goes on where it "
-        "stopped",
-    )
-    command.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
-    command.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
-    command.add_argument("--tier", metavar="TIER", help="write OUT/recipes.yaml: sparse, furnished or cluttered homes")
-    command.add_argument("--count", type=_positive, default=10, metavar="N", help="how many of a tier (default 10)")
-    command.add_argument(
-        "--seed", type=int, default=100_000, metavar="N", help="of a tier's first home (default 100000)"
-    )
-    command.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
-    command.add_argument("--overwrite", action="store_true", help="make those again that are there")
-    command.add_argument(
-        "--jobs", type=_positive, default=os.cpu_count() or 1, metavar="N", help="scenes side by side; default: cores"
-    )
-    command.add_argument("--launcher", choices=("local", "ray"), default="local", help="where (default: local)")
-    command.add_argument("--ray-address", default="auto", metavar="HOST:PORT", help="of the cluster's head")
-    command.set_defaults(run=_generate_scenes, writes=("{}/*",))
-
-
-def _add_models(commands: _Commands) -> None:
-    command = commands.add_parser("models", help="draw the CAD models that generated buildings are furnished with")
-    command.add_argument("names", nargs="*", metavar="NAME", help="models or categories (default: all models)")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
-    command.set_defaults(run=_models, writes=("{}",))
-
-
-def _add_preview(commands: _Commands) -> None:
+def _add_preview(commands: Commands) -> None:
     command = commands.add_parser("preview", help="draw a conversion's stages from above")
     command.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
@@ -338,20 +284,30 @@ def _add_preview(commands: _Commands) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    generating = (_add_generate, _add_generate_scenes, _add_models)
+    generating = (add_generate, add_generate_scenes, add_models)
     for add in (_add_convert, _add_propose, _add_object, _add_check, *generating, _add_preview):
         add(commands)
     return parser
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
-    """The command line's words; settings of `generate` may stand before and after its options."""
+    """The command line's words; those of `generate` and `convert` may stand before and after its options."""
     parser = _parser()
     arguments, rest = parser.parse_known_args(argv)
-    if rest and ("settings" not in arguments or any(word.startswith("-") for word in rest)):
+    free = "settings" if "settings" in arguments else "places"
+    if rest and (free not in arguments or any(word.startswith("-") for word in rest)):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:
-        arguments.settings = [*arguments.settings, *rest]
+        setattr(arguments, free, [*getattr(arguments, free), *rest])
+    if "places" in arguments:
+        arguments.settings = [word for word in arguments.places if "=" in word and not Path(word).exists()]
+        arguments.places = [word for word in arguments.places if word not in arguments.settings]
+        if arguments.into:
+            arguments.out, arguments.writes = arguments.into, ("{}/[!.]*",)
+        elif len(arguments.places) == 2:
+            arguments.source, arguments.out = map(Path, arguments.places)
+        else:
+            parser.error(f"convert: got {len(arguments.places)} folders, expected SRC OUT, or SRC... --into DIR")
     return arguments
 
 

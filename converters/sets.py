@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Protocol
@@ -192,37 +192,47 @@ def _command(command: list[str], cwd: str) -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
-def make_set(
-    names: list[str], words: list[str], runner: Runner, side_by_side: int,
-    report: Report = lambda stage, share: None, tell: Callable[[str], None] = lambda line: None,
+def make_runner(launcher: str, address: str, jobs: int, count: int) -> tuple[Runner, int]:
+    """Where `count` commands run, and how many of them side by side."""
+    return (RayRunner(address, 1), max(count, 1)) if launcher == "ray" else (LocalRunner(), jobs)
+
+
+def _last_line(name: str, code: int, printed: str) -> str:
+    lines = [line for line in printed.splitlines() if line.startswith((f"{name}:", "converters"))]
+    return lines[-1] if lines else f"{name}: exit code {code}, {printed.strip()[-200:]}"
+
+
+def run_side_by_side(
+    commands: Mapping[str, list[str]], runner: Runner, side_by_side: int, report: Report, tell: Callable[[str], None],
+    ended: Callable[[str, int, str], str] = _last_line, what: str = "scenes",
 ) -> list[str]:  # fmt: skip
-    """Makes scenes, several at a time; what was begun when a signal or an error comes is ended.
+    """Runs commands, several at a time; what was begun when a signal or an error comes is ended.
 
     Args:
-        names: of recipes.
-        words: `generate-scenes OUT ...`, to which `--only NAME` is added.
+        commands: by name of what each makes.
         runner: where.
-        side_by_side: scenes at a time.
+        side_by_side: commands at a time.
         report: progress over all of them.
-        tell: told one line a scene.
+        tell: told one line each.
+        ended: name, exit code and what was printed -> that line.
+        what: they make.
 
     Returns:
-        Names of those that were not made, or do not pass every gate.
+        Names of those that did not exit with 0.
     """
     failed: list[str] = []
-    report(f"0/{len(names)} scenes", 0.0)
+    count = len(commands)
+    report(f"0/{count} {what}", 0.0)
     with ThreadPoolExecutor(side_by_side) as pool:
         try:
-            command = [sys.executable, "-m", "converters", *words, "--only"]
-            waiting: dict[Future[tuple[int, str]], str] = {pool.submit(runner.run, [*command, n]): n for n in names}
+            waiting: dict[Future[tuple[int, str]], str] = {pool.submit(runner.run, c): n for n, c in commands.items()}
             while waiting:
                 done, _ = wait(waiting, timeout=0.5, return_when=FIRST_COMPLETED)
                 for future in done:
                     name, (code, printed) = waiting.pop(future), future.result()
-                    lines = [line for line in printed.splitlines() if line.startswith((f"{name}:", "converters"))]
-                    tell(lines[-1] if lines else f"{name}: exit code {code}, {printed.strip()[-200:]}")
+                    tell(ended(name, code, printed))
                     failed += [name] if code else []
-                    report(f"{len(names) - len(waiting)}/{len(names)} scenes", 1 - len(waiting) / len(names))
+                    report(f"{count - len(waiting)}/{count} {what}", 1 - len(waiting) / count)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             runner.close()
@@ -245,16 +255,14 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
     """
     if wanted.tier:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
-    path, side_by_side = wanted.recipes or wanted.out / RECIPES, wanted.jobs
+    path = wanted.recipes or wanted.out / RECIPES
     recipes = load_recipes(path)
     todo = chosen(recipes, wanted.out, tuple(wanted.only), wanted.overwrite, tell)
     if len(todo) > 1 and (wanted.jobs > 1 or wanted.launcher == "ray"):
-        runner: Runner = LocalRunner()
-        if wanted.launcher == "ray":
-            runner, side_by_side = RayRunner(wanted.ray_address, 1), len(todo)
-        words = ["generate-scenes", str(wanted.out), "--recipes", str(path), "--jobs", "1"]
-        words += ["--overwrite"] if wanted.overwrite else []
-        failed = make_set([r.name for r in todo], words, runner, side_by_side, report, tell)
+        runner, side_by_side = make_runner(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
+        words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
+        words += ["--jobs", "1", *(["--overwrite"] if wanted.overwrite else []), "--only"]
+        failed = run_side_by_side({r.name: [*words, r.name] for r in todo}, runner, side_by_side, report, tell)
     else:
         gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, tell)
         failed = [name for name, failing in gates.items() if failing]

@@ -23,6 +23,7 @@ from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
+from train.scoring.brought import named
 from train.scoring.evaluation import AUTO_BATCH, LEARNED, add_playing_words, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
 from train.scoring.policies import PLANNERS, YARDSTICKS
@@ -77,8 +78,14 @@ def parser() -> argparse.ArgumentParser:
     names = ",".join((LEARNED, *YARDSTICKS))
     made.add_argument(
         "--policies",
-        default=names,
-        help=f"comma-separated choice from {','.join((names, *PLANNERS))} (default: {names})",
+        help=f"comma-separated choice from {','.join((names, *PLANNERS))} (default: {names}; with --policy none)",
+    )
+    made.add_argument(
+        "--policy",
+        action="append",
+        default=[],
+        metavar="[NAME=]MODULE:FACTORY",
+        help="also play what this function of your module, or of path/to/file.py, returns; may be given several times",
     )
     add_playing_words(made)
     made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
@@ -87,6 +94,22 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--out", metavar="PATH", help=f"Parquet file (default RUN_DIR/{ROWS})")
     made.add_argument("--dataset", metavar="DIR", help="add a file for each run and evaluation to this folder instead")
     return made
+
+
+def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """What --policies names, then `name=module:factory` of each --policy."""
+    brought = [named(word) for word in arguments.policy]
+    given = arguments.policies
+    if given is None:
+        given = "" if brought else ",".join((LEARNED, *YARDSTICKS))
+    policies = tuple(dict.fromkeys(name for name in given.split(",") if name))
+    if not policies and not brought:
+        raise ConfigError(f"--policies is {given!r}, expected at least one, such as {LEARNED}")
+    names = [word.partition("=")[0] for word in (*policies, *brought)]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"--policy: name {twice[0]!r} is taken, expected one of its own, as in mine=module:factory")
+    return (*policies, *brought)
 
 
 def _place(
@@ -120,9 +143,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             raise ConfigError(f"{name} is {value}, expected at least 1")
     if arguments.record < 0 or not -(2**63) <= arguments.seed < 2**63:
         raise ConfigError(f"--record {arguments.record} --seed {arguments.seed}: expected 0 or more and 64 bits")
-    policies = tuple(name for name in arguments.policies.split(",") if name)
-    if not policies:
-        raise ConfigError(f"--policies is {arguments.policies!r}, expected at least one, such as {LEARNED}")
+    policies = _policies(arguments)
     for word in arguments.words:
         if "=" in word and not word.startswith("env."):
             raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
@@ -160,7 +181,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         rows, stood = pa.table({}), out.exists()
         for rows, played in evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch):
             # What is stopped keeps what has been played; whole rows that stood there give way to whole ones only.
-            if set(played) == set(policies) or not stood:
+            if len(played) == len(policies) or not stood:
                 write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
                 write_parquet(rows, out, notes)
         _tell(console, rows, config, player.env, out)

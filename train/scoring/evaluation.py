@@ -25,7 +25,8 @@ from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run import check_fits
 from train.runs.run_folder import RunFolder
-from train.scoring.planners import Planner
+from train.scoring.brought import BroughtPolicy
+from train.scoring.planners import HostPolicy
 from train.scoring.policies import PolicyFn, make_yardstick
 from train.scoring.rollout import Episodes, Player, episode_keys
 from train.scoring.row_files import EvaluationAsked
@@ -98,13 +99,17 @@ def make_policies(
     deterministic: bool,
     known: dict[Any, Any] | None = None,
 ) -> dict[str, tuple[Any, CheckpointMeta | None]]:
-    """Policies by name, and the checkpoints of those that learned; see `load_policy` and `make_yardstick`."""
-    return {
-        name: load_policy(folder, config, env, which, deterministic, known)
-        if name == LEARNED and folder
-        else (make_yardstick(name, env), None)
-        for name in names
-    }
+    """Policies by name, and the checkpoints of those that learned.
+
+    See `load_policy`, `make_yardstick`, and `BroughtPolicy` for `name=module:factory`.
+    """
+
+    def made(name: str) -> tuple[Any, CheckpointMeta | None]:
+        if name == LEARNED and folder:
+            return load_policy(folder, config, env, which, deterministic, known)
+        return BroughtPolicy(name, env) if "=" in name else make_yardstick(name, env), None
+
+    return {name.partition("=")[0]: made(name) for name in names}
 
 
 def evaluate(
@@ -158,7 +163,7 @@ def evaluate(
             needed = [row.get("push_needed") for row in fixed.episodes]
             table = table.append_column("push_needed", pa.array(needed, pa.bool_()))
         tables.append(table)
-        note = f" ({policy.note})" if isinstance(policy, Planner) and policy.note else ""
+        note = f" ({policy.note})" if isinstance(policy, HostPolicy) and policy.note else ""
         console.print(f"{name}: {asked.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
         yield pa.concat_tables(tables), played
 

@@ -38,7 +38,25 @@ class Plan:
     step: int
 
 
-class Planner:
+class HostPolicy:
+    """Acts on the host, step by step, for a batch of episodes."""
+
+    note = ""
+    """What a reader of its scores should know."""
+
+    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
+        """Actions [N, A] of one control step.
+
+        Args:
+            state: of the environments, leaves [N, ...].
+            episode: [N] the episode that each plays.
+            running: [N] bool; the others get an action that means nothing.
+            step: control steps done.
+        """
+        raise NotImplementedError
+
+
+class Planner(HostPolicy):
     """Plans and steers many episodes; the state in, actions out.
 
     Args:
@@ -65,19 +83,12 @@ class Planner:
         self.plans = 0
 
     @property
-    def note(self) -> str:
-        """What a reader of its scores should know."""
+    def note(self) -> str:  # type: ignore[override]
+        """How often no way was found."""
         return f"{self.plans:,} plans, {self.no_path:,} of them found no way" if self._weight is None else ""
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
-        """Actions [N, A] of one control step.
-
-        Args:
-            state: of the environments, leaves [N, ...].
-            episode: [N] the episode that each plays.
-            running: [N] bool; the others get an action that means nothing.
-            step: control steps done.
-        """
+        """Actions [N, A] of one control step, on plans that are as old as what has moved allows."""
         nav = state.info["nav"]
         qpos = np.asarray(state.pipeline_state.qpos)
         pos, yaw = np.asarray(nav.robot_pos_w)[:, :2], np.asarray(nav.yaw_rad)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.types import OF_OBJECTS
-from train.scoring.planners import Planner
+from train.scoring.planners import HostPolicy
 from train.scoring.policies import PolicyFn
 
 CHUNK_STEPS = 50
@@ -61,7 +61,7 @@ def episode_keys(seed: int, episodes: int) -> jax.Array:
 
 def run_episodes(
     env: Any,
-    policy: PolicyFn | Planner,
+    policy: PolicyFn | HostPolicy,
     keys: jax.Array,
     record: int = 0,
     on_progress: Callable[[int, int], None] = lambda finished, step: None,
@@ -92,7 +92,7 @@ class Player:
 
     def play(
         self,
-        policy: PolicyFn | Planner,
+        policy: PolicyFn | HostPolicy,
         keys: jax.Array,
         record: int = 0,
         on_progress: Callable[[int, int], None] = lambda finished, step: None,
@@ -104,7 +104,7 @@ class Player:
         """Plays every episode to its end.
 
         Args:
-            policy: see `train.scoring.policies`, or a planner.
+            policy: see `train.scoring.policies`, or one on the host.
             keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
             record: for how many of the first episodes to return paths.
             on_progress: told (episodes finished, steps taken in their batch) now and then.
@@ -148,7 +148,7 @@ class Player:
 
     def _play_batch(
         self,
-        policy: PolicyFn | Planner,
+        policy: PolicyFn | HostPolicy,
         keys: jax.Array,
         count: int,
         record: int,
@@ -168,10 +168,10 @@ class Player:
 
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
-        planner = policy if isinstance(policy, Planner) else None
+        planner = policy if isinstance(policy, HostPolicy) else None
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
         if not isinstance(policy, jax.tree_util.Partial):
-            act = None if isinstance(policy, Planner) else jax.tree_util.Partial(policy)
+            act = None if isinstance(policy, HostPolicy) else jax.tree_util.Partial(policy)
         step = 0
         while not finished.all():
             ended_here = jnp.asarray(finished[episode_of])

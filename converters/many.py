@@ -1,0 +1,168 @@
+"""Raw folders in, a scene folder and a row of `conversions.parquet` for each out: side by side, resumable.
+
+Each source is converted by a process of its own (`python -m converters.many JSON`), which writes its own row: one that
+fails or is killed costs no other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from converters.clock import STAGES
+from converters.pipeline import ConvertConfig, Converted, convert_building
+from converters.records.errors import StageFailed
+from converters.sets import Runner, run_side_by_side
+from interactive_nav_common.errors import ConfigError, FileError, UserError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.rows import write_parquet
+
+ROWS = "conversions.parquet"
+SCHEMA = pa.schema(
+    {
+        **dict.fromkeys(("name", "source", "digest"), pa.string()),
+        "exit_code": pa.int32(),  # 0 done, 1 a gate failed, 2 unusable, negative: ended by this signal
+        "error": pa.string(),
+        **dict.fromkeys(("scenes", "gates_passed", "gates_failed", "warnings"), pa.list_(pa.string())),
+        "movables": pa.int32(),
+        "area_m2": pa.float64(),  # traversable, of all floors
+        **dict.fromkeys(("seconds", *(f"{stage}_s" for stage in STAGES)), pa.float64()),
+        "peak_memory_mib": pa.float64(),  # of the process, then of the largest one that it started
+        "worker_memory_mib": pa.float64(),
+    }
+)
+
+
+def digest_of(source: Path, config: ConvertConfig) -> str:
+    """Of the options that a conversion's result depends on, and of the names, sizes and times of its input files."""
+    roots = [root for root in (source, config.library) if root is not None]
+    paths = [(root, path) for root in roots for path in (root, *sorted(root.rglob("*"))) if path.is_file()]
+    files = [(str(p.relative_to(root)), p.stat().st_size, p.stat().st_mtime_ns) for root, p in paths]
+    options = {**dataclasses.asdict(config), "jobs": 0, "overwrite": False, "library": config.library is not None}
+    return hashlib.sha256(repr((options, files)).encode()).hexdigest()[:16]
+
+
+def convert_many(
+    sources: Sequence[Path], into: Path, config: ConvertConfig, runner: Runner, side_by_side: int,
+    report: Callable[[str, float], None], tell: Callable[[str], None],
+) -> list[str]:  # fmt: skip
+    """Converts what has not been converted with these options; the row of each is written as it ends.
+
+    Args:
+        sources: raw folders; the scene of each is named after it.
+        into: folder of scene folders.
+        config: choices; `jobs` are decompositions side by side in all.
+        runner: where.
+        side_by_side: sources at a time.
+        report: progress over all of them.
+        tell: told one line a source.
+
+    Returns:
+        Names of the sources without a scene, or with a gate that fails, whether tried now or before.
+
+    Raises:
+        ConfigError: two sources of one name.
+        FileError: unreadable rows of before.
+    """
+    named = _named(sources)
+    path = into / ROWS
+    rows = {row["name"]: row for row in _rows(path)}
+    jobs = max(1, config.jobs // side_by_side)
+    commands, digests, bad = {}, {}, []
+    into.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=into, prefix=".rows-") as folder:
+        for name, source in named.items():
+            old, digests[name] = rows.get(name), digest_of(source, config)
+            ours = bool(old and old["scenes"] and all(Path(into, scene).is_dir() for scene in old["scenes"]))
+            same = old and ours and old["digest"] == digests[name] and old["exit_code"] in (0, 1)
+            if old and same and not config.overwrite:
+                tell(f"{name}: is there, kept")
+                bad += [name] if old["exit_code"] else []
+                continue
+            choices = {**dataclasses.asdict(config), "jobs": jobs, "overwrite": config.overwrite or ours}
+            task = {"source": source, "target": into / name, "config": choices, "row": Path(folder, name)}
+            commands[name] = [sys.executable, "-m", "converters.many", json.dumps(task, default=str)]
+
+        def ended(name: str, code: int, printed: str) -> str:
+            made = Path(folder, name)
+            row = json.loads(made.read_text(encoding="utf-8")) if made.is_file() else {}
+            if not row:
+                told = f"killed by signal {-code}" if code < -1 else f"exit code {code}, {printed[-200:].strip()}"
+                row["error"] = told
+            known = {"name": name, "source": str(named[name]), "digest": digests[name], "exit_code": code}
+            scenes = (rows.get(name) or {}).get("scenes")  # of before: they still stand
+            rows[name] = {"scenes": scenes, **known, **row}
+            write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
+            if "error" in row:
+                return f"{name}: {row['error']}"
+            gates = ", ".join(row["gates_failed"])
+            verdict = f"gates that fail: {gates}" if gates else "every gate passes"
+            return f"{name}: {row['area_m2']:.1f} m² traversable in {row['seconds']:.0f} s, {verdict}"
+
+        return bad + run_side_by_side(commands, runner, side_by_side, report, tell, ended, "sources")
+
+
+def _named(sources: Sequence[Path]) -> dict[str, Path]:
+    names = [source.stem if source.is_file() else os.path.abspath(source).rpartition(os.sep)[2] for source in sources]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"--into: two sources are named {name}, expected one; rename a folder")
+    return dict(zip(names, sources, strict=True))
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        return pq.read_table(path).to_pylist() if path.is_file() else []
+    except (OSError, pa.ArrowInvalid) as error:
+        raise FileError(f"{path}: not readable as Parquet ({error}); remove it to convert all again") from None
+
+
+def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
+    """What a row says of a conversion that was done in this process; gates carry the scene's name where several are."""
+    gates = [(g.name if len(results) == 1 else f"{r.folder.name}/{g.name}", g.passed) for r in results for g in r.gates]
+    own, started = (resource.getrusage(of).ru_maxrss / 1024 for of in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return {
+        "scenes": [r.folder.name for r in results],
+        "gates_passed": [name for name, passed in gates if passed],
+        "gates_failed": [name for name, passed in gates if not passed],
+        "warnings": list(dict.fromkeys(w for r in results for w in r.manifest.warnings)),
+        "movables": sum(len(r.manifest.objects) for r in results),
+        "area_m2": sum(r.manifest.floor_area_m2 for r in results),
+        "seconds": seconds,
+        **{f"{stage}_s": value for stage, value in results[0].stage_s.items()},
+        "peak_memory_mib": own,
+        "worker_memory_mib": started,
+    }
+
+
+def main(task: str) -> int:
+    """Converts one source and writes its row; the exit code is that of `python -m converters convert`."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is unfinished is removed
+    told, began, code = json.loads(task), time.monotonic(), 2
+    config, library = told["config"], told["config"]["library"]
+    config = ConvertConfig(**{**config, "library": Path(library) if library else None})
+    try:
+        results = convert_building(Path(told["source"]), Path(told["target"]), config)
+        row = measured(results, time.monotonic() - began)
+        code = 1 if row["gates_failed"] else 0
+    except (UserError, StageFailed, OSError) as error:
+        row = {"error": " ".join(str(error).split()), "seconds": time.monotonic() - began}
+    write_text(told["row"], json.dumps(row))
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,165 @@
+"""Many raw folders at once: a row each, what is there is kept, one that fails or is killed costs no other."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from converters import many, sets
+from converters.__main__ import main
+from converters.many import ROWS, convert_many, digest_of
+from converters.pipeline import STAGES, ConvertConfig
+from scenes_mjcf.schema import load_manifest
+
+QUICK = ConvertConfig(jobs=2, structure_texture=64, object_texture=32)
+
+
+class Killing(sets.LocalRunner):
+    """Runs commands; that of `killed` ends as the kernel would end it that is out of memory."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tasks = []
+
+    def run(self, command):
+        self.tasks.append(json.loads(command[-1]))
+        if Path(self.tasks[-1]["target"]).name == "killed":
+            command = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
+        return super().run(command)
+
+
+def rows_of(into: Path) -> dict[str, dict]:
+    return {row["name"]: row for row in pq.read_table(into / ROWS).to_pylist()}
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory, pristine) -> dict[str, Path]:
+    base = tmp_path_factory.mktemp("sources")
+    for name in ("first", "second", "broken", "killed"):
+        shutil.copytree(pristine / "gibson", base / name)
+    next((base / "broken").glob("*.obj")).unlink()
+    return {path.name: path for path in sorted(base.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def converted(sources, tmp_path_factory) -> tuple[Path, list[str], Killing, list[str]]:
+    into, runner, lines = tmp_path_factory.mktemp("many") / "scenes", Killing(), []
+    failed = convert_many([*sources.values()], into, QUICK, runner, 2, lambda *_: None, lines.append)
+    return into, failed, runner, lines
+
+
+def test_a_row_each_and_no_other_is_lost(converted, sources):
+    into, failed, runner, lines = converted
+    assert sorted(failed) == ["broken", "killed"] and {task["config"]["jobs"] for task in runner.tasks} == {1}
+    rows = rows_of(into)
+    codes = {name: row["exit_code"] for name, row in rows.items()}
+    assert codes == {"first": 0, "second": 0, "broken": 2, "killed": -9}
+    assert rows["killed"]["error"] == "killed by signal 9" and rows["killed"]["area_m2"] is None
+    assert "broken" in rows["broken"]["error"] and rows["broken"]["scenes"] is None
+    assert sorted(p.name for p in into.iterdir()) == [ROWS, "first", "second"]
+    first, manifest = rows["first"], load_manifest(into / "first")
+    assert first["error"] is None and first["scenes"] == ["first"] and first["source"] == str(sources["first"])
+    assert first["area_m2"] == manifest.floor_area_m2 and first["movables"] == len(manifest.objects) == 2
+    assert first["warnings"] == list(manifest.warnings) and first["gates_failed"] == []
+    assert "drift_boxes" in first["gates_passed"]
+    stages = sum(first[f"{stage}_s"] for stage in STAGES)
+    assert 0 < stages <= first["seconds"] < stages + 5
+    assert 50 < first["peak_memory_mib"] < 5000
+    assert "killed: killed by signal 9" in lines
+
+
+def test_what_is_there_is_kept_until_its_options_or_inputs_change(converted, sources, monkeypatch):
+    into, _, _, _ = converted
+    lines = []
+    chosen = [sources[name] for name in ("first", "second", "killed")]
+
+    def again(config):
+        runner = Killing()
+        convert_many(chosen, into, config, runner, 1, lambda *_: None, lines.append)
+        return {Path(task["target"]).name: task["config"]["overwrite"] for task in runner.tasks}
+
+    monkeypatch.setattr(many.sys, "executable", "/bin/false")  # what would be converted fails at once
+    assert again(QUICK) == {"killed": False}
+    assert lines[:2] == ["first: is there, kept", "second: is there, kept"]
+    assert "broken" in rows_of(into)  # not asked for: stays
+    file = next(sources["second"].glob("*.json"))
+    os.utime(file, (1, 1))
+    assert again(QUICK) == {"second": True, "killed": False}
+    rows = rows_of(into)
+    assert rows["second"]["exit_code"] == 1 and rows["second"]["error"].startswith("exit code 1")
+    assert rows["second"]["scenes"] == ["second"] and (into / "second").is_dir()  # still that of before
+
+
+def test_the_digest_is_of_options_and_inputs(gibson_raw):
+    first = digest_of(gibson_raw, QUICK)
+    assert first == digest_of(gibson_raw, dataclasses.replace(QUICK, jobs=9, overwrite=True))
+    assert first != digest_of(gibson_raw, dataclasses.replace(QUICK, seed=1))
+    (gibson_raw / "more.txt").write_text("x")
+    assert first != digest_of(gibson_raw, QUICK)
+
+
+def test_of_the_command(tmp_path, monkeypatch, capsys):
+    """SRC... and lists of them reach the function; its failures are told last and the exit code is 1."""
+    asked = {}
+
+    def convert_many(sources, into, config, runner, side_by_side, report, tell):
+        asked.update(sources=sources, into=into, config=config, side_by_side=side_by_side)
+        return ["b"]
+
+    monkeypatch.setattr(many, "convert_many", convert_many)
+    listed = tmp_path / "list.txt"
+    listed.write_text("a\nb\n\n")
+    assert main(["convert", f"@{listed}", "--strict", "c", "--into", str(tmp_path / "o"), "--jobs", "2"]) == 1
+    assert asked["sources"] == [Path("a"), Path("b"), Path("c")] and asked["into"] == tmp_path / "o"
+    assert asked["config"].strict and asked["config"].jobs == 2 and asked["side_by_side"] == 2
+    assert capsys.readouterr().out.rstrip().endswith("not converted, or with gates that fail: b")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a"], "got 1 folders, expected SRC OUT, or SRC... --into DIR"),
+        (["a", "b", "c"], "got 3 folders, expected SRC OUT"),
+        (["@nowhere.txt", "--into", "o"], "nowhere.txt"),
+    ],
+)
+def test_wrong_words(words, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["convert", *words])
+    assert end.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_two_of_one_name_and_damaged_rows_are_one_line(tmp_path, capsys):
+    for place in ("x/a", "y/a"):
+        (tmp_path / place).mkdir(parents=True)
+    words = ["--into", str(tmp_path / "o")]
+    assert main(["convert", str(tmp_path / "x" / "a"), str(tmp_path / "y" / "a"), *words]) == 2
+    assert capsys.readouterr().err == "error: --into: two sources are named a, expected one; rename a folder\n"
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / ROWS).write_text("x")
+    assert main(["convert", str(tmp_path / "x" / "a"), *words]) == 2
+    assert "not readable as Parquet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_what_runs_and_leaves_no_part(sources, tmp_path, number, code):
+    into = tmp_path / "scenes"
+    command = [sys.executable, "-m", "converters", "convert", str(sources["first"]), "--into", str(into), "--jobs", "1"]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 60
+    while not list(into.glob(".first.part-*")) and time.monotonic() < until:
+        time.sleep(0.05)
+    running.send_signal(number)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == code and "nothing was written" in said
+    assert list(into.iterdir()) == []

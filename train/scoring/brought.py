@@ -1,0 +1,176 @@
+"""`name=module:factory` in, a policy that plays out: any Python callable, NumPy, JAX or PyTorch, on the host."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import numpy as np
+
+from interactive_nav_common.errors import ConfigError
+from train.errors import PolicyError
+from train.scoring.planners import HostPolicy
+
+TAKEN = ("learned", "random", "follower", "avoider", "namo")
+EXPECTED = "expected [name=]module:factory or [name=]path/to/file.py:factory"
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayedEnv:
+    """What a policy's factory is told of the environment that it is to play in."""
+
+    robot: str
+    scenes: tuple[str, ...]
+    observations: dict[str, jax.ShapeDtypeStruct]
+    """Name -> `.shape` and `.dtype` of one environment's: `state`, the vector, and images such as `pixels/depth`."""
+    state_parts: dict[str, slice]
+    """Part of `state` -> where it stands: `waypoints` (x0, y0, x1, ... m, robot frame), `goal`, `velocity`, ..."""
+    action_size: int
+    """Actions are clipped to [-1, 1]."""
+    control_dt_s: float
+    max_linear_m_s: float
+    """Of the base; NaN, as the next one, where the control mode takes no base velocity."""
+    max_angular_rad_s: float
+    drive: Callable[[Any, Any], np.ndarray]
+    """Linear (m/s) and angular (rad/s) velocity [B] of the base -> actions [B, A]."""
+
+
+def told(env: Any) -> PlayedEnv:
+    """An environment's description."""
+    obs = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), np.uint32)).obs
+    ends = np.cumsum([0, *env.sensors.sizes.values()]).tolist()
+    twist = env.robot.twist
+    return PlayedEnv(
+        robot=env.robot.name,
+        scenes=tuple(scene.name for scene in env.scenes),
+        observations=dict(obs) if isinstance(obs, Mapping) else {"state": obs},
+        state_parts=dict(zip(env.sensors.sizes, map(slice, ends, ends[1:]), strict=False)),
+        action_size=env.action_size,
+        control_dt_s=env.config.physics.control_dt_s,
+        max_linear_m_s=twist.max_linear_m_s if twist else np.nan,
+        max_angular_rad_s=twist.max_angular_rad_s if twist else np.nan,
+        drive=env.robot.drive,
+    )
+
+
+def named(word: str) -> str:
+    """`name=module:factory` of a word of `--policy`; the name is the module's and factory's where none is given.
+
+    Raises:
+        ConfigError: not such a word.
+    """
+    name, equals, place = word.rpartition("=")
+    module, _, factory = place.rpartition(":")
+    if not module or not factory.isidentifier():
+        raise ConfigError(f"--policy: got {word!r}, {EXPECTED}")
+    name = name if equals else f"{Path(module).stem if module.endswith('.py') else module}:{factory}"
+    if not re.fullmatch(r"[\w.:+-]+", name) or name.partition(":")[0] in TAKEN:
+        raise ConfigError(
+            f"--policy: name is {name!r}, expected letters, digits and any of _ . : + -, and none of {', '.join(TAKEN)}"
+        )
+    return f"{name}={place}"
+
+
+def _first_line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+
+
+def _load(place: str) -> Callable[[PlayedEnv], Any]:
+    """The factory at `module:factory` or `path/to/file.py:factory`; modules of the current folder count."""
+    module, _, name = place.rpartition(":")
+    is_file = module.endswith(".py")
+    folder = str(Path(module).resolve().parent) if is_file else os.getcwd()
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        loaded = _load_file(Path(module)) if is_file else importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        raise PolicyError(f"--policy: cannot import {module} ({_first_line(error)}); {EXPECTED}") from error
+    made = getattr(loaded, name, None)
+    if not callable(made):
+        got = "nothing" if made is None else f"of type {type(made).__name__}"
+        raise PolicyError(f"--policy: {name} of {module} is {got}, expected a function of one description")
+    return made
+
+
+def _load_file(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"policy_of_{path.stem}", path)
+    assert spec and spec.loader
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class BroughtPolicy(HostPolicy):
+    """A callable of the user's; see `docs/benchmark-your-policy.md`.
+
+    Args:
+        word: `name=module:factory`.
+        env: one environment, not batched.
+
+    Raises:
+        PolicyError: no such factory, or it raises or returns nothing that can be called.
+    """
+
+    def __init__(self, word: str, env: Any):
+        self._name, _, place = word.partition("=")
+        self._act = self._call("factory", _load(place), told(env))
+        if not callable(self._act):
+            raise self._error(f"its factory returned type {type(self._act).__name__}, expected a callable")
+        self._size = env.action_size
+        self._seen: dict[str, np.ndarray] = {}
+        self._first_episode = 0
+
+    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
+        """Actions [N, A] of one control step; the policy sees the batch as large as it began, whoever is over."""
+        obs = state.obs if isinstance(state.obs, Mapping) else {"state": state.obs}
+        if step == 0:
+            self._seen = {name: np.array(value) for name, value in obs.items()}
+            self._first_episode = int(episode[0])
+            if hasattr(self._act, "reset"):
+                self._call("reset", self._act.reset, np.array(episode))
+        places = episode - self._first_episode
+        for name, value in obs.items():
+            self._seen[name][places] = np.asarray(value)
+        count = len(next(iter(self._seen.values())))
+        seen = {name: value.copy() for name, value in self._seen.items()}  # it may keep them, or write into them
+        got = self._call("policy", self._act, seen, np.full(count, step == 0))
+        actions = self._call("policy's actions", _on_host, got)
+        if actions.shape != (count, self._size):
+            raise self._error(f"actions have shape {actions.shape}, expected {(count, self._size)}")
+        actions = np.where(running[:, None], actions[places], 0.0)
+        bad = np.flatnonzero(~np.isfinite(actions).all(1))
+        if len(bad):
+            raise self._error(
+                f"actions of episode {episode[bad[0]]} at step {step} are {actions[bad[0]]}, expected finite numbers"
+            )
+        return actions
+
+    def _call(self, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except Exception as error:
+            frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
+            own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+            where = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+            raise self._error(f"{what}: raised {_first_line(error)}{where}") from error
+
+    def _error(self, text: str) -> PolicyError:
+        return PolicyError(f"policy {self._name}: {text}")
+
+
+def _on_host(actions: Any) -> np.ndarray:
+    """Actions of NumPy, JAX or PyTorch (on any device, with or without a gradient) as f32."""
+    if hasattr(actions, "detach"):
+        actions = actions.detach().cpu()
+    return np.asarray(actions, np.float32)
