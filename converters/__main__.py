@@ -198,7 +198,7 @@ def _add_convert(commands: Commands) -> None:
         nargs="+",
         metavar="SRC OUT",
         help="folder with the raw scan, or a mesh file, and the scene folder to make, whose name becomes the scene's; "
-        "several floors make OUT_0, OUT_1, ...; @LIST is a file of one SRC a line; KEY=VALUE settings: structure_faces, "
+        "several floors make OUT_0, OUT_1, ...; @LIST is a file of one SRC a line; KEY=VALUE: structure_faces, "
         "object_faces (triangles drawn), structure_texture, object_texture (pixels)",
     )
     command.add_argument(
