@@ -33,7 +33,7 @@ from converters.read.storeys import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.gate import Gate
-from converters.records.raw import RawScene
+from converters.records.raw import CATEGORY_LABELS, RawScene
 from converters.records.visual import ColourCloud, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
 from converters.structure.floor import level_floor
@@ -341,9 +341,11 @@ def _convert(
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
-            raw = dataclasses.replace(
-                read_source(source, config.format, config.strict, config.up, config.unit), name=target.name
-            )
+            raw = read_source(source, config.format, config.strict, config.up, config.unit)
+            labelled = np.isin(raw.scan.labels, [label for own in CATEGORY_LABELS.values() for label in own]).any()
+            unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
+            told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
+            raw = dataclasses.replace(raw, name=target.name, warnings=told)
             scenes = split_storeys(raw)
         if warn is not None:
             for warning in raw.warnings:

@@ -18,6 +18,8 @@ from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manife
 ROBOT_RADIUS_M = 0.18
 """Free space is judged for a TurtleBot-sized disc."""
 START_GOAL_M = 1.0
+OFF_MAP_M = 1.0
+"""An object with no free floor this near lies outside of what was mapped."""
 DRIFT_S = 5.0
 TIMESTEP_S = 0.02
 """The environments' own physics timestep (`sim_dt_s`), for hulls and for boxes."""
@@ -25,7 +27,7 @@ TIMESTEP_S = 0.02
 
 LIMITS: dict[str, Limit] = {
     "compiles": Limit("bool", least=1, meaning="scene.xml compiles in MuJoCo"),
-    "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml"),
+    "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml; off the map"),
     "finite": Limit("bool", least=1, meaning="no non-finite number in 5 s, no simulation started over"),
     "drift_hulls": Limit("m", most=0.01, meaning="largest move in 5 s untouched, hulls at the environments' timestep"),
     "drift_boxes": Limit("m", most=0.01, meaning="the same with boxes"),
@@ -173,6 +175,22 @@ def free_space_warnings(maps: SceneMaps) -> tuple[str, ...]:
     )
 
 
+def objects_off_map(model: mujoco.MjModel, maps: SceneMaps) -> tuple[str, ...]:
+    """Names of the movable bodies that stand farther than `OFF_MAP_M` from all traversable floor."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    distance = ndimage.distance_transform_edt(~maps.traversable, sampling=maps.resolution_m)
+    assert isinstance(distance, np.ndarray)
+    off = []
+    for body in movable_bodies(model) if maps.traversable.any() else []:
+        at = (data.xpos[body, :2] - maps.origin_w) / maps.resolution_m
+        inside = np.clip(np.floor(at).astype(int), 0, np.array(distance.shape)[::-1] - 1)
+        beyond = float(np.abs(at - inside - 0.5).max()) * maps.resolution_m
+        if max(beyond, float(distance[inside[1], inside[0]])) > OFF_MAP_M:
+            off.append(model.body(body).name)
+    return tuple(off)
+
+
 def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]) -> tuple[Gate, ...]:
     """Every gate in the table's order.
 
@@ -190,10 +208,11 @@ def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]
     bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in movable_bodies(model)}
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or "" for g in range(model.ngeom)]
     hulls = [sum(n.startswith(f"{o}_hull_") for n in names) for o in object_names]
+    off = objects_off_map(model, maps)
     by_hull, by_box = physical_values(model), physical_values(boxes)
     values = {
         "compiles": 1.0,
-        "unmatched_objects": float(len(bodies ^ set(object_names))),
+        "unmatched_objects": float(len(bodies ^ set(object_names)) + len(off)),
         "finite": min(by_hull["finite"], by_box["finite"]),
         "hulls_per_object": float(max(hulls, default=0)),
         "hulls": float(sum(hulls)),
@@ -203,6 +222,8 @@ def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
     values |= free_space_values(maps)
     warnings = {"connected_share": free_space_warnings(maps)}
+    if off:
+        warnings["unmatched_objects"] = (f"{', '.join(off)}: more than {OFF_MAP_M:g} m from all free floor of the map",)
     return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
 
 

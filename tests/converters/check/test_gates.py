@@ -21,6 +21,7 @@ from converters.check.gates import (
     free_space_values,
     free_space_warnings,
     judge,
+    objects_off_map,
     physical_values,
 )
 from converters.check.settle import settle
@@ -89,6 +90,18 @@ def test_a_piece_too_narrow_for_the_robot_counts_against_the_share_and_is_named(
 def test_a_corridor_one_cell_wide_and_one_too_narrow(shape, farthest):
     values = free_space_values(maps_of(np.ones(shape, bool)))
     assert values["start_goal"] == pytest.approx(farthest)
+
+
+def test_objects_beyond_the_mapped_floor_are_named():
+    spec = mujoco.MjSpec()
+    for name, x in (("near", 0.4), ("far", -1.3), ("beyond", 9.0), ("between", 3.2)):
+        body = spec.worldbody.add_body(name=name, pos=[x, 0.5, 0.1])
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1])
+    free = np.zeros((20, 100), bool)
+    free[:, :40] = True  # 2 x 1 m from the origin on, of a map of 5 m
+    maps = dataclasses.replace(maps_of(free), origin_w=(0.0, 0.0))
+    assert objects_off_map(spec.compile(), maps) == ("far", "beyond", "between")
 
 
 def spec_of(folder: Path) -> mujoco.MjSpec:

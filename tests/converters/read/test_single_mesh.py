@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from converters.__main__ import main
-from converters.pipeline import ConvertConfig, convert
+from converters.pipeline import ConvertConfig, convert, convert_building
 from converters.read.meshes import SUFFIXES
 from converters.read.source import read_source
 from converters.records.errors import SceneRejected
@@ -64,6 +64,9 @@ def test_a_tilted_scan_in_centimetres_becomes_the_scene_of_the_right_one(room, t
     words = " ".join(tilted.manifest.warnings)
     assert "turned by 117" in words and "taken to be in cm" in words and "told by shape" in words
     assert "turned" not in " ".join(right.manifest.warnings)
+    told: list[str] = []
+    convert_building(room, tmp_path / "c", ConvertConfig(jobs=1, auto_align=True), cache=hull_cache, warn=told.append)
+    assert "--auto-align: no label of furniture in the scan, so no model is fitted" in told
 
 
 @pytest.mark.parametrize(
