@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from converters.read import gibson, interactive_gibson, meshes, scan2cad
-from converters.read.homes import sdf
+from converters.read.homes import mjcf, sdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 
@@ -14,6 +14,7 @@ READERS = {
     "gibson": (gibson.looks_like, gibson.read_gibson),
     "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
     "sdf": (sdf.looks_like, sdf.read_sdf),
+    "mjcf": (mjcf.looks_like, mjcf.read_mjcf),
 }
 
 
@@ -30,7 +31,7 @@ def detect_format(source: Path) -> str:
         raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
-        f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad) or worlds/*.world (sdf) in it"
+        f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad) worlds/*.world (sdf) or scene.xml (mjcf) in it"
     )
 
 

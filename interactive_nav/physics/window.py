@@ -19,15 +19,12 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
+from interactive_nav.physics.nearness import FAR_M, REACH_M, Nearness
 from interactive_nav.scenes.spec import FEET, build_empty_spec
 from interactive_nav.scenes.world import World
 
-REACH_M = 0.6
-"""An object left out of the window although it is this near to the robot's footprint counts as missed."""
-_MOVING_M_S = 0.02
 _MOVING_BONUS_M = 2.0
 """Moving objects rank as if they were this much nearer."""
-_FAR_M = 1e6
 
 _BODY = (
     *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
@@ -69,8 +66,9 @@ class Window:
         model = world.models[0]
         slots: list[tuple[str, int]] = []
         picked = []
+        self._slots = {kind: np.flatnonzero(kinds == kind) for kind in limits}
         for kind, limit in limits.items():
-            own = np.flatnonzero(kinds == kind)
+            own = self._slots[kind]
             width = min(limit or len(own), len(own))
             boxes = max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=FEET) - FEET
             if width:
@@ -81,9 +79,7 @@ class Window:
         self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
         self.groups = tuple(self._group(*p) for p in picked)
         self._wall_tables, self._wall_rows = self._walls()
-        self._radius_m = jnp.asarray(_radii(world), jnp.float32)
-        self._anchor_m, self._leaf_m = (jnp.asarray(x, jnp.float32) for x in _doors(world))
-        self._occupied = jnp.asarray(world.occupied)
+        self._nearness = Nearness(world)
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
         self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
@@ -142,40 +138,41 @@ class Window:
             Per group [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something
             within reach had to be left out.
         """
-        layout = self.world.layout
-        robot = state.qpos[layout.robot_qpos : layout.robot_qpos + 2]
-        reach = self.world.robot.footprint_radius_m + REACH_M
+        near, moving, walls = self._near(scene, state)
         chosen, missed = [], jnp.zeros((), bool)
         for group in self.groups:
             if group.width == len(group.slots):
                 chosen.append(jnp.arange(group.width))
                 continue
-            if layout.slot_kind[group.slots[0]] == "hinge":
-                angle = state.qpos[layout.slot_qpos[group.slots]] * self._leaf_m[scene, group.slots, 2]
-                c, s = jnp.cos(angle), jnp.sin(angle)
-                x, y = self._leaf_m[scene, group.slots, 0], self._leaf_m[scene, group.slots, 1]
-                centre = self._anchor_m[scene, group.slots] + jnp.stack([c * x - s * y, s * x + c * y], -1)
-                speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots]])
-            else:
-                centre = state.qpos[layout.slot_qpos[group.slots][:, None] + np.arange(2)]
-                speed = jnp.abs(state.qvel[layout.slot_qvel[group.slots][:, None] + np.arange(6)]).max(-1)
-            gap = jnp.linalg.norm(centre - robot[None], axis=-1) - self._radius_m[scene, group.slots]
-            gap = jnp.where(self._occupied[scene, group.slots], gap, _FAR_M)
-            _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * (speed > _MOVING_M_S)), group.width)
+            gap, moves = near[group.slots], moving[group.slots]
+            _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * moves), group.width)
             left_out = jnp.ones(len(group.slots), bool).at[index].set(False)
-            missed |= jnp.any(left_out & (gap < reach))
+            missed |= jnp.any(left_out & ((gap < 0) | moves))
             chosen.append(index)
+        if self.n_walls == len(walls):
+            return tuple(chosen), jnp.arange(self.n_walls), missed.astype(jnp.int32)
+        _, index = jax.lax.top_k(-walls, self.n_walls)
+        missed |= jnp.any(jnp.ones(len(walls), bool).at[index].set(False) & (walls < 0))
+        return tuple(chosen), index, missed.astype(jnp.int32)
+
+    def needs(self, scene: jax.Array, state: PhysicsState) -> dict[str, jax.Array]:
+        """How many of each kind can be met, or move, in one environment: [] i32 by kind of slot, and of walls."""
+        near, moving, walls = self._near(scene, state)
+        needed = (near < 0) | moving
+        counts = {kind: needed[jnp.asarray(slots)].sum() for kind, slots in self._slots.items()}
+        return {**counts, "walls": (walls < 0).sum()}
+
+    def _near(self, scene: jax.Array, state: PhysicsState) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """[slots] m to where each can be met, [slots] whether it moves, [walls] m likewise; see `Nearness.measure`."""
+        reach = self.world.robot.footprint_radius_m + REACH_M
+        near, moving = self._nearness.measure(scene, state, reach)
+        robot = state.qpos[self.world.layout.robot_qpos : self.world.layout.robot_qpos + 2]
         walls = self._wall_tables
-        count = walls["used"].shape[1]
-        if self.n_walls == count:
-            return tuple(chosen), jnp.arange(count), missed.astype(jnp.int32)
         # Planar distance from the robot to each wall box.
         offset = jnp.einsum("wi,wij->wj", robot[None] - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
         outside = jnp.maximum(jnp.abs(offset) - walls["geom_size"][scene, :, :2], 0.0)
-        gap = jnp.where(walls["used"][scene] > 0, jnp.linalg.norm(outside, axis=-1), _FAR_M)
-        _, index = jax.lax.top_k(-gap, self.n_walls)
-        missed |= jnp.any(jnp.ones(count, bool).at[index].set(False) & (gap < reach))
-        return tuple(chosen), index, missed.astype(jnp.int32)
+        gap = jnp.where(walls["used"][scene] > 0, jnp.linalg.norm(outside, axis=-1), FAR_M)
+        return near, moving, gap - reach
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
         """Values of all `FIELDS` of the window's model, in MuJoCo's shapes."""
@@ -266,40 +263,3 @@ def _static_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-
-
-def _radii(world: World) -> np.ndarray:
-    """[S, M] how far each slot's boxes reach from its frame; a door's, from its centre of mass."""
-    layout = world.layout
-    out = np.zeros((len(world.models), layout.num_slots))
-    for s, model in enumerate(world.models):
-        for k, body in enumerate(layout.slot_body):
-            geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body] - FEET)
-            centre = model.body_ipos[body] if layout.slot_kind[k] == "hinge" else np.zeros(3)
-            reach = np.linalg.norm((model.geom_pos[geoms] - centre)[:, :2], axis=1) + np.linalg.norm(
-                model.geom_size[geoms, :2], axis=1
-            )
-            if layout.slot_kind[k] != "hinge":
-                # It may tip over.
-                reach = np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]
-            out[s, k] = reach.max(initial=0.0)
-    return out
-
-
-def _doors(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Hinges [S, M, 2] in the world, and leaves [S, M, 3]: planar way from hinge to centre of mass when the joint
-    is at 0, and the joint's sense about the world's z; zeros for other slots."""
-    layout = world.layout
-    anchor = np.zeros((len(world.models), layout.num_slots, 2))
-    leaf = np.zeros((len(world.models), layout.num_slots, 3))
-    for s, model in enumerate(world.models):
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        for k, body in enumerate(layout.slot_body):
-            if layout.slot_kind[k] == "hinge":
-                joint = model.body_jntadr[body]
-                anchor[s, k] = data.xanchor[joint, :2]
-                leaf[s, k, :2] = data.xipos[body, :2] - anchor[s, k]
-                leaf[s, k, 2] = np.sign(data.xaxis[joint, 2])
-    return anchor, leaf

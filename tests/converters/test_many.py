@@ -17,8 +17,9 @@ import pytest
 
 from converters import many, sets
 from converters.__main__ import main
+from converters.clock import STAGES
 from converters.many import ROWS, convert_many, digest_of
-from converters.pipeline import STAGES, ConvertConfig
+from converters.pipeline import ConvertConfig
 from scenes_mjcf.schema import load_manifest
 
 QUICK = ConvertConfig(jobs=2, structure_texture=64, object_texture=32)
