@@ -120,7 +120,7 @@ def test_an_environment_and_its_new_episodes(env):
     assert np.isfinite(state.obs).all()
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "sac", "ddpg"])
+@pytest.mark.parametrize("algorithm", ["ppo", *(pytest.param(a, marks=pytest.mark.heavy) for a in ("sac", "ddpg"))])
 def test_an_update_of_a_learner(algorithm):
     env = batched()
     if algorithm == "ppo":

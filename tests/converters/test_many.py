@@ -152,7 +152,9 @@ def test_two_of_one_name_and_damaged_rows_are_one_line(tmp_path, capsys):
     assert "not readable as Parquet" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.heavy), (signal.SIGTERM, 143)]
+)
 def test_a_signal_ends_what_runs_and_leaves_no_part(sources, tmp_path, number, code):
     into = tmp_path / "scenes"
     command = [sys.executable, "-m", "converters", "convert", str(sources["first"]), "--into", str(into), "--jobs", "1"]

@@ -265,6 +265,7 @@ def adapted_from(out, source):
     return begun and "export" not in about and kinds == {jnp.dtype("float32")}
 
 
+@pytest.mark.heavy
 def test_an_exported_detector_is_fine_tuned_and_makes_maps_like_the_runs(made, exported, tmp_path):
     """Weights in half precision, no optimiser state."""
     out, rooms, passages = tmp_path / "passages", exported / "rooms", exported / "passages"

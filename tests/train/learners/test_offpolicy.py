@@ -67,7 +67,7 @@ def copy(tree: Any) -> Any:
 both = pytest.mark.parametrize("algorithm", ["sac", "ddpg"])
 
 
-@both
+@pytest.mark.parametrize("algorithm", [pytest.param("sac", marks=pytest.mark.heavy), "ddpg"])
 def test_nothing_is_learned_before_the_replay_is_full_enough(straight, algorithm):
     """Two updates fill 128 of 192; the third learns. Two gradient steps an update, one line a log interval."""
     seen, end = straight[algorithm]

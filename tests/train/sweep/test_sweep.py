@@ -202,7 +202,9 @@ def running(pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.heavy), signal.SIGTERM, signal.SIGKILL]
+)
 def test_children_end_with_the_sweep_however_it_ends(tmp_path, number):
     path = write_sweep(tmp_path, steps=100_000)
     program = (
