@@ -116,7 +116,12 @@ def convert_many(
 
 
 def _named(sources: Sequence[Path]) -> dict[str, Path]:
-    names = [source.stem if source.is_file() else os.path.abspath(source).rpartition(os.sep)[2] for source in sources]
+    names = [
+        source.stem.removesuffix(".scene_instance")
+        if source.is_file()
+        else os.path.abspath(source).rpartition(os.sep)[2]
+        for source in sources
+    ]
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"--into: two sources are named {name}, expected one; rename a folder")

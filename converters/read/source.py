@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from converters.read import gibson, interactive_gibson, meshes, scan2cad
-from converters.read.homes import mjcf, sdf
+from converters.read.homes import habitat, mjcf, sdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 
@@ -14,8 +15,15 @@ READERS = {
     "gibson": (gibson.looks_like, gibson.read_gibson),
     "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
     "sdf": (sdf.looks_like, sdf.read_sdf),
+    "habitat": (habitat.looks_like, habitat.read_habitat),
     "mjcf": (mjcf.looks_like, mjcf.read_mjcf),
 }
+FILES = {
+    (".world", ".sdf"): (sdf.root_of, sdf.read_sdf),
+    (habitat.SCENE,): (habitat.root_of, habitat.read_habitat),
+    (".xml",): (lambda path: path.resolve().parent, mjcf.read_mjcf),
+}
+"""Ending of a file that says which home of a folder is meant -> its folder, its reader."""
 
 
 def detect_format(source: Path) -> str:
@@ -31,14 +39,15 @@ def detect_format(source: Path) -> str:
         raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
-        f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad) worlds/*.world (sdf) or scene.xml (mjcf) in it"
+        f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad), worlds/*.world (sdf), "
+        f"*{habitat.SCENE} (habitat) or scene.xml (mjcf) in it"
     )
 
 
 def read_source(
     source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto"
 ) -> RawScene:
-    """Reads a raw folder in the given layout, or in the one that its files show; or a single mesh file.
+    """Reads a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh.
 
     Args:
         source: folder, or file.
@@ -51,8 +60,15 @@ def read_source(
         SceneRejected: no known layout, or bad input.
     """
     if source.is_file() and layout == "auto":
+        for endings, (root_of, read) in FILES.items():
+            if source.name.lower().endswith(endings) and (up, unit) == ("auto", "auto"):
+                return dataclasses.replace(read(root_of(source), strict, source), name=source.name.partition(".")[0])
         if source.suffix.lower() not in meshes.SUFFIXES:
-            raise SceneRejected(f"{source}: is no mesh file; expected one of {', '.join(meshes.SUFFIXES)}, or a folder")
+            homes = ", ".join(ending for endings in FILES for ending in endings)
+            raise SceneRejected(
+                f"{source}: is no mesh file; expected one of {', '.join(meshes.SUFFIXES)}, of a home's ({homes}), or a "
+                "folder"
+            )
         return meshes.read_single_mesh(source, strict, up, unit)
     if (up, unit) != ("auto", "auto"):
         raise SceneRejected(f"{source}: --up and --unit are for a single mesh file; a folder's layout says both")

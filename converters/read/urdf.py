@@ -35,13 +35,14 @@ class RigidObject:
     friction: float | None
 
 
-def read_urdf(source: SourceFolder, relative: str, remedy: str) -> RigidObject:
+def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = False) -> RigidObject:
     """Reads a URDF whose links, if several, hang together by fixed joints.
 
     Args:
         source: the folder; takes hashes and warnings.
         relative: path of the URDF in it.
         remedy: ends the message where the file is missing.
+        hold: take joints that move as fixed where they are at 0.
 
     Raises:
         SceneRejected: no XML, no link, a joint that moves, no mesh, or a number that is none.
@@ -50,7 +51,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str) -> RigidObject:
     try:
         root = ElementTree.parse(path).getroot()
         links = {str(e.get("name")): e for e in root.findall("link")}
-        places = _link_places(path, root, links)
+        places = _link_places(path, root, links, hold)
         visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual")]
         solid = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision")]
         masses = [_value(e, "inertial/mass") for e in links.values()]
@@ -106,7 +107,9 @@ def _origin(element: ElementTree.Element) -> np.ndarray:
     return matrix
 
 
-def _link_places(path: Path, root: ElementTree.Element, links: dict[str, ElementTree.Element]) -> dict[str, np.ndarray]:
+def _link_places(
+    path: Path, root: ElementTree.Element, links: dict[str, ElementTree.Element], hold: bool
+) -> dict[str, np.ndarray]:
     """Link -> (4, 4) in the frame of the root link."""
     if not links:
         raise SceneRejected(f"{path}: has no <link>, expected a URDF of one object")
@@ -115,7 +118,7 @@ def _link_places(path: Path, root: ElementTree.Element, links: dict[str, Element
         kind, child, parent = joint.get("type"), joint.find("child"), joint.find("parent")
         if child is None or parent is None:
             raise SceneRejected(f"{path}: joint '{joint.get('name')}' lacks a parent or child")
-        if kind != "fixed":
+        if kind != "fixed" and not hold:
             raise SceneRejected(
                 f"{path}: joint '{joint.get('name')}' is {kind}, expected fixed joints only; "
                 "articulated objects are not supported, give each rigid part a URDF of its own"

@@ -7,8 +7,7 @@ the boxes' shadows and between their centres (separating axes).
 
 from __future__ import annotations
 
-import dataclasses
-
+import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -29,7 +28,7 @@ _MOVERS = 2
 FAR_M = 1e6
 
 
-@dataclasses.dataclass(frozen=True)
+@flax.struct.dataclass
 class Boxes:
     """Bounding boxes in the world, seen from above."""
 

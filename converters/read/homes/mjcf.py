@@ -49,17 +49,17 @@ def looks_like(root: Path) -> bool:
     return root.is_dir() and bool(mains_of(root))
 
 
-def read_mjcf(root: Path, strict: bool = False) -> RawScene:
-    """Reads a folder's only MJCF file, or its `scene.xml`.
+def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
+    """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one.
 
     Raises:
         SceneRejected: none or several, one that MuJoCo refuses, or it names a file outside of the folder.
     """
     source = SourceFolder(root, strict)
-    mains = mains_of(root)
+    mains = [chosen] if chosen else mains_of(root)
     if len(mains) != 1:
         names = ", ".join(p.name for p in mains) or "none"
-        raise SceneRejected(f"{root}: MJCF files are {names}, expected one or scene.xml; give a folder with one")
+        raise SceneRejected(f"{root}: MJCF files are {names}, expected one or scene.xml; give the file of one")
     _check_files(source, mains[0], 0, dict.fromkeys(FOLDERS, ""))
     try:
         model = mujoco.MjSpec.from_file(str(mains[0])).compile()

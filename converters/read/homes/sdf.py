@@ -43,17 +43,22 @@ def looks_like(root: Path) -> bool:
     return bool(worlds_of(root))
 
 
-def read_sdf(root: Path, strict: bool = False) -> RawScene:
-    """Reads the only world of a folder.
+def root_of(world: Path) -> Path:
+    """The folder whose world a file is."""
+    return world.resolve().parents[1 if world.resolve().parent.name == "worlds" else 0]
+
+
+def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
+    """Reads the only world of a folder, or the chosen one.
 
     Raises:
         SceneRejected: none or several worlds, a missing or damaged file, or a number that is none.
     """
     source = SourceFolder(root, strict)
-    worlds = worlds_of(root)
+    worlds = [chosen] if chosen else worlds_of(root)
     if len(worlds) != 1:
         names = ", ".join(p.name for p in worlds) or "none"
-        raise SceneRejected(f"{root}: worlds are {names}, expected one; leave the one to convert in the folder")
+        raise SceneRejected(f"{root}: worlds are {names}, expected one; give the file of one")
     reader = _Reader(source)
     world = _root(source, source.inside(worlds[0])).find("world")
     if world is None:

@@ -21,6 +21,7 @@ def colours(path) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
+@pytest.mark.heavy
 def test_a_source_adds_scan_and_cut(tiny_scene, pristine, tmp_path):
     folder = tiny_scene[0]
     preview(folder, tmp_path / "four.png")

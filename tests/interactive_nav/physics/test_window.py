@@ -47,7 +47,7 @@ def _state(world, scene, robot_xy=(0.0, 0.0)):
 def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
     window = Window(world, NavConfig.of(num_objects=2, **ALL))
     assert sum(group.width for group in window.groups) == world.layout.num_slots
-    chosen, walls, missed = window.select(jnp.asarray(scene), _state(world, scene))
+    chosen, walls, missed = jax.jit(window.select)(jnp.asarray(scene), _state(world, scene))
     fields, model, inner, outer = window.fields(jnp.asarray(scene), chosen, walls), world.models[scene], window, world
     assert int(missed) == 0 and set(fields) == set(FIELDS)
     for a, b in zip(inner.layout.slot_body, outer.layout.slot_body, strict=True):
@@ -77,17 +77,17 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
     two = Window(world, NavConfig.of(num_objects=2, active_furniture=2))
     kinds = {tuple(g.slots): i for i, g in enumerate(two.groups)}
     free = next(i for slots, i in kinds.items() if len(slots) == 4)
-    group = two.groups[free]
+    group, select = two.groups[free], jax.jit(two.select)
 
     def names(xy):
-        chosen, _, missed = two.select(jnp.asarray(0), _state(world, 0, xy))
+        chosen, _, missed = select(jnp.asarray(0), _state(world, 0, xy))
         return {world.names[0][s] for s in group.slots[np.asarray(chosen[free])]}, int(missed)
 
     assert names((0.0, 0.0)) == ({"chair_0", "chair_1"}, 0)
     assert names((-2.0, 0.0))[0] >= {"table_1"}
     one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
     # Between the chairs both are within 0.18 + 0.6 m; only one is simulated.
-    assert int(one.select(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
+    assert int(jax.jit(one.select)(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
 
 
 def test_a_moving_object_outranks_one_at_rest(world):
@@ -96,7 +96,8 @@ def test_a_moving_object_outranks_one_at_rest(world):
     slot = world.names[0].index("chair_1")
     moving = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[slot]].set(0.5))
     free = next(i for i, g in enumerate(one.groups) if slot in g.slots)
-    picked = [int(one.groups[free].slots[int(one.select(jnp.asarray(0), s)[0][free][0])]) for s in (state, moving)]
+    select = jax.jit(one.select)
+    picked = [int(one.groups[free].slots[int(select(jnp.asarray(0), s)[0][free][0])]) for s in (state, moving)]
     assert [world.names[0][p] for p in picked] == ["chair_0", "chair_1"]
 
 
@@ -105,7 +106,7 @@ def test_enter_and_leave_are_inverse(world):
     state = _state(world, 0)
     key = jax.random.PRNGKey(0)
     state = state.replace(qpos=state.qpos + 0.01 * jax.random.normal(key, state.qpos.shape))
-    chosen, _, _ = window.select(jnp.asarray(0), state)
+    chosen, _, _ = jax.jit(window.select)(jnp.asarray(0), state)
     inner = window.enter(state, chosen)
     back = window.leave(state, inner, chosen)
     np.testing.assert_array_equal(back.qpos, state.qpos)

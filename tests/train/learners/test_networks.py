@@ -165,6 +165,7 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
 
 
 @pytest.mark.slow
+@pytest.mark.heavy
 def test_ppo_learns_from_a_picture():
     """Where the goal lies stands in the image only: success from about 0.2 to at least 0.9."""
     config = TrainConfig(

@@ -1,0 +1,293 @@
+"""A scene of a Habitat dataset (ReplicaCAD, HSSD) in, `RawScene` out.
+
+Layout: one or several `*.scene_instance.json` anywhere; stages, objects and articulated objects are found by the
+names of their `*.stage_config.json`, `*.object_config.json` and URDFs, or are mesh files themselves. Habitat's world
+has y up. Objects that a class lexicon numbers (`*semantic_lexicon.json`; HSSD names its objects by hashes) take the
+names of their classes.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.files import SourceFolder, read_json
+from converters.read.homes.parts import Part, home
+from converters.read.meshes import SUFFIXES, read_surface
+from converters.read.obj import TexturedMesh
+from converters.read.urdf import placed, read_urdf
+from converters.records.errors import SceneRejected
+from converters.records.raw import RawScene
+from interactive_nav_common.rotations import matrix_from_quat
+
+SCENE, STAGE, OBJECT, ARTICULATED = (
+    f".{kind}.json" for kind in ("scene_instance", "stage_config", "object_config", "ao_config")
+)
+LEXICON = "semantic_lexicon.json"
+MOST_PARTS = 20_000
+DEFAULT_MASS_KG = 1.0
+"""Habitat's own for what says nothing."""
+
+
+def scenes_of(root: Path) -> list[Path]:
+    """Scene files of a folder."""
+    return sorted(root.rglob(f"*{SCENE}"))
+
+
+def looks_like(root: Path) -> bool:
+    """True when the folder has a scene file."""
+    return root.is_dir() and bool(scenes_of(root))
+
+
+def root_of(scene: Path) -> Path:
+    """The folder of the dataset that a scene file belongs to: the nearest one with a dataset's config, if any."""
+    near = scene.resolve().parents[:4]
+    own = near[1] if near[0].name == "scenes" else near[0]
+    return next((folder for folder in near if any(folder.glob("*.scene_dataset_config.json"))), own)
+
+
+def read_habitat(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
+    """Reads the only scene of a folder, or the chosen one.
+
+    Raises:
+        SceneRejected: none or several scenes, a missing or damaged file, or a value of the wrong kind.
+    """
+    source = SourceFolder(root, strict)
+    scenes = [chosen] if chosen else scenes_of(root)
+    if len(scenes) != 1:
+        names = ", ".join(p.name.removesuffix(SCENE) for p in scenes[:5]) or "none"
+        more = f" and {len(scenes) - 5} more" if len(scenes) > 5 else ""
+        raise SceneRejected(f"{root}: scenes are {names}{more}, expected one; give the file of one")
+    reader = _Reader(source)
+    parts = list(reader.parts(scenes[0]))
+    for kind, count in sorted(reader.dropped.items()):
+        source.note(f"{scenes[0].name}: {count} x {kind}")
+    return home(source, "habitat", parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Asset:
+    """A stage or an object, in its own frame with y up, m."""
+
+    surface: TexturedMesh
+    collision: TexturedMesh | None
+    origin: np.ndarray
+    """[3] what Habitat takes for its centre of mass: given, or the middle of its box."""
+    name: str
+    mass_kg: float | None
+    friction: float | None
+
+
+class _Reader:
+    """Finds and reads what a scene names; counts what it drops."""
+
+    def __init__(self, source: SourceFolder) -> None:
+        self.source = source
+        self.dropped: collections.Counter[str] = collections.Counter()
+        self._files: dict[str, list[Path]] = collections.defaultdict(list)
+        for path in sorted(source.root.rglob("*")):
+            if path.suffix.lower() in (*SUFFIXES, ".json", ".urdf"):
+                self._files[path.name].append(path)
+        self._classes = self._lexicon()
+        self._assets: dict[tuple[str, str], _Asset] = {}
+
+    def parts(self, path: Path) -> Iterator[Part]:
+        """The stage, rigid and articulated objects of a scene."""
+        scene = self._table(path)
+        local = _word(scene, "translation_origin", path) == "asset_local"
+        stage = _table_in(scene, "stage_instance", path)
+        instances = [(stage, STAGE)]
+        for key, kind in (("object_instances", OBJECT), ("articulated_object_instances", ARTICULATED)):
+            found = scene.get(key, [])
+            if not isinstance(found, list) or not all(isinstance(i, dict) for i in found):
+                raise SceneRejected(f"{path}: {key} is {_short(found)}, expected a list of objects")
+            instances += [(instance, kind) for instance in found]
+        if len(instances) > MOST_PARTS:
+            raise SceneRejected(f"{path}: has {len(instances)} instances, expected a home of at most {MOST_PARTS}")
+        for key in ("default_lighting", "navmesh_instance", "semantic_scene_instance", "default_pbr_shader_config"):
+            if scene.get(key):
+                self.dropped[f"{key} (not read)"] += 1
+        for instance, kind in instances:
+            yield self._part(instance, kind, local, path)
+
+    def _part(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> Part:
+        name = _word(instance, "template_name", path)
+        if not name:
+            raise SceneRejected(f"{path}: an instance has no template_name, expected the name of a stage or an object")
+        asset = self._asset(name, kind, path)
+        scale = _numbers(instance, "non_uniform_scale", (1.0, 1.0, 1.0), path) * _number(
+            instance, "uniform_scale", 1.0, path
+        )
+        quat = _numbers(instance, "rotation", (1.0, 0.0, 0.0, 0.0), path)
+        length = float(np.linalg.norm(quat))
+        if length < 1e-6 or not (np.abs(scale) > 1e-6).all():
+            raise SceneRejected(f"{path}: '{name}' has no usable rotation or scale ({quat.tolist()}, {scale.tolist()})")
+        pose = np.eye(4)
+        pose[:3, :3] = matrix_from_quat(quat / length)
+        pose[:3, 3] = _numbers(instance, "translation", (0.0, 0.0, 0.0), path)
+        origin = _word(instance, "translation_origin", path)
+        if kind == OBJECT and not (origin == "asset_local" or (local and origin != "com")):
+            pose[:3, 3] -= pose[:3, :3] @ (asset.origin * scale)
+        turn, grow = np.eye(4), np.diag([*scale, 1.0])
+        turn[:3, :3] = Y_UP_TO_Z_UP
+        upright = turn @ grow  # The part's frame has z up as well.
+        motion = _word(instance, "motion_type", path) or ("static" if kind != OBJECT else "dynamic")
+        return Part(
+            asset.name,
+            turn @ pose @ turn.T,
+            placed(asset.surface, upright),
+            None if asset.collision is None else placed(asset.collision, upright),
+            kind == STAGE or motion == "static" or instance.get("fixed_base") is True,
+            asset.mass_kg,
+            asset.friction,
+        )
+
+    def _asset(self, name: str, kind: str, path: Path) -> _Asset:
+        if (name, kind) not in self._assets:
+            read = self._articulated if kind == ARTICULATED else self._rigid
+            self._assets[name, kind] = read(name, kind, path)
+        return self._assets[name, kind]
+
+    def _rigid(self, name: str, kind: str, path: Path) -> _Asset:
+        config = self._find(name, (kind,))
+        if config is None:
+            model = self._find(name, SUFFIXES)
+            if model is None:
+                raise SceneRejected(f"{path}: names '{name}', which is not in {self.source.root}; copy it there")
+            config, about = model, {"render_asset": model.name}
+        else:
+            about = self._table(config)
+        render = self._mesh(about, "render_asset", config)
+        if render is None:
+            raise SceneRejected(f"{config}: names no render_asset, expected a mesh file")
+        collision = self._mesh(about, "collision_asset", config) if about.get("is_collidable", True) is True else None
+        corners = [render.vertices.min(axis=0), render.vertices.max(axis=0)]
+        origin = np.mean(corners, axis=0)
+        if "COM" in about:
+            origin = _numbers(about, "COM", (0.0, 0.0, 0.0), config)
+        mass = _number(about, "mass", DEFAULT_MASS_KG, config) if kind == OBJECT else None
+        friction = _number(about, "friction_coefficient", 0.0, config)
+        label = self._classes.get(about.get("semantic_id") if kind == OBJECT else None, "")
+        own = Path(name).name
+        return _Asset(
+            render, collision, origin, f"{own}_{label}" if label else own, mass, friction if 0 < friction <= 2 else None
+        )
+
+    def _articulated(self, name: str, kind: str, path: Path) -> _Asset:
+        """A URDF with its joints where they are at 0."""
+        urdf = self._find(name, (".urdf",))
+        config = self._find(name, (kind,))
+        if urdf is None and config is not None:
+            urdf = config.parent / _word(self._table(config), "urdf_filepath", config)
+        if urdf is None or not urdf.is_file():
+            raise SceneRejected(f"{path}: names '{name}', whose URDF is not in {self.source.root}; copy it there")
+        self.dropped["articulated object (its joints are held at 0)"] += 1
+        body = read_urdf(self.source, self.source.inside(urdf), "", hold=True)
+        solid = TexturedMesh(*body.collision, None, None)
+        # read_urdf keeps the file's frame, and Habitat's URDFs have y up as its other assets have.
+        return _Asset(body.surface, solid, np.zeros(3), Path(name).name, body.mass_kg, body.friction)
+
+    def _mesh(self, about: dict[str, Any], key: str, config: Path) -> TexturedMesh | None:
+        name = _word(about, key, config)
+        if not name:
+            return None
+        target = config.parent / name
+        if self.source.relative(target) is None or not target.is_file():
+            found = self._files.get(Path(name).name, [])
+            if key == "collision_asset" and not found:
+                self.source.note(f"{config.name}: its {key} '{name}' is not there; what is seen is decomposed")
+                return None
+            if not found:
+                raise SceneRejected(f"{config}: names '{name}', which is not in {self.source.root}; copy it there")
+            target = found[0]
+        mesh = read_surface(self.source, self.source.inside(target), "")
+        frame = _frame(about, config)
+        size = _numbers(about, "scale", (1.0, 1.0, 1.0), config) * _number(about, "units_to_meters", 1.0, config)
+        matrix = np.eye(4)
+        matrix[:3, :3] = frame @ np.diag(size)
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            raise SceneRejected(f"{config}: scale {size.tolist()} leaves nothing; expected positive numbers")
+        return placed(mesh, matrix)
+
+    def _find(self, name: str, endings: tuple[str, ...]) -> Path | None:
+        """The file that a template name means: its end, with or without the ending; the longest common path wins."""
+        base = Path(name).name
+        found = [p for end in ("", *endings) for p in self._files.get(base + end, []) if p.name.endswith(endings)]
+        folders = Path(name).parent.parts
+        found.sort(key=lambda p: -sum(part in p.parts for part in folders))
+        return found[0] if found else None
+
+    def _table(self, path: Path) -> dict[str, Any]:
+        return _table(read_json(self.source.use(self.source.inside(path), "")), path)
+
+    def _lexicon(self) -> dict[Any, str]:
+        """Class number -> name."""
+        names: dict[Any, str] = {}
+        for path in (p for found in self._files.values() for p in found if p.name.endswith(LEXICON)):
+            classes = self._table(path).get("classes", [])
+            if not isinstance(classes, list):
+                raise SceneRejected(f"{path}: classes is {_short(classes)}, expected a list")
+            for entry in classes:
+                if isinstance(entry, dict) and isinstance(entry.get("id"), int) and isinstance(entry.get("name"), str):
+                    names[entry["id"]] = entry["name"]
+        return names
+
+
+def _frame(about: dict[str, Any], path: Path) -> np.ndarray:
+    """(3, 3) an asset's own frame -> y up, looking along -z."""
+    up = _numbers(about, "up", (0.0, 1.0, 0.0), path)
+    front = _numbers(about, "front", (0.0, 0.0, -1.0), path)
+    lengths = np.linalg.norm(up), np.linalg.norm(front)
+    if min(lengths) < 1e-6 or abs(up @ front) > 1e-3 * lengths[0] * lengths[1]:
+        raise SceneRejected(f"{path}: up {up.tolist()} and front {front.tolist()} are not at right angles")
+    up, front = up / lengths[0], front / lengths[1]
+    return np.stack([np.cross(front, up), up, -front])
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) < 60 else f"{text[:57]}..."
+
+
+def _table(value: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise SceneRejected(f"{path}: holds {_short(value)}, expected an object of keys and values")
+    return value
+
+
+def _table_in(parent: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
+    if key not in parent:
+        raise SceneRejected(f"{path}: has no {key}; expected a Habitat scene")
+    return _table(parent[key], path)
+
+
+def _word(parent: dict[str, Any], key: str, path: Path) -> str:
+    """A word, in small letters where it is one of Habitat's own; empty where there is none."""
+    value = parent.get(key, "")
+    if not isinstance(value, str):
+        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected text")
+    return value.lower() if key in ("translation_origin", "motion_type") else value
+
+
+def _number(parent: dict[str, Any], key: str, default: float, path: Path) -> float:
+    value = parent.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
+        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected a number below 1e6")
+    return float(value)
+
+
+def _numbers(parent: dict[str, Any], key: str, default: tuple[float, ...], path: Path) -> np.ndarray:
+    value = parent.get(key, default)
+    try:
+        found = np.array(value, float)
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan)
+    if found.shape != np.shape(default) or not np.isfinite(found).all() or np.abs(found).max() > 1e6:
+        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {len(default)} usable numbers")
+    return found
