@@ -4,6 +4,7 @@
 
 `simulation` drives random wheel commands through `AutoResetEnv.step`; new episodes are drawn as old ones
 end. `physics`, `task` and `observed` are the same with parts left out, for their shares of a step.
+`windows` counts instead what an environment needs in its window while it drives at random, and proposes settings.
 `train` trains with `python -m train`'s own code and a preset of any algorithm, and reads the rate that it
 logs, compiling and checkpoints apart. Rows carry device, versions and commit, and are appended to
 `benchmarks/results/steps_per_second.jsonl`.
@@ -16,15 +17,18 @@ import json
 import statistics
 import sys
 import tempfile
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from rich.console import Console
 
 import interactive_nav
 from benchmarks.measurement import append_row, command_line, origin, random_driving, timed
 from interactive_nav.physics import resolve_backend
+from interactive_nav.physics.window import Window
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
@@ -32,9 +36,15 @@ from train import config_io
 from train.runs.run import train_run
 from train.sweep.devices import gpu_listing
 
-MODES = ("physics", "task", "observed", "simulation", "train")
+MODES = ("physics", "task", "observed", "simulation", "windows", "train")
 CHUNK = 20
 """Steps in one compiled scan."""
+LEFT_OUT_SHARE = 0.005
+"""Of environment steps: windows are proposed that are too small in fewer."""
+SETTLED_STEPS = 10
+"""Of an episode, after which objects that were laid out lie still."""
+SETTINGS = {"free": "active_furniture", "small": "active_small", "hinge": "active_doors", "walls": "active_walls"}
+"""What a window holds -> the setting that says how many."""
 
 
 @functools.lru_cache(maxsize=1)
@@ -161,6 +171,44 @@ def simulation(
     }
 
 
+def windows(
+    robot: str, scenes: list[str], backend: str, num_envs: int, steps: int, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """How much each environment needs in its window, over random driving; counted every tenth step.
+
+    Best on `native`, which simulates everything: a window would hide what it left out.
+    """
+    env = _make(robot, tuple(scenes), backend, json.dumps(settings))
+    batch, window = AutoResetEnv(env), Window(env.world, env.config)
+    state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
+    program = jax.jit(random_driving(_counting(batch.step), (num_envs, env.action_size), 10))
+    needs = jax.jit(jax.vmap(window.needs))
+    counted: dict[str, list[np.ndarray]] = {kind: [] for kind in SETTINGS}
+    for i in range(max(1, steps // 10)):
+        state, _ = program(state, jax.random.PRNGKey(1 + i))
+        nav = state.info["nav"]
+        settled = np.asarray(nav.step_count) >= SETTLED_STEPS
+        for kind, count in needs(nav.scene_index, state.pipeline_state).items():
+            counted[kind].append(np.asarray(count)[settled])
+    counts = {kind: np.concatenate(values) for kind, values in counted.items()}
+    shares = (0.5, 0.9, 0.99, 0.995, 0.999, 1.0)
+    least = 1 - LEFT_OUT_SHARE / len(counts)
+    # At least one: 0 stands for all.
+    proposed = {k: max(1, int(np.quantile(c, least, method="higher"))) for k, c in counts.items()}
+    widths = {kind: getattr(env.config.physics, name) or np.inf for kind, name in SETTINGS.items()}
+
+    def left_out(widths: Mapping[str, float]) -> float:
+        return float(np.mean([counts[kind] > width for kind, width in widths.items()], axis=0).astype(bool).mean())
+
+    return {
+        "env_steps": int(len(counts["walls"])),
+        "needs": {k: {str(q): float(np.quantile(c, q)) for q in shares} for k, c in counts.items()},
+        "left_out_share": left_out(widths),
+        "proposed": {SETTINGS[kind]: width for kind, width in proposed.items()},
+        "proposed_left_out_share": left_out(proposed),
+    }
+
+
 def training(
     scenes: list[str],
     backend: str,
@@ -231,6 +279,9 @@ def main() -> None:
                 row |= training(*measure, args.preset, args.learner)
             else:
                 row |= {"robot": args.robot, "devices": args.devices}
+            if mode == "windows":
+                row |= windows(args.robot, *measure)
+            elif mode != "train":
                 row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
             append_row(args.out, row)
 

@@ -25,7 +25,10 @@ from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
 from scenes_mjcf.schema import CATEGORIES
 
-FORMATS = ("gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf")
+FORMATS = (
+    *("gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf"),
+    *("scannet", "scannetpp", "arkitscenes", "3rscan", "multiscan", "matterport3d"),
+)
 """`READERS` of `converters.read.source`, which need not be imported to say so."""
 
 if TYPE_CHECKING:

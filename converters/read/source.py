@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from converters.read import gibson, interactive_gibson, meshes, scan2cad
+from converters.read.datasets import scanned
 from converters.read.homes import habitat, mjcf, sdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
@@ -17,6 +18,7 @@ READERS = {
     "sdf": (sdf.looks_like, sdf.read_sdf),
     "habitat": (habitat.looks_like, habitat.read_habitat),
     "mjcf": (mjcf.looks_like, mjcf.read_mjcf),
+    **{name: (scanned.looks_like(name), scanned.reader(name)) for name in scanned.COLLECTIONS},
 }
 FILES = {
     (".world", ".sdf"): (sdf.root_of, sdf.read_sdf),
@@ -40,7 +42,7 @@ def detect_format(source: Path) -> str:
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
         f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad), worlds/*.world (sdf), "
-        f"*{habitat.SCENE} (habitat) or scene.xml (mjcf) in it"
+        f"*{habitat.SCENE} (habitat) or scene.xml (mjcf) in it, or one scene of {', '.join(scanned.COLLECTIONS)}"
     )
 
 

@@ -32,7 +32,8 @@ def world(tmp_path_factory):
 
 
 def _boxes(centre, quat, half):
-    return Boxes(*(np.float32([v]) for v in (centre, np.asarray(matrix_from_quat(np.asarray(quat)))[:2], half)))
+    rows = np.asarray(matrix_from_quat(np.asarray(quat)))[:2]
+    return Boxes(*(jnp.asarray([v], jnp.float32) for v in (centre, rows, half)))
 
 
 @jax.jit

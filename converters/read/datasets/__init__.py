@@ -1,0 +1,1 @@
+"""Published collections of scans in, `RawScene` out, through a library that reads them."""

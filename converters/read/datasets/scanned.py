@@ -1,0 +1,198 @@
+"""A scene of a published collection of scans in, `RawScene` with labels out; the package scenezoo reads the files.
+
+The folder of one scene is the source, where its collection's own download put it. Labels become NYU40's by the names of
+their classes. scenezoo may fetch a collection's tables of splits and classes, where they do not lie beside the scans.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.geometry.upright import find_up, turn_upright
+from converters.read.files import SourceFolder
+from converters.read.gibson import read_licence
+from converters.read.homes.parts import category_of
+from converters.read.obj import GREY
+from converters.read.storeys import label_storeys
+from converters.read.surfaces import floor_level
+from converters.records.errors import SceneRejected
+from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene, ScanMesh
+
+NYU40 = tuple(
+    re.findall(
+        r"\w+",
+        "wall floor cabinet bed chair sofa table door window bookshelf picture counter blinds desk shelves curtain "
+        "dresser pillow mirror floor_mat clothes ceiling books refrigerator television paper towel shower_curtain box "
+        "whiteboard person night_stand toilet sink lamp bathtub bag otherstructure otherfurniture otherprop",
+    )
+)
+"""Names of the ids from 1 on."""
+OTHER = {
+    "armchair": 5, "beam": 38, "blind": 13, "bookcase": 10, "column": 38, "couch": 6, "doorframe": 8, "frame": 9,
+    "fridge": 24, "monitor": 25, "nightstand": 32, "pillar": 38, "railing": 38, "rug": 20, "shelf": 15, "stairs": 38,
+    "stool": 5, "tv": 25, "carpet": 20, "windowsill": 9, "closet": 3, "wardrobe": 3, "cupboard": 3,
+}  # fmt: skip
+"""Names that collections use for the same."""
+PROP = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class Collection:
+    """Where a collection's scenes lie, and how scenezoo is asked for NYU40's classes or the nearest to them."""
+
+    name: str
+    """scenezoo's."""
+    levels: int
+    """Folders between the collection's and a scene's."""
+    marks: tuple[str, ...]
+    """Files, one of which shows that a folder is such a scene; they are hashed. `*` stands for anything."""
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+COLLECTIONS = {
+    "scannet": Collection(
+        "scannetv2", 2, ("*_vh_clean_2.ply", "*.aggregation.json"), {"segmentation_type": "semantic"}
+    ),
+    "scannetpp": Collection("scannetppv2", 2, ("scans/mesh_aligned_0.05.ply", "scans/segments_anno.json")),
+    "arkitscenes": Collection("arkitscenes", 3, ("*_3dod_mesh.ply", "*_3dod_annotation.json")),
+    "3rscan": Collection("3rscan", 1, ("labels.instances.annotated.v2.ply",), {"segmentation_type": "nyu40"}),
+    "multiscan": Collection("multiscan", 1, ("*.annotations.json", "*.ply")),
+    "matterport3d": Collection(
+        "matterport3d", 1, ("house_segmentations/*.ply",), {"segmentation_type": "semantic", "label_space": "nyu40"}
+    ),
+}
+
+
+def looks_like(name: str) -> Callable[[Path], bool]:
+    """Whether a folder is a scene of a collection."""
+    first = COLLECTIONS[name].marks[0]
+    return lambda root: root.is_dir() and any(root.glob(first))
+
+
+def reader(name: str) -> Callable[[Path, bool], RawScene]:
+    """What reads a scene of a collection."""
+    return lambda root, strict=False: read_scan(name, root, strict)
+
+
+def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
+    """Reads the folder of one scene.
+
+    Args:
+        name: of `COLLECTIONS`.
+        root: the scene's folder, as its collection lays it out.
+        strict: refuse what would be repaired with a warning.
+
+    Raises:
+        SceneRejected: missing or damaged files, or scenezoo is not installed.
+    """
+    source, about = SourceFolder(root, strict), COLLECTIONS[name]
+    try:
+        library = importlib.import_module("scenezoo")
+    except ImportError as error:
+        raise SceneRejected(
+            f"{root}: {name} is read by scenezoo, which is not installed; pip install 'interactive-nav[datasets]'"
+        ) from error
+    for path in sorted(p for mark in about.marks for p in root.glob(mark)):
+        source.use(source.inside(path), "")
+    scene = root.resolve()
+    try:
+        dataset = library.get_dataset(about.name, scene.parents[about.levels - 1])
+        mesh = dataset.get_mesh(scene.name)
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.triangles, np.int64)
+        colours = np.asarray(mesh.vertex_colors, float) if mesh.has_vertex_colors() else None
+        found = _labels(source, dataset, scene.name, about)
+    except Exception as error:  # whatever a damaged file raises in scenezoo, Open3D or plyfile
+        reason = " ".join(str(error).split()) or "no reason given"
+        raise SceneRejected(f"{root}: not readable as {name} ({type(error).__name__}: {reason[:300]})") from error
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise SceneRejected(f"{root}: its mesh has {len(faces)} faces or vertices that are no numbers; fetch it again")
+    return _record(source, name, vertices, faces, colours, found)
+
+
+def _labels(source: SourceFolder, dataset: Any, scene: str, about: Collection) -> Any:
+    """scenezoo's segmentation; None where the collection does not publish this scene's."""
+    try:
+        return dataset.get_segmentation(scene, **about.options)
+    except (FileNotFoundError, importlib.import_module("scenezoo").UnsupportedOperationError) as error:
+        source.note(f"{scene}: has no labels ({' '.join(str(error).split())[:200]}); structure is told by shape")
+        return None
+
+
+def _record(
+    source: SourceFolder, name: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, found: Any
+) -> RawScene:
+    root = source.root.resolve()
+    turn = turn_upright(find_up(vertices, faces, str(root)))
+    if not np.allclose(turn, np.eye(3), atol=0.02):
+        vertices = vertices @ turn.T
+        source.note(f"{root.name}: turned so that its floor is level")
+    floor_m = floor_level(vertices, faces, str(root))
+    labels = label_storeys(vertices, faces, (floor_m,))
+    if found is not None:
+        labels = _of_vertices(source, found, len(vertices), faces)
+        unknown = sorted({n for n in found.id_to_name.values() if label_of(n) == PROP and n.lower() not in NYU40})
+        if unknown:
+            more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
+            source.note(f"classes that NYU40 has no name for, taken as otherprop: {', '.join(unknown[:8])}{more}")
+    grey = np.full((len(vertices), 3), GREY[0], np.uint8)
+    return RawScene(
+        name=root.name,
+        source_format=name,
+        scan=ScanMesh(
+            vertices,
+            faces,
+            labels,
+            grey if colours is None else np.clip(np.round(255 * colours), 0, 255).astype(np.uint8),
+        ),
+        cads={},
+        annotations=(),
+        floor_height_m=floor_m,
+        given_map=None,
+        licence=read_licence(source),
+        sources=dict(sorted(source.sha256.items())),
+        warnings=tuple(source.warnings),
+    )
+
+
+def label_of(name: str) -> int:
+    """NYU40 id of a class's name, by its last words: an office chair is a chair."""
+    words = [w for w in re.findall(r"[a-z]+", name.lower()) if len(w) > 1]
+    known = {n.replace("_", ""): i for i, n in enumerate(NYU40, start=1)} | OTHER
+    for first in range(len(words)):
+        tail = "".join(words[first:])
+        found = known.get(tail) or known.get(tail.removesuffix("s"))
+        if found is not None:
+            return found
+    category = category_of(name)
+    return category.labels[0] if category is not None and category.labels else PROP
+
+
+def _of_vertices(source: SourceFolder, found: Any, count: int, faces: np.ndarray) -> np.ndarray:
+    """(n,) NYU40 id of each vertex.
+
+    Raises:
+        SceneRejected: another number of labels than the mesh has vertices or faces.
+    """
+    labels = np.asarray(found.labels)
+    labels = labels if labels.ndim == 1 else labels[:, 0]
+    wanted = count if found.domain == "vertex" else len(faces)
+    if found.domain not in ("vertex", "face") or len(labels) != wanted:
+        raise SceneRejected(f"{source.root}: {len(labels)} labels a {found.domain}, expected {wanted}; fetch it again")
+    ids, at = np.unique(labels, return_inverse=True)
+    known = [label_of(found.id_to_name[i]) if i in found.id_to_name else UNLABELLED for i in ids.tolist()]
+    nyu = np.array(known, np.int64)[at]
+    if found.domain == "vertex":
+        return nyu
+    # A vertex takes the label of the structure that meets there, else of any face: furniture ends at its own faces.
+    out = np.zeros(count, np.int64)
+    for structural in (False, True):
+        mine = np.isin(nyu, STRUCTURE_LABELS) == structural
+        out[faces[mine].ravel()] = np.repeat(nyu[mine], 3)
+    return out
