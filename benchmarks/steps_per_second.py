@@ -195,7 +195,7 @@ def windows(
     least = 1 - LEFT_OUT_SHARE / len(counts)
     # At least one: 0 stands for all.
     proposed = {k: max(1, int(np.quantile(c, least, method="higher"))) for k, c in counts.items()}
-    widths = {kind: getattr(env.config.physics, name) or np.inf for kind, name in SETTINGS.items()}
+    widths = {kind: width or np.inf for kind, width in window.widths.items()}
 
     def left_out(widths: Mapping[str, float]) -> float:
         return float(np.mean([counts[kind] > width for kind, width in widths.items()], axis=0).astype(bool).mean())
@@ -203,6 +203,7 @@ def windows(
     return {
         "env_steps": int(len(counts["walls"])),
         "needs": {k: {str(q): float(np.quantile(c, q)) for q in shares} for k, c in counts.items()},
+        "set": {SETTINGS[kind]: width for kind, width in window.widths.items()},
         "left_out_share": left_out(widths),
         "proposed": {SETTINGS[kind]: width for kind, width in proposed.items()},
         "proposed_left_out_share": left_out(proposed),

@@ -130,6 +130,10 @@ class TaskRules(Settings):
         return self.interaction_with == "anything" or self.force_part == "normal" or self.force_sum == "contacts"
 
 
+WINDOW = ("active_furniture", "active_small", "active_doors", "active_walls")
+"""Settings that size what MJX simulates at a time."""
+
+
 @dataclasses.dataclass(frozen=True)
 class PhysicsConfig(Settings):
     """How the world is simulated. With backend auto, settings of all backends may stand side by side."""
@@ -153,21 +157,21 @@ class PhysicsConfig(Settings):
     """MJX-Warp contact slots per env; 0: measured when the environment is built, with head room."""
     constraints_per_env: Natural = 0
     """MJX-Warp constraint rows per env; 0: measured likewise."""
-    active_furniture: Natural = 5
-    """MJX backends: pieces of furniture simulated at a time, the nearest to the robot; 0: all."""
-    active_small: Natural = 4
-    """MJX backends: small objects simulated at a time; 0: all."""
-    active_doors: Natural = 2
-    """MJX backends: doors simulated at a time; 0: all."""
-    active_walls: Natural = 32
-    """MJX backends: wall boxes that can be met at a time; 0: all."""
+    active_furniture: Natural | None = None
+    """MJX backends: pieces of furniture near the robot that are simulated (auto: measured in these scenes; 0: all)."""
+    active_small: Natural | None = None
+    """MJX backends: small objects simulated at a time (auto: likewise; 0: all)."""
+    active_doors: Natural | None = None
+    """MJX backends: doors simulated at a time (auto: likewise; 0: all)."""
+    active_walls: Natural | None = None
+    """MJX backends: wall boxes that can be met at a time (auto: likewise; 0: all)."""
     sleep: bool = True
     """Native backend: objects at rest sleep until touched."""
     threads: Natural = 0
     """Native backend: threads; 0: all cores."""
 
     IDLE = (
-        ("active_furniture active_small active_doors active_walls", "backend auto, jax or warp, or 0 (all)",
+        (" ".join(WINDOW), "backend auto, jax or warp, or 0 (all)",
          lambda c: c.backend != "native"),
         ("contacts_per_env constraints_per_env", "backend auto or warp", lambda c: c.backend in ("auto", "warp")),
         ("threads", "backend auto or native", lambda c: c.backend in ("auto", "native")),

@@ -7,11 +7,16 @@ import re
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from interactive_nav.config import WINDOW
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.metrics_file import PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from topological_nav.evaluate.scores import differences, markdown, summary
 from train.figures import tables
+from train.runs.run import config_to_play
+from train.runs.run_folder import RunFolder
 from train.sweep import spec
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -105,3 +110,15 @@ def test_the_topological_results_name_no_folder_of_a_machine():
             assert not [value for values in columns.values() for value in set(values) if value.startswith("/")], path
         elif path.is_file():
             assert not re.search(r"(?<![\w.-])/(tmp|root|home|work)/", path.read_text()), path
+
+
+def test_what_learned_in_a_window_of_mjx_is_played_without_one():
+    """Committed runs state the sizes of their windows; C MuJoCo simulates everything and takes none."""
+    folder = RunFolder(Path(__file__).parents[1] / "results" / "kint" / "runs" / "k_int0-turtlebot-ppo-seed0")
+    console = Console(quiet=True)
+    native = config_to_play(folder, ["env.backend=native"], None, console)
+    assert [getattr(native.env, name) for name in WINDOW] == [None] * 4
+    warp = config_to_play(folder, ["env.backend=warp", "env.active_small=3"], None, console)
+    assert [getattr(warp.env, name) for name in WINDOW] == [5, 3, 2, 32]
+    with pytest.raises(ConfigError, match="active_doors is 3, which changes nothing here"):
+        config_to_play(folder, ["env.backend=native", "env.active_doors=3"], None, console)

@@ -1,4 +1,4 @@
-"""The world's state in, how near each movable slot is to the robot and to what moves out.
+"""The world's state in, how near each movable slot and wall is to the robot and to what moves out.
 
 A slot's body is the box that bounds it in its own frame, so a bed or a sofa is near where its side is near, at
 whatever turn. Gaps are planar and never larger than the true ones: the largest of the gaps across the edges of
@@ -14,83 +14,98 @@ import mujoco
 import numpy as np
 
 from interactive_nav.physics.base import PhysicsState
+from interactive_nav.scenes.layout import Layout
 from interactive_nav.scenes.spec import FEET
 from interactive_nav.scenes.world import World
-from interactive_nav_common.rotations import matrix_from_quat
+from interactive_nav_common.rotations import Array, matrix_from_quat, namespace
 
 REACH_M = 0.6
 """What is this near to the robot's footprint can be met, itself or behind something that is pushed."""
 TOUCH_M = 0.15
 """What is this near to a moving object can be met by it: at 1 m/s it moves 0.1 m in a control step."""
-MOVING_M_S = 0.02
+MOVING_M_S = 0.05
+"""Or rad/s. What rests in the solver's tolerance turns by up to 0.02."""
 _MOVERS = 2
 """Moving objects that others are measured against: the fastest."""
 FAR_M = 1e6
+_PLACES = 4000
+"""Of the robot, at which a window's size is measured: of all scenes together, but at least 200 in each."""
+_SHARE = 0.999
+"""Of these places a window has room for what stands near."""
 
 
 @flax.struct.dataclass
 class Boxes:
     """Bounding boxes in the world, seen from above."""
 
-    centre: jax.Array
+    centre: Array
     """[M, 2] m"""
-    axes: jax.Array
+    axes: Array
     """[M, 2, 3] planar parts of the box's three unit axes."""
-    half: jax.Array
+    half: Array
     """[M, 3] half sizes, m"""
 
-    def gap_m(self, centre: jax.Array, axes: jax.Array, half: jax.Array) -> jax.Array:
+    def gap_m(self, centre: Array, axes: Array, half: Array) -> Array:
         """[M] from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
+        xp = namespace(self.centre, centre)
         between = self.centre - centre[None]
-        others = jnp.broadcast_to(axes[None], self.axes.shape)
-        edges = jnp.concatenate([self.axes, others], -1)
-        across = jnp.stack([-edges[:, 1], edges[:, 0]], 1)
-        ways = jnp.concatenate([between[:, :, None], across], -1)
-        ways = ways / jnp.maximum(jnp.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
-        apart = jnp.abs(jnp.einsum("mpw,mp->mw", ways, between))
-        own = jnp.einsum("mwa,ma->mw", jnp.abs(jnp.einsum("mpw,mpa->mwa", ways, self.axes)), self.half)
-        theirs = jnp.abs(jnp.einsum("mpw,pa->mwa", ways, axes)) @ half
+        others = xp.broadcast_to(axes[None], self.axes.shape)
+        edges = xp.concatenate([self.axes, others], -1)
+        across = xp.stack([-edges[:, 1], edges[:, 0]], 1)
+        ways = xp.concatenate([between[:, :, None], across], -1)
+        ways = ways / xp.maximum(xp.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
+        apart = xp.abs(xp.einsum("mpw,mp->mw", ways, between))
+        own = xp.einsum("mwa,ma->mw", xp.abs(xp.einsum("mpw,mpa->mwa", ways, self.axes)), self.half)
+        theirs = xp.abs(xp.einsum("mpw,pa->mwa", ways, axes)) @ half
         return (apart - own - theirs).max(-1)
 
 
 class Nearness:
-    """Where the world's movable slots are, in a scene and a state."""
+    """Where the world's movable slots and walls are, in a scene and a state."""
 
     def __init__(self, world: World):
-        layout = world.layout
+        self.world, layout = world, world.layout
         self.hinge = np.asarray(layout.slot_kind) == "hinge"
         self._qpos = layout.slot_qpos[:, None] + np.where(self.hinge[:, None], 0, np.arange(7))
         self._qvel = layout.slot_qvel[:, None] + np.where(self.hinge[:, None], 0, np.arange(6))
-        self._robot = layout.robot_qpos
-        self._occupied = jnp.asarray(world.occupied)
-        made = [_rest(model, layout.slot_body, self.hinge) for model in world.models]
-        tables = (jnp.asarray(np.stack(t), jnp.float32) for t in zip(*made, strict=True))
-        self._offset_m, self._half_m, self._frame, self._anchor_m, self._sense = tables
+        self._robot = layout.robot_qpos + np.arange(2)
+        made = [_rest(model, layout, self.hinge) for model in world.models]
+        tables = (np.stack(t).astype(np.float32) for t in zip(*made, strict=True))
+        self._offset_m, self._half_m, self._frame, self._anchor_m, self._sense, *self._walls = tables
 
-    def boxes(self, scene: jax.Array, state: PhysicsState) -> Boxes:
+    def boxes(self, scene: Array, state: PhysicsState) -> Boxes:
         """Of all slots of one environment."""
+        xp = namespace(state.qpos)
+        sense, frame, anchor, offset, half = (
+            xp.asarray(t)[scene] for t in (self._sense, self._frame, self._anchor_m, self._offset_m, self._half_m)
+        )
         qpos = state.qpos[self._qpos]
-        angle = qpos[:, 0] * self._sense[scene]
-        half_angle = jnp.stack([jnp.cos(angle / 2), 0 * angle, 0 * angle, jnp.sin(angle / 2)], -1)
-        turn = matrix_from_quat(half_angle)
-        leaf = turn @ self._frame[scene]
-        hung = self._anchor_m[scene] + jnp.einsum("mij,mj->mi", turn, self._offset_m[scene])
-        free = matrix_from_quat(qpos[:, 3:] / jnp.maximum(jnp.linalg.norm(qpos[:, 3:], axis=-1, keepdims=True), 1e-6))
-        placed = qpos[:, :3] + jnp.einsum("mij,mj->mi", free, self._offset_m[scene])
-        hinge = jnp.asarray(self.hinge)
-        axes = jnp.where(hinge[:, None, None], leaf, free)
-        centre = jnp.where(hinge[:, None], hung, placed)
-        return Boxes(centre[:, :2], axes[:, :2], self._half_m[scene])
+        angle = qpos[:, 0] * sense
+        turn = matrix_from_quat(xp.stack([xp.cos(angle / 2), 0 * angle, 0 * angle, xp.sin(angle / 2)], -1))
+        hung = anchor + xp.einsum("mij,mj->mi", turn, offset)
+        free = matrix_from_quat(qpos[:, 3:] / xp.maximum(xp.linalg.norm(qpos[:, 3:], axis=-1, keepdims=True), 1e-6))
+        placed = qpos[:, :3] + xp.einsum("mij,mj->mi", free, offset)
+        hinge = xp.asarray(self.hinge)
+        axes = xp.where(hinge[:, None, None], turn @ frame, free)
+        centre = xp.where(hinge[:, None], hung, placed)
+        return Boxes(centre[:, :2], axes[:, :2], half)
 
-    def measure(self, scene: jax.Array, state: PhysicsState, reach_m: float) -> tuple[jax.Array, jax.Array]:
+    def walls_m(self, scene: Array, state: PhysicsState) -> Array:
+        """[W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
+        xp = namespace(state.qpos)
+        xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
+        offset = xp.einsum("wi,wij->wj", state.qpos[self._robot][None] - xpos, xmat)
+        outside = xp.maximum(xp.abs(offset) - half, 0.0)
+        return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
+
+    def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> tuple[Array, Array]:
         """How far each slot is from where it can be met: within `reach_m` of the robot, or `TOUCH_M` of what moves.
 
         Returns:
             [M] m, negative where it can be met, `FAR_M` for empty slots; [M] whether it moves.
         """
-        boxes, occupied = self.boxes(scene, state), self._occupied[scene]
-        robot = state.qpos[self._robot : self._robot + 2]
-        gap = boxes.gap_m(robot, jnp.eye(2, 3), jnp.zeros(3)) - reach_m
+        boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.occupied)[scene]
+        gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2, 3), jnp.zeros(3)) - reach_m
         speed = jnp.where(occupied, jnp.abs(state.qvel[self._qvel]).max(-1), 0.0)
         moving = speed > MOVING_M_S
         fastest, movers = jax.lax.top_k(speed, min(_MOVERS, len(self.hinge)))
@@ -101,16 +116,43 @@ class Nearness:
             gap = jnp.where(fastest[k] > MOVING_M_S, jnp.minimum(gap, behind), gap)
         return jnp.where(occupied, gap, FAR_M), moving
 
+    def widths(self, reach_m: float) -> dict[str, int]:
+        """How many of each kind of slot, and of walls, a window needs: at rest, with the robot anywhere on free floor.
 
-def _rest(model: mujoco.MjModel, bodies: np.ndarray, hinge: np.ndarray) -> tuple[np.ndarray, ...]:
+        Small objects lie anywhere, too.
+        """
+        world, rng = self.world, np.random.default_rng(0)
+        kinds = np.asarray(world.layout.slot_kind)
+        small = np.flatnonzero(kinds == "small")
+        counts: dict[str, list[int]] = {kind: [] for kind in ("small", "free", "hinge", "walls")}
+        for scene, (source, rest) in enumerate(zip(world.scenes, world.rest_qpos, strict=True)):
+            maps, qpos = source.maps, np.array(rest, np.float32)
+            cells = np.argwhere(maps.traversable)[:, ::-1]
+            state = PhysicsState(qpos, np.zeros(0), np.zeros(0))
+            for _ in range(max(200, _PLACES // len(world.scenes))):
+                places = cells[rng.integers(len(cells), size=1 + len(small))] + rng.random((1 + len(small), 2))
+                places = np.asarray(maps.origin_w) + maps.resolution_m * places
+                qpos[self._robot] = places[0]
+                qpos[self._qpos[small, :2]] = places[1:]
+                gap = self.boxes(scene, state).gap_m(qpos[self._robot], np.eye(2, 3), np.zeros(3))
+                near = (gap < reach_m) & world.occupied[scene]
+                for kind in ("small", "free", "hinge"):
+                    counts[kind].append(int(near[kinds == kind].sum()))
+                counts["walls"].append(int((self.walls_m(scene, state) < reach_m).sum()))
+        # At least one: 0 stands for all.
+        return {k: max(1, int(np.quantile(c, _SHARE, method="higher"))) for k, c in counts.items()}
+
+
+def _rest(model: mujoco.MjModel, layout: Layout, hinge: np.ndarray) -> tuple[np.ndarray, ...]:
     """Of each slot: the box's centre and half sizes in its body's frame; for hinges, from the joint's anchor in the
-    world at rest, with the body's matrix, the anchor, and the joint's sense about the world's z."""
+    world at rest, with the body's matrix, the anchor, and the joint's sense about the world's z. Of each wall: planar
+    place, axes and half sizes, and whether it is one."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    count = len(bodies)
+    count = layout.num_slots
     offset, half, anchor = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
     frame, sense = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count)
-    for k, body in enumerate(bodies):
+    for k, body in enumerate(layout.slot_body):
         geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body] - FEET)
         if geoms.stop > geoms.start:
             turn = matrix_from_quat(model.geom_quat[geoms])
@@ -123,4 +165,10 @@ def _rest(model: mujoco.MjModel, bodies: np.ndarray, hinge: np.ndarray) -> tuple
             frame[k], anchor[k] = data.xmat[body].reshape(3, 3), data.xanchor[joint]
             offset[k] = frame[k] @ offset[k] + data.xpos[body] - anchor[k]
             sense[k] = np.sign(data.xaxis[joint, 2])
-    return offset, half, frame, anchor, sense
+    first = model.body_geomadr[layout.structure_body]
+    walls = slice(first, first + model.body_geomnum[layout.structure_body])
+    xpos = data.geom_xpos[walls]
+    # Padding lies below the floor; it never counts as near.
+    used = xpos[:, 2] > -4.0
+    xmat = data.geom_xmat[walls].reshape(-1, 3, 3)[:, :2, :2]
+    return offset, half, frame, anchor, sense, xpos[:, :2], xmat, model.geom_size[walls, :2], used

@@ -19,7 +19,7 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.physics.nearness import FAR_M, REACH_M, Nearness
+from interactive_nav.physics.nearness import REACH_M, Nearness
 from interactive_nav.scenes.spec import FEET, build_empty_spec
 from interactive_nav.scenes.world import World
 
@@ -67,6 +67,15 @@ class Window:
         slots: list[tuple[str, int]] = []
         picked = []
         self._slots = {kind: np.flatnonzero(kinds == kind) for kind in limits}
+        self._nearness = Nearness(world)
+        self._reach_m = world.robot.footprint_radius_m + REACH_M
+        walls = physics.active_walls
+        if None in (*limits.values(), walls):
+            needed = self._nearness.widths(self._reach_m)
+            limits = {kind: needed[kind] if limit is None else limit for kind, limit in limits.items()}
+            walls = needed["walls"] if walls is None else walls
+        self.widths = {**limits, "walls": walls}
+        """Kind of slot, and `walls` -> how many at a time; 0: all."""
         for kind, limit in limits.items():
             own = self._slots[kind]
             width = min(limit or len(own), len(own))
@@ -75,11 +84,10 @@ class Window:
                 picked.append((own, width, len(slots), boxes))
                 slots += [(kind, boxes)] * width
         n_walls = int(model.body_geomnum[layout.structure_body])
-        self.n_walls = min(physics.active_walls or n_walls, n_walls)
+        self.n_walls = min(walls or n_walls, n_walls)
         self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
         self.groups = tuple(self._group(*p) for p in picked)
         self._wall_tables, self._wall_rows = self._walls()
-        self._nearness = Nearness(world)
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
         self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
@@ -122,8 +130,6 @@ class Window:
         poses = [_static_poses(m) for m in world.models]
         tables["xpos"] = np.stack([xpos[own] for xpos, _ in poses])
         tables["xmat"] = np.stack([xmat[own] for _, xmat in poses])
-        # Padding lies below the floor; it never counts as near.
-        tables["used"] = (tables["xpos"][..., 2] > -4.0).astype(float)
         rows = self.model.body_geomadr[self.layout.structure_body] + np.arange(self.n_walls)
         return {k: jnp.asarray(v, jnp.float32) for k, v in tables.items()}, rows
 
@@ -164,15 +170,8 @@ class Window:
 
     def _near(self, scene: jax.Array, state: PhysicsState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """[slots] m to where each can be met, [slots] whether it moves, [walls] m likewise; see `Nearness.measure`."""
-        reach = self.world.robot.footprint_radius_m + REACH_M
-        near, moving = self._nearness.measure(scene, state, reach)
-        robot = state.qpos[self.world.layout.robot_qpos : self.world.layout.robot_qpos + 2]
-        walls = self._wall_tables
-        # Planar distance from the robot to each wall box.
-        offset = jnp.einsum("wi,wij->wj", robot[None] - walls["xpos"][scene, :, :2], walls["xmat"][scene, :, :2, :2])
-        outside = jnp.maximum(jnp.abs(offset) - walls["geom_size"][scene, :, :2], 0.0)
-        gap = jnp.where(walls["used"][scene] > 0, jnp.linalg.norm(outside, axis=-1), FAR_M)
-        return near, moving, gap - reach
+        near, moving = self._nearness.measure(scene, state, self._reach_m)
+        return near, moving, self._nearness.walls_m(scene, state) - self._reach_m
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
         """Values of all `FIELDS` of the window's model, in MuJoCo's shapes."""

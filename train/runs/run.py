@@ -18,6 +18,7 @@ from rich.console import Console
 from tensorboardX import SummaryWriter
 
 import interactive_nav
+from interactive_nav.config import WINDOW
 from interactive_nav.physics import resolve_backend
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
@@ -68,6 +69,9 @@ def config_to_play(
     Raises:
         UserError: the folder is no run, or a word is wrong.
     """
+    if "env.backend=native" in words:
+        # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.
+        words = [*(f"env.{name}=auto" for name in WINDOW), *words]
     config = config_io.apply_overrides(folder.read_config(), words)
     env = dataclasses.replace(config.env, scenes=scene_folders(scenes) if scenes else config.env.scenes)
     if not any(word.startswith("env.backend=") for word in words):
@@ -77,7 +81,7 @@ def config_to_play(
             there = resolve_backend("auto")
             told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(told, highlight=False, soft_wrap=True)
-            env = replace(env, backend=there)
+            env = replace(env, backend=there, **(dict.fromkeys(WINDOW) if there == "native" else {}))
     return dataclasses.replace(config, env=env)
 
 

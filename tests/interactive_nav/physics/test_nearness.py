@@ -136,3 +136,13 @@ def test_what_stands_behind_a_moving_thing_is_near_however_far_from_the_robot(wo
     np.testing.assert_allclose(pushed[chair], min(float(rest[chair]), between - TOUCH_M), atol=1e-4)
     assert float(pushed[table]) > 1.0 and float(pushed[sofa]) == pytest.approx(float(rest[sofa]))
     assert (np.asarray(rest)[~np.asarray(world.occupied[0])] == FAR_M).all()
+
+
+def test_a_window_is_as_wide_as_what_stands_near_somewhere(tmp_path):
+    """Three chairs in a corner, one table far away: three pieces at a time, and the two walls of a corner."""
+    blocks = (*(("chair", 3.0, y, 2.0, 0.4) for y in (0.9, 1.4, 1.9)), ("table", -3.0, -1.5, 9.0, 0.5))
+    folder = write_room(tmp_path / "room", (8.0, 5.0), blocks)
+    world = build_world(get_robot("turtlebot"), (load_scene(folder),), NavConfig.of(num_objects=2))
+    assert Nearness(world).widths(0.78) == {"small": 2, "free": 3, "hinge": 1, "walls": 2}
+    assert Nearness(world).widths(0.1)["free"] == 2, "chairs 0.1 m apart"
+    assert Nearness(world).widths(20.0) == {"small": 2, "free": 4, "hinge": 1, "walls": 4}

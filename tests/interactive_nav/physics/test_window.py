@@ -90,6 +90,14 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
     assert int(jax.jit(one.select)(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
 
 
+def test_sizes_are_measured_where_none_are_set(world):
+    auto = Window(world, NavConfig.of(num_objects=2, active_small=1))
+    assert auto.widths == {"small": 1, "free": 2, "hinge": 1, "walls": 2}, "two chairs or the table; a corner"
+    kinds = [world.layout.slot_kind[group.slots[0]] for group in auto.groups]
+    assert dict(zip(kinds, (g.width for g in auto.groups), strict=True)) == {"small": 1, "free": 2}
+    assert auto.n_walls == 2 < Window(world, NavConfig.of(num_objects=2, **ALL)).n_walls
+
+
 def test_a_moving_object_outranks_one_at_rest(world):
     one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
     state = _state(world, 0)
