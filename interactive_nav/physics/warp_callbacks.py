@@ -1,4 +1,4 @@
-"""Keeps Python's garbage collector out of the calls by which JAX reaches Warp.
+"""Keeps Python's garbage collector out of the calls by which JAX reaches Warp, and Warp's lines off the console.
 
 Such a call captures a CUDA graph whenever XLA has moved a buffer, and runs Python for up to a second. What the
 collector finds dead meanwhile is destroyed on the device at once, and no capture survives that: a program that JAX has
@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import functools
 import gc
+import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
@@ -40,9 +42,24 @@ class _Suspended:
 _SUSPENDED = _Suspended()
 
 
+def quieten() -> None:
+    """Instead of Warp's line for each of its hundreds of kernels, one where none is compiled yet. Once is enough."""
+    import warp
+
+    if warp.config.log_level != warp.LOG_INFO:  # somebody chose, or it was done
+        return
+    warp.config.log_level = warp.LOG_WARNING
+    warp.init()
+    kept = warp.config.kernel_cache_dir
+    if kept and not any(Path(kept).glob("wp_*mujoco_warp*")):
+        print(f"Warp compiles its kernels: about two minutes the first time (kept in {kept})", file=sys.stderr)
+
+
 def keep_collector_out() -> None:
     """Suspends the collector in every callback of Warp's that is made from now on; once is enough."""
     from warp._src.jax.ffi import FfiCallable
+
+    quieten()
 
     # Warp has no public place for this: `jax_callable` registers the bound method.
     if not hasattr(FfiCallable.ffi_callback, "__wrapped__"):

@@ -1,6 +1,7 @@
 """The collector and Warp's callbacks: suspended within, as before after; and what a capture does not survive."""
 
 import gc
+import os
 import subprocess
 import sys
 import threading
@@ -16,6 +17,33 @@ def test_the_collector_is_suspended_within_and_on_after():
     assert gc.isenabled()
     assert without_collector(lambda a, b: (a, b, gc.isenabled()))(1, b=2) == (1, 2, False)
     assert gc.isenabled()
+
+
+def test_one_line_where_no_kernel_is_compiled_yet(tmp_path):
+    """A process of its own: Warp reads its settings once."""
+    program = """
+import os, warp
+warp.config.kernel_cache_dir = os.environ["CACHE"]
+from interactive_nav.physics.warp_callbacks import quieten
+quieten(); quieten()
+@warp.kernel
+def one(x: warp.array(dtype=float)):
+    x[warp.tid()] = 1.0
+warp.launch(one, 2, [warp.zeros(2, dtype=float, device="cpu")], device="cpu")
+"""
+
+    def said():
+        (tmp_path / "program.py").write_text(program)
+        told = {**os.environ, "CACHE": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+        words = [sys.executable, str(tmp_path / "program.py")]
+        done = subprocess.run(words, env=told, capture_output=True, text=True, check=True)
+        # Without a GPU Warp warns of that, and may.
+        return [line for line in (done.stdout + done.stderr).splitlines() if "NVIDIA CUDA driver" not in line]
+
+    first = said()
+    assert len(first) == 1 and "about two minutes the first time" in first[0] and str(tmp_path) in first[0]
+    (tmp_path / wp.config.version / "wp_mujoco.mjx.third_party.mujoco_warp._src.smooth_1").mkdir()
+    assert said() == []
 
 
 def test_it_comes_back_whatever_happens():
