@@ -155,8 +155,10 @@ def simulation(
         if i % 10 == 0:
             memory.append(_gpu_memory_mib())
     nav, physics = state.info["nav"], env.physics
+    rate, clock = statistics.median(rates), env.config.physics
     return {
-        "env_steps_per_s": round(statistics.median(rates)),
+        "env_steps_per_s": round(rate),
+        "physics_steps_per_s": round(rate * round(clock.control_dt_s / clock.sim_dt_s)),
         "compile_s": round(compile_s, 1),
         "steps": CHUNK * len(rates),
         "env_steps": CHUNK * len(rates) * num_envs,

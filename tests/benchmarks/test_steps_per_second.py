@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.steps_per_second import LEFT_OUT_SHARE, SETTINGS, windows
+from benchmarks.steps_per_second import LEFT_OUT_SHARE, SETTINGS, simulation, windows
 from tests.toys import write_room
 
 # Six cubes round the start that the robot cannot leave by far, one far away.
@@ -20,3 +20,10 @@ def test_what_is_needed_is_counted_and_proposed(tmp_path):
     assert row["needs"]["hinge"]["1.0"] == 0 and row["proposed"]["active_doors"] == 1, "0 would stand for all"
     # The default window holds five pieces: what it would have left out is the share that needs more.
     assert (row["left_out_share"] > 0) == (free["1.0"] > 5)
+
+
+def test_a_control_step_is_five_of_physics(tmp_path):
+    folder = write_room(tmp_path / "room")
+    row = simulation("turtlebot", [str(folder)], "native", 4, 20, {"num_objects": 0})
+    assert abs(row["physics_steps_per_s"] - 5 * row["env_steps_per_s"]) <= 3
+    assert row["env_steps"] == 80 and row["nonfinite"] == 0
