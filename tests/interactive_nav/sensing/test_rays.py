@@ -9,9 +9,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from interactive_nav.config import NavConfig
+from interactive_nav.robots import get_robot
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
+from interactive_nav.sensing.boxes import build_boxes
 from interactive_nav.sensing.rays import RayRenderer, cast_fan
-from scenes_mjcf.categories import class_id
+from scenes_mjcf.categories import SEGMENTATIONS, class_id
+from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
 LENS = Lens(68, 68, 120.0)
@@ -23,7 +29,7 @@ def drawn(boxes, jumble):
     return jax.jit(RayRenderer(boxes, LENS, tiled=True).render_batch)(scene, qpos, look_along(eye, forward))
 
 
-def c_mujoco(world, scene, qpos, pos, axes, lens):
+def c_mujoco(world, scene, qpos, pos, axes, lens, classes=4):
     """Depth and class ids by `mj_multiRay` over the physics model's own geoms, the robot's left out."""
     model, layout = world.models[scene], world.layout
     data = mujoco.MjData(model)
@@ -42,7 +48,7 @@ def c_mujoco(world, scene, qpos, pos, axes, lens):
     for slot, name in enumerate(world.names[scene]):
         if name:
             small = layout.slot_kind[slot] == "small"
-            own = world.small_objects[slot].segmentation_id if small else class_id(categories[name])
+            own = world.small_objects[slot].mask_id(classes) if small else class_id(categories[name], classes)
             ids[model.geom_bodyid == layout.slot_body[slot]] = own
     depth = distance.reshape(length.shape) / length
     met = (distance.reshape(length.shape) > 0) & (depth < 100)
@@ -65,6 +71,20 @@ def test_both_orders_of_work_draw_the_same(boxes, jumble, drawn):
     scanned = jax.jit(RayRenderer(boxes, LENS, tiled=False).render_batch)(scene, qpos, look_along(eye, forward))
     assert np.mean(np.abs(scanned[0] - drawn[0]) < 1e-4) > 0.999
     assert np.mean(scanned[1] == drawn[1]) > 0.999
+
+
+@pytest.mark.parametrize("tiled", [True, False])
+def test_all_classes_are_told_apart_up_to_the_highest(tmp_path, tiled):
+    rows = (("drying_rack", 0.7, -0.8, 5.0, 0.5), ("bed", 0.7, 0.0, 9.0, 0.5), ("coffee_table", 0.7, 0.8, 5.0, 0.5))
+    scene = load_scene(write_room(tmp_path / "room", blocks=rows))
+    world = build_world(get_robot("turtlebot"), (scene,), NavConfig.of(num_objects=0))
+    qpos, eye = world.rest_qpos[:1].astype(np.float32), np.asarray([[-1.5, 0.0, 0.4]], np.float32)
+    camera = look_along(eye, np.asarray([[1.0, 0.0, -0.1]], np.float32))
+    renderer = RayRenderer(build_boxes(world, "all"), LENS, tiled)
+    depth, ids = jax.jit(renderer.render_batch)(np.zeros(1, np.int32), qpos, camera)
+    want = c_mujoco(world, 0, qpos[0], eye[0], camera.axes_w[0], LENS, "all")
+    assert np.mean(np.asarray(ids[0]) == want[1]) > 0.998 and np.mean(np.abs(depth[0] - want[0]) < 1e-3) > 0.998
+    assert set(np.unique(ids).tolist()) == {0, 16, 17, 32} and len(SEGMENTATIONS["all"].names) == 33
 
 
 @pytest.mark.parametrize("size", [(20, 11), (37, 130)])
@@ -148,12 +168,14 @@ def test_mjx_warp_draws_the_same(boxes, jumble, drawn):
     from interactive_nav.sensing.warp import WarpRenderer
 
     scene, qpos, eye, forward = jumble
+    # Chairs get the highest number of all.
+    boxes = boxes.replace(class_id=jnp.where(boxes.class_id == 2, jnp.uint8(32), boxes.class_id), classes="all")
     renderer = WarpRenderer(boxes, LENS)
     camera = look_along(eye, forward)
     draw = jax.jit(jax.vmap(renderer.render))
     depth, ids = draw(scene, qpos, camera)
     assert np.mean(np.abs(depth - drawn[0]) < 0.01) > 0.99
-    assert np.mean(ids == drawn[1]) > 0.99
+    assert np.mean(ids == np.where(drawn[1] == 2, 32, drawn[1])) > 0.99 and (np.asarray(ids) == 32).any()
     # The same program with everything elsewhere: scenes swapped between environments, objects and cameras moved.
     roll = jax.tree.map(lambda x: jnp.roll(jnp.asarray(x), 1, 0), (scene, qpos, camera))
     moved = (roll[0], roll[1], CameraPose(roll[2].pos_w + 0.1, roll[2].axes_w))
