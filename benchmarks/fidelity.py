@@ -32,6 +32,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Movable, Scene, load_scene
 from interactive_nav.scenes.world import World, build_world
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rows import markdown
 
 REFERENCE = {"sim_dt_s": 1 / 240, "solver_iterations": 100}
@@ -83,7 +84,7 @@ def _movable(source: Scene, category: str) -> Movable:
     """An object of the category: the lightest chair, which a TurtleBot's traction can move, else the heaviest."""
     found = [m for m in source.movables if m.category == category]
     if not found:
-        raise ValueError(f"{source.path} has no {category}; choose another --scene")
+        raise ConfigError(f"{source.path} has no {category}; choose another --scene")
     return (min if category == "chair" else max)(found, key=lambda m: m.mass_kg)
 
 

@@ -25,6 +25,7 @@ import interactive_nav
 from benchmarks.measurement import append_row, command_line, origin, random_driving
 from benchmarks.steps_per_second import MODES, step_of
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common.errors import ConfigError
 
 PARTS = (
     ("rendering", r"render|bvh"),
@@ -72,7 +73,7 @@ def device_events(folder: Path) -> list[tuple[str, float, float]]:
     """(name, begin, end) in ns of every kernel and copy on the first GPU in a profile.
 
     Raises:
-        ValueError: the profile has no GPU in it.
+        ConfigError: the profile has no GPU in it.
     """
     found = []
     for path in folder.rglob("*.xplane.pb"):
@@ -84,7 +85,7 @@ def device_events(folder: Path) -> list[tuple[str, float, float]]:
                     continue  # summaries by module or operation, which would count twice
                 found += [(e.name, e.start_ns, e.start_ns + e.duration_ns) for e in line.events]
     if not found:
-        raise ValueError(f"{folder}: no kernels of a GPU in the profile; it needs an NVIDIA GPU and CUPTI")
+        raise ConfigError(f"{folder}: no kernels of a GPU in the profile; it needs an NVIDIA GPU and CUPTI")
     return found
 
 

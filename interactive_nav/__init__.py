@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from interactive_nav import mjx_without_warp
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.moved import keep_old_names
 
 # The scenes' tables are constants of `reset` and `step`, tens to hundreds of megabytes. Without this, JAX
@@ -81,7 +82,7 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
         A `brax.envs.Env` with pure `reset` and `step` for one environment; batch it with `jax.vmap`.
 
     Raises:
-        ValueError: unknown robot or setting (the message names the nearest valid one), impossible value,
+        ConfigError: unknown robot or setting (the message names the nearest valid one), impossible value,
             or an unusable scene (`SceneError`).
     """
     from interactive_nav.config import make_config
@@ -91,7 +92,7 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
     from scenes_mjcf.sets import scene_folders
 
     if isinstance(scenes, (str, Path)):
-        raise ValueError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
+        raise ConfigError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
     spec = get_robot(robot, config.rules.control_mode)
     return InteractiveNav(spec, tuple(load_scene(s) for s in scene_folders(scenes)), config)

@@ -13,10 +13,12 @@ from collections.abc import Sequence
 
 import interactive_nav
 from interactive_nav.task.episode_files import EpisodeFile, EpisodeFileError, draw, load, load_all, save, starts_of
+from interactive_nav_common.errors import reports_errors
 
 __all__ = ["EpisodeFile", "EpisodeFileError", "draw", "load", "load_all", "main", "save", "starts_of"]
 
 
+@reports_errors("interactive_nav.episodes")
 def main(argv: Sequence[str] | None = None) -> int:
     """Makes a file; 0 when done, 2 on a user's error."""
     parser = argparse.ArgumentParser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
@@ -32,19 +34,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     make_parser.add_argument("-o", "--out", required=True, metavar="FILE")
     arguments = parser.parse_args(argv)
-    try:
-        env = interactive_nav.make(
-            arguments.robot,
-            arguments.scenes,
-            backend="native",
-            num_objects=arguments.num_objects,
-            objects=arguments.objects,
-        )
-        file = draw(env, arguments.episodes, arguments.seed)
-        save(file, arguments.out)
-    except (ValueError, OSError) as error:
-        print(f"interactive_nav.episodes: {error}", file=sys.stderr)
-        return 2
+    env = interactive_nav.make(
+        arguments.robot,
+        arguments.scenes,
+        backend="native",
+        num_objects=arguments.num_objects,
+        objects=arguments.objects,
+    )
+    file = draw(env, arguments.episodes, arguments.seed)
+    save(file, arguments.out)
     shortest = [row["shortest_path_m"] for row in file.episodes]
     print(
         f"{arguments.out}: {len(shortest)} episodes in {len(file.scenes)} scenes, shortest paths "

@@ -34,6 +34,7 @@ from interactive_nav.pictures.views import (
 )
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import yaw_from_quat
 
@@ -59,7 +60,7 @@ class Compositor:
 
         Raises:
             ReplayError: the scene is not the one that the replay was recorded in.
-            ValueError: a height that does not divide.
+            ConfigError: a height that does not divide.
         """
         check_height(height)
         check_scene(replay, scene)
@@ -125,9 +126,9 @@ class Compositor:
 
 
 def check_height(height: int) -> None:
-    """Raises `ValueError` unless every part of a frame of so many rows has whole, even pixels."""
+    """Raises `ConfigError` unless every part of a frame of so many rows has whole, even pixels."""
     if height < 120 or height % 12:
-        raise ValueError(f"height is {height}, expected a multiple of 12 from 120 on")
+        raise ConfigError(f"height is {height}, expected a multiple of 12 from 120 on")
 
 
 def check_format(path: Path) -> None:
@@ -236,7 +237,7 @@ def check_picture_words(arguments: argparse.Namespace) -> None:
     """Refuses what cannot be drawn, before anything is played.
 
     Raises:
-        ValueError: the message says what.
+        ConfigError: the message says what.
     """
     check_format(Path(arguments.out))
     check_height(arguments.height)
@@ -262,6 +263,7 @@ def record(source: Path, arguments: argparse.Namespace, console: Console) -> Non
     console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
 
 
+@reports_errors("interactive_nav.record")
 def main(argv: Sequence[str] | None = None) -> int:
     """Records; 0 when done, 2 on a user's error, 130 when interrupted."""
     made = argparse.ArgumentParser(prog="python -m interactive_nav.record", description="Makes a video of an episode.")
@@ -274,9 +276,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if source.suffix != ".npz":
             source = replay_of(source, arguments.episode, arguments.policy, arguments.out)
         record(source, arguments, Console())
-    except (ValueError, OSError) as error:  # ReplayError, SceneError and an unknown robot are ValueErrors
-        print(f"interactive_nav.record: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("interactive_nav.record: stopped; no video was written", file=sys.stderr)
         return 130

@@ -5,6 +5,7 @@ R = R_suc + R_pot + R_int. Pure functions on NumPy or JAX arrays with any leadin
 
 from __future__ import annotations
 
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import Array, namespace
 
 
@@ -70,10 +71,10 @@ def interactive_navigation_reward(
         The sum [...], and its terms under `success`, `potential`, `interaction`.
 
     Raises:
-        ValueError: k_int is a negative Python number.
+        ConfigError: k_int is a negative Python number.
     """
     if isinstance(k_int, (int, float)) and k_int < 0:
-        raise ValueError(f"k_int is {k_int}, expected a penalty >= 0 (it is subtracted)")
+        raise ConfigError(f"k_int is {k_int}, expected a penalty >= 0 (it is subtracted)")
     terms = {
         "success": success_reward(success, success_value),
         "potential": potential_reward(geodesic_before_m, geodesic_after_m),

@@ -30,6 +30,8 @@ from interactive_nav.record import check_scene
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
 
 COLOUR_BY = ("time", "contact")
@@ -74,10 +76,10 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
 
     Raises:
         ReplayError: the scene is not the one that the replay was recorded in.
-        ValueError: another `colour_by`.
+        ConfigError: another `colour_by`.
     """
     if colour_by not in COLOUR_BY:
-        raise ValueError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
+        raise ConfigError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
     check_scene(replay, scene)
     maps = scene.maps
     rows, columns = maps.traversable.shape
@@ -216,6 +218,7 @@ def _files(sources: Sequence[str]) -> list[Path]:
     return files
 
 
+@reports_errors("interactive_nav.topdown")
 def main(argv: Sequence[str] | None = None) -> int:
     """Draws; 0 when done, 2 on a user's error."""
     made = argparse.ArgumentParser(prog="python -m interactive_nav.topdown", description="Draws episodes from above.")
@@ -224,17 +227,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     made.add_argument("--colour-by", choices=COLOUR_BY, default="time", help="colour of the path (default time)")
     made.add_argument("--columns", type=int, default=3, help="panels in a row (default 3)")
     arguments = made.parse_args(argv)
-    try:
-        if arguments.columns < 1:
-            raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")
-        replays = [load(path) for path in _files(arguments.replays)]
-        scenes = {path: load_scene(path) for path in dict.fromkeys(r.scene for r in replays)}
-        figure = panels(replays, scenes, arguments.colour_by, arguments.columns)
-        Path(arguments.out).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(arguments.out, dpi=160)
-    except (ValueError, OSError) as error:
-        print(f"interactive_nav.topdown: {error}", file=sys.stderr)
-        return 2
+    if arguments.columns < 1:
+        raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")
+    replays = [load(path) for path in _files(arguments.replays)]
+    scenes = {path: load_scene(path) for path in dict.fromkeys(r.scene for r in replays)}
+    figure = panels(replays, scenes, arguments.colour_by, arguments.columns)
+    with whole_file(arguments.out) as partial:
+        figure.savefig(partial, dpi=160)
     print(f"{arguments.out}: {len(replays)} episodes")
     return 0
 

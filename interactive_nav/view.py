@@ -23,7 +23,7 @@ from interactive_nav.pictures.scene_model import furnished_spec
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import UserError, reports_errors
 
 VIEWERS = ("auto", "window", "browser")
 GAP_M = 0.03
@@ -176,17 +176,14 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@reports_errors("interactive_nav.view")
 def main(argv: Sequence[str] | None = None) -> int:
     """Opens a viewer; 0 when it was closed, 2 with one line on stderr when none can open."""
     arguments = _parser().parse_args(argv)
-    try:
-        robot = get_robot(arguments.robot) if arguments.robot else None
-        small = pick(arguments.objects, arguments.small_objects)
-        model = build_model(arguments.scene, robot, small, arguments.seed)
-        viewer = choose_viewer(arguments.viewer)
-    except ValueError as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        return 2
+    robot = get_robot(arguments.robot) if arguments.robot else None
+    small = pick(arguments.objects, arguments.small_objects)
+    model = build_model(arguments.scene, robot, small, arguments.seed)
+    viewer = choose_viewer(arguments.viewer)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     if viewer == "window":

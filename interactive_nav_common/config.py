@@ -265,7 +265,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
             changes[key] = _convert(value, hint, f"{where}: {name}")
     try:
         return replace(base, **changes)
-    except ValueError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
+    except ConfigError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
         raise ConfigError(f"{where}: {prefix}{error}") from None
 
 

@@ -10,7 +10,7 @@ from typing import ParamSpec
 Arguments = ParamSpec("Arguments")
 
 
-class UserError(ValueError):
+class UserError(Exception):
     """Base of the errors that programs print as one line and exit with 2."""
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 from interactive_nav_common.config import nearest
+from interactive_nav_common.errors import ConfigError
 
 Rgb = tuple[float, float, float]
 Range = tuple[float, float]
@@ -311,10 +312,10 @@ def class_id(category: str, classes: MaskClasses = 4) -> int:
         classes: the setting `segmentation_classes`.
 
     Raises:
-        ValueError: a category without an id.
+        ConfigError: a category without an id.
     """
     ids = SEGMENTATIONS[classes].ids
     if category not in ids:
         near = nearest(category, list(ids))
-        raise ValueError(f"category '{category}' has no segmentation id{near}; known: {', '.join(ids)}")
+        raise ConfigError(f"category '{category}' has no segmentation id{near}; known: {', '.join(ids)}")
     return ids[category]

@@ -15,11 +15,13 @@ from rich.console import Console
 
 from interactive_nav.pictures.replay import replay_path
 from interactive_nav.record import add_picture_words, check_picture_words, record
+from interactive_nav_common.errors import reports_errors
 from train import replay
 from train.config import EnvConfig
 from train.runs.run import make_env
 
 
+@reports_errors("train.record")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
     """Plays and draws; 0 when done, 2 on a user's error, 130 when interrupted."""
     made = argparse.ArgumentParser(prog="python -m train.record", description="Makes a video of an episode of a run.")
@@ -37,9 +39,6 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             return refused
         path = replay_path(Path(arguments.run), arguments.policy, arguments.episode)
         record(path, arguments, Console())
-    except (ValueError, OSError) as error:
-        print(f"train.record: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("train.record: stopped; no video was written", file=sys.stderr)
         return 130

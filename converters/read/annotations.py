@@ -111,8 +111,6 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
                 )
             )
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        if isinstance(error, SceneRejected):
-            raise
         what = f"missing key {error}" if isinstance(error, KeyError) else str(error)
         raise SceneRejected(f"{where}: {what}; expected Scan2CAD's annotation layout") from error
     return str(data[0].get("id_scan", path.parent.name)), tuple(records)

@@ -228,8 +228,6 @@ def read_obj(path: Path) -> ObjMesh:
         uv = np.array(uvs, float).reshape(-1, 2)
         index, uv_index = _corner_indices(corners)
     except (ValueError, OverflowError) as error:
-        if isinstance(error, SceneRejected):
-            raise
         raise SceneRejected(f"{path}: not readable as OBJ ({error}); the file is damaged, fetch it again") from error
     corner, face = _fans(np.array(sizes, np.int64))
     faces = index[corner] - 1

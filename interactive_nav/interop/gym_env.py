@@ -89,7 +89,7 @@ def _key(rng: np.random.Generator) -> np.ndarray:
 def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
     unknown = [name for name in options or {} if name not in known]
     if unknown:
-        raise ValueError(f"reset option {unknown[0]!r} is unknown; known options: {', '.join(known)}")
+        raise ConfigError(f"reset option {unknown[0]!r} is unknown; known options: {', '.join(known)}")
     return options or {}
 
 
@@ -129,7 +129,7 @@ class InteractiveNavEnv(gymnasium.Env):
             **settings: of `NavConfig`'s parts.
 
         Raises:
-            ValueError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
+            ConfigError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
         """
         self.env = interactive_nav.make(robot, scenes, **settings)
         kept = _checked_slot(self.env, slot)
@@ -210,12 +210,12 @@ class InteractiveNavVectorEnv(VectorEnv):
             **settings: of `NavConfig`'s parts.
 
         Raises:
-            ValueError: as `interactive_nav.make`, or another choice that does not exist.
+            ConfigError: as `interactive_nav.make`, or another choice that does not exist.
         """
         if num_envs < 1:
-            raise ValueError(f"num_envs is {num_envs}, expected at least 1")
+            raise ConfigError(f"num_envs is {num_envs}, expected at least 1")
         if arrays not in ARRAYS:
-            raise ValueError(f"arrays is {arrays!r}, expected one of {', '.join(ARRAYS)}")
+            raise ConfigError(f"arrays is {arrays!r}, expected one of {', '.join(ARRAYS)}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.env = interactive_nav.make(robot, scenes, **settings)
         self.num_envs, self.arrays = num_envs, arrays
@@ -250,12 +250,12 @@ class InteractiveNavVectorEnv(VectorEnv):
         super().reset(seed=seed if isinstance(seed, int) else None)
         given = _check_options(options, ("reset_mask", "start"))
         if "reset_mask" in given and ("start" in given or self._state is None):
-            raise ValueError("reset option 'reset_mask' excludes 'start' and needs an earlier reset without it")
+            raise ConfigError("reset option 'reset_mask' excludes 'start' and needs an earlier reset without it")
         keys = self._keys(seed)
         if "reset_mask" in given:
             mask = np.asarray(given["reset_mask"])
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-                raise ValueError(
+                raise ConfigError(
                     f"reset_mask is {mask.dtype} of shape {mask.shape} with {np.count_nonzero(mask)} set, "
                     f"expected bool of shape ({self.num_envs},) with at least one set"
                 )
@@ -299,7 +299,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         n = self.num_envs
         seeds = list(range(seed, seed + n)) if isinstance(seed, int) else [None] * n if seed is None else list(seed)
         if len(seeds) != n:
-            raise ValueError(f"seed has {len(seeds)} entries, expected one for each of {n} environments")
+            raise ConfigError(f"seed has {len(seeds)} entries, expected one for each of {n} environments")
         if self._state is not None:
             keys = np.array(self._state.info["rng"])
         else:
@@ -367,7 +367,7 @@ def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
 def _checked_render_mode(mode: str | None) -> str | None:
     known = InteractiveNavEnv.metadata["render_modes"]
     if mode is not None and mode not in known:
-        raise ValueError(f"render_mode is {mode!r}, expected one of {', '.join(known)} or none")
+        raise ConfigError(f"render_mode is {mode!r}, expected one of {', '.join(known)} or none")
     return mode
 
 

@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from interactive_nav_common.errors import ConfigError
+
 
 def _torch() -> Any:
     try:
@@ -50,7 +52,7 @@ def to_jax(tree: Any) -> Any:
 
     Raises:
         ImportError: PyTorch is not installed.
-        ValueError: a tensor that requires a gradient.
+        ConfigError: a tensor that requires a gradient.
     """
     torch = _torch()
 
@@ -58,7 +60,7 @@ def to_jax(tree: Any) -> Any:
         if not isinstance(x, torch.Tensor):
             return x
         if x.requires_grad:
-            raise ValueError(
+            raise ConfigError(
                 f"tensor of shape {tuple(x.shape)} requires a gradient, expected a detached one: .detach()"
             )
         return jnp.from_dlpack(x.contiguous())

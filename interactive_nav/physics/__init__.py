@@ -9,13 +9,14 @@ import jax
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import ForceOptions, Physics, PhysicsState, StepSignals
 from interactive_nav.scenes.world import World
+from interactive_nav_common.errors import ConfigError
 
 
 def resolve_backend(name: str) -> str:
     """`auto` becomes `warp` on an NVIDIA GPU with Warp installed, `native` on a CPU, `jax` elsewhere.
 
     Raises:
-        ValueError: `warp` without the Warp package.
+        ConfigError: `warp` without the Warp package.
     """
     has_warp = importlib.util.find_spec("warp") is not None
     if name == "auto":
@@ -24,7 +25,7 @@ def resolve_backend(name: str) -> str:
             return "native"
         return "warp" if platform == "gpu" and has_warp else "jax"
     if name == "warp" and not has_warp:
-        raise ValueError(
+        raise ConfigError(
             "backend is 'warp' but the package warp-lang is not installed; "
             "install the gpu extra (pip install '.[gpu]') or choose backend=native"
         )
@@ -35,14 +36,14 @@ def make_physics(world: World, config: NavConfig) -> Physics:
     """Builds the backend that the configuration names.
 
     Raises:
-        ValueError: hull collision on an MJX backend, or a backend that is not installed.
+        ConfigError: hull collision on an MJX backend, or a backend that is not installed.
     """
     rules, physics = config.rules, config.physics
     backend = resolve_backend(physics.backend)
     if physics.collision == "hulls" and backend != "native":
-        raise ValueError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
+        raise ConfigError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
     if physics.cone == "elliptic" and backend != "native":
-        raise ValueError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
+        raise ConfigError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
     forces = ForceOptions(rules.force_part, rules.force_sum, rules.needs_contacts)
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics

@@ -21,7 +21,7 @@ from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
 from interactive_nav.pictures.shading import SKY_COLOUR, lambert
 from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import ConfigError, UserError
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
 VIEWS = ("robot", "top", "follow")
@@ -39,10 +39,10 @@ class Camera:
             engine: of RGB: gl, warp, rays, or auto: gl where it works, else warp on an NVIDIA GPU, else rays.
 
         Raises:
-            ValueError: unknown engine.
+            ConfigError: unknown engine.
         """
         if engine not in ENGINES:
-            raise ValueError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
+            raise ConfigError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
         self._env, self._engine = env, engine
         self._models: dict[int, _PictureModel] = {}
         self._painters: dict[tuple, Any] = {}
@@ -75,16 +75,16 @@ class Camera:
             segmentation [H, W] u8 class ids.
 
         Raises:
-            ValueError: unknown stream or view, or a batch of states.
+            ConfigError: unknown stream or view, or a batch of states.
         """
         unknown = [s for s in streams if s not in STREAMS]
         if unknown or not streams:
-            raise ValueError(f"streams is {tuple(streams)!r}, expected a choice from {', '.join(STREAMS)}")
+            raise ConfigError(f"streams is {tuple(streams)!r}, expected a choice from {', '.join(STREAMS)}")
         if view not in VIEWS:
-            raise ValueError(f"view is '{view}', expected one of {', '.join(VIEWS)}")
+            raise ConfigError(f"view is '{view}', expected one of {', '.join(VIEWS)}")
         qpos = np.asarray(state.pipeline_state.qpos)
         if qpos.ndim != 1:
-            raise ValueError(
+            raise ConfigError(
                 f"state is a batch of shape {qpos.shape[:-1]}, expected one environment; "
                 "index it first: jax.tree.map(lambda x: x[0], state)"
             )

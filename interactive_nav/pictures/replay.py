@@ -22,7 +22,7 @@ from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import MaskClasses
 
@@ -130,10 +130,10 @@ class Player:
                 host: something that looks at the whole state or keeps a plan.
 
         Raises:
-            ValueError: both a policy and a planner, or neither.
+            ConfigError: both a policy and a planner, or neither.
         """
         if (policy is None) == (planner is None):
-            raise ValueError("Player got policy and planner, expected exactly one of them")
+            raise ConfigError("Player got policy and planner, expected exactly one of them")
         self.env, self.name, self.label = env, name, label
         self._reset = jax.jit(jax.vmap(env.reset))
         self._planner = planner
@@ -267,8 +267,6 @@ def load(path: str | Path) -> Replay:
                 )
             header = json.loads(str(stored["header"]))
             arrays = {name: stored[name] for name in _ARRAYS}
-    except ReplayError:
-        raise
     except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
         raise ReplayError(f"{path}: is no replay or damaged ({error}); record the episode again") from error
     if header.pop("format", None) != FORMAT:

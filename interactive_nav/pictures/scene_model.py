@@ -17,6 +17,7 @@ from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes,
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import CATEGORIES, MaskClasses, class_id
 
@@ -156,14 +157,14 @@ class SceneModel:
             quat_w: [B, 4] w x y z.
 
         Raises:
-            ValueError: the scene has no body of a name.
+            ConfigError: the scene has no body of a name.
         """
         model, data = self.model, self.data
         rotation = np.zeros(9)
         for name, pos, quat in zip(bodies, pos_w, quat_w, strict=True):
             body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
             if body < 0:
-                raise ValueError(f"no body '{name}' in this scene with robot '{self.robot.name}'; record it again")
+                raise ConfigError(f"no body '{name}' in this scene with robot '{self.robot.name}'; record it again")
             quat = np.asarray(quat, float)
             mujoco.mju_quat2Mat(rotation, quat)
             data.xpos[body], data.xquat[body], data.xmat[body] = pos, quat, rotation

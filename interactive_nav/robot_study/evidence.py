@@ -25,6 +25,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.scenes.world import World, build_world
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import yaw_from_quat
 
 _DT_S = 0.1
@@ -362,9 +363,9 @@ def measure(name: str, backend: str = "native") -> Evidence:
     """A robot's evidence, by its kind.
 
     Raises:
-        ValueError: unknown robot, or a kind without evidence.
+        ConfigError: unknown robot, or a kind without evidence.
     """
     kind = get_robot(name).kind
     if kind not in EVIDENCE:
-        raise ValueError(f"robot '{name}' is {kind}; evidence exists for {', '.join(sorted(EVIDENCE))} robots")
+        raise ConfigError(f"robot '{name}' is {kind}; evidence exists for {', '.join(sorted(EVIDENCE))} robots")
     return EVIDENCE[kind](name, backend)

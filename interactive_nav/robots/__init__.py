@@ -53,13 +53,13 @@ def register(name: str, factory: Callable[[str], RobotSpec]) -> None:
         factory: control mode -> spec; the mode `native` must exist. `from_file` makes one.
 
     Raises:
-        ValueError: a name that is taken, or a factory whose spec has another name.
+        ConfigError: a name that is taken, or a factory whose spec has another name.
     """
     if name in _FACTORIES:
-        raise ValueError(f"robot '{name}' exists already; choose another name")
+        raise ConfigError(f"robot '{name}' exists already; choose another name")
     spec = factory("native")
     if spec.name != name:
-        raise ValueError(f"the factory's robot is called '{spec.name}', expected '{name}'")
+        raise ConfigError(f"the factory's robot is called '{spec.name}', expected '{name}'")
     _FACTORIES[name] = factory
 
 

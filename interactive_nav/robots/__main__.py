@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from interactive_nav.robots import get_robot, robot_names
+from interactive_nav_common.errors import reports_errors
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -81,6 +82,7 @@ def _draw_figure(names: tuple[str, ...], backend: str, path: Path) -> None:
     save_figure({n: measure(n, backend) if get_robot(n).kind in EVIDENCE else None for n in names}, path)
 
 
+@reports_errors("interactive_nav.robots")
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m interactive_nav.robots", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
@@ -111,9 +113,6 @@ def main(argv: list[str] | None = None) -> int:
 
             for path in save_pictures(names, args.render):
                 console.print(f"wrote {path}")
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         return 130
     return 0

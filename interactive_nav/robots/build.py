@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, check_mode, set_servo, wheel_twist
+from interactive_nav_common.errors import ConfigError
 
 FOLDER = Path(__file__).parent / "mjcf"
 _OPTIONS = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity")
@@ -105,14 +106,14 @@ def read_file(path: Path) -> mujoco.MjSpec:
     """Parses an MJCF or URDF file.
 
     Raises:
-        ValueError: no such file, or MuJoCo cannot read it.
+        ConfigError: no such file, or MuJoCo cannot read it.
     """
     if not path.is_file():
-        raise ValueError(f"robot file {path} does not exist, expected an MJCF or URDF file")
+        raise ConfigError(f"robot file {path} does not exist, expected an MJCF or URDF file")
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ValueError(f"robot file {path}: MuJoCo cannot read it ({str(error).splitlines()[0]})") from error
+        raise ConfigError(f"robot file {path}: MuJoCo cannot read it ({str(error).splitlines()[0]})") from error
 
 
 def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
@@ -160,7 +161,7 @@ def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:
     low, high = (float(v) for v in own.range)
     effort = float(own.actfrcrange[1])
     if not effort > 0:
-        raise ValueError(f"joint '{joint.name}' has no torque limit (actuatorfrcrange), expected a positive one")
+        raise ConfigError(f"joint '{joint.name}' has no torque limit (actuatorfrcrange), expected a positive one")
     return _Limits((low, high) if low < high else None, effort)
 
 
@@ -309,7 +310,7 @@ def _load(base: WheeledBase, prepare: Callable[[mujoco.MjSpec], None] | None) ->
         prepare(child)
     missing = [j.name for j in base.joints if child.joint(j.name) is None or child.actuator(j.name) is None]
     if missing:
-        raise ValueError(f"robot file {path}: no joint and actuator named '{missing[0]}'")
+        raise ConfigError(f"robot file {path}: no joint and actuator named '{missing[0]}'")
     return child
 
 
@@ -343,7 +344,7 @@ def wheeled_robot(
         **figures: other fields of `RobotSpec`.
 
     Raises:
-        ValueError: unknown mode, or a file that does not fit.
+        ConfigError: unknown mode, or a file that does not fit.
     """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"

@@ -18,6 +18,7 @@ import numpy as np
 from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, read_file, stand, wheeled_robot
 from interactive_nav.robots.repair import Facts, Wheel, complete, find, strip
 from interactive_nav.robots.spec import Camera, RobotSpec
+from interactive_nav_common.errors import ConfigError
 
 _GEOM = mujoco.mjtGeom
 _SPHERE_WIDTH = 0.25
@@ -35,18 +36,18 @@ def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mappin
         rotation = data.xmat[body].reshape(3, 3)
         axis = rotation @ model.jnt_axis[joint.id]
         if abs(axis[1]) < 0.95:
-            raise ValueError(
+            raise ConfigError(
                 f"robot file {path}: wheel joint '{name}' turns about {np.round(axis, 2).tolist()} of the base, "
                 "expected its y axis (x forward, y left, z up)"
             )
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 3]
         if not geoms:
-            raise ValueError(f"robot file {path}: wheel body '{model.body(body).name}' has no collision geom")
+            raise ConfigError(f"robot file {path}: wheel body '{model.body(body).name}' has no collision geom")
         geom = geoms[0]
         kind = _GEOM(int(model.geom_type[geom]))
         round_kinds = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE)
         if len(geoms) > 1 or kind not in round_kinds:
-            raise ValueError(
+            raise ConfigError(
                 f"robot file {path}: wheel body '{model.body(body).name}' collides as {len(geoms)} geoms or as no "
                 "round one, expected one cylinder, capsule or sphere"
             )
@@ -76,7 +77,7 @@ def _outline(robot: RobotSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
 def _sides(left_wheels: tuple[str, ...], right_wheels: tuple[str, ...]) -> dict[str, int]:
     """Wheel joint -> -1 on the left, 1 on the right."""
     if not left_wheels or len(left_wheels) != len(right_wheels):
-        raise ValueError(
+        raise ConfigError(
             f"left_wheels has {len(left_wheels)} and right_wheels {len(right_wheels)} joints, expected as many on both"
         )
     return dict.fromkeys(left_wheels, -1) | dict.fromkeys(right_wheels, 1)
@@ -103,7 +104,7 @@ def _base(
     """Driven joints and commands; what is None follows from the wheels."""
     radii = [w.radius_m for w in facts.wheels]
     if max(radii) - min(radii) > 1e-3:
-        raise ValueError(f"robot file {path}: its driven wheels differ in radius, expected one radius")
+        raise ConfigError(f"robot file {path}: its driven wheels differ in radius, expected one radius")
     if track_m is None:
         across = float(np.ptp([w.pos_m[1] for w in facts.wheels]))
         along = float(np.ptp([w.pos_m[0] for w in facts.wheels]))
@@ -210,7 +211,7 @@ def from_file(
         control mode -> `RobotSpec`.
 
     Raises:
-        ValueError: a file that cannot be used; the message says what to change.
+        ConfigError: a file that cannot be used; the message says what to change.
     """
     sides = _sides(left_wheels, right_wheels)
     driven, limits, path = dict(joints or {}), dict(torque_limits or {}), Path(path).resolve()

@@ -18,6 +18,7 @@ import numpy as np
 
 from interactive_nav.robots.build import Joint, WheeledBase
 from interactive_nav.robots.spec import set_servo
+from interactive_nav_common.errors import FileError
 
 _GEOM = mujoco.mjtGeom
 _STIFFNESS_PER_EFFORT = 10.0
@@ -61,12 +62,12 @@ def find(child: mujoco.MjSpec, path: Path, kind: str, name: str):
     """The body or joint of a name.
 
     Raises:
-        ValueError: there is none; the message lists what there is.
+        FileError: there is none; the message lists what there is.
     """
     found = child.body(name) if kind == "body" else child.joint(name)
     if found is None:
         known = [x.name for x in (child.bodies if kind == "body" else child.joints) if x.name not in ("world", "")]
-        raise ValueError(f"robot file {path} has no {kind} named '{name}'; it has {', '.join(known)}")
+        raise FileError(f"robot file {path} has no {kind} named '{name}'; it has {', '.join(known)}")
     return found
 
 
@@ -83,11 +84,11 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         child.delete(geom)
     for other in list(child.worldbody.bodies):
         if other.name != base.name:
-            raise ValueError(f"robot file {path}: body '{other.name}' is no part of '{base_body}', expected one tree")
+            raise FileError(f"robot file {path}: body '{other.name}' is no part of '{base_body}', expected one tree")
     free = [j for j in base.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         if base.joints:
-            raise ValueError(f"robot file {path}: base body '{base_body}' hangs on a joint, expected it free")
+            raise FileError(f"robot file {path}: base body '{base_body}' hangs on a joint, expected it free")
         base.add_freejoint(name="free")
     elif not free[0].name:
         free[0].name = "free"
@@ -96,7 +97,7 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         if not geom.name:
             geom.name = f"{geom.parent.name}_geom_{k}"
         if _solid(geom) and geom.type == _GEOM.mjGEOM_MESH:
-            raise ValueError(
+            raise FileError(
                 f"robot file {path}: geom '{geom.name}' of body '{geom.parent.name}' collides as a mesh, expected "
                 "boxes, capsules, spheres or cylinders; replace it (meshes may stay as visuals)"
             )
@@ -143,7 +144,7 @@ def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         if any(g.group == 3 for g in body.geoms):
             _warn(f"{path}: body '{body.name}' has no inertia; taken from its shapes at 1000 kg/m3")
         elif body.joints and body.name != base_body:
-            raise ValueError(f"robot file {path}: moving body '{body.name}' has neither inertia nor collision shapes")
+            raise FileError(f"robot file {path}: moving body '{body.name}' has neither inertia nor collision shapes")
     model = child.copy().compile()
     for body in child.bodies:
         if body.name == "world":
@@ -180,7 +181,7 @@ def complete(
     for name in casters:
         for geom in [g for g in find(child, path, "body", name).geoms if g.group == 3]:
             if geom.type != _GEOM.mjGEOM_SPHERE:
-                raise ValueError(f"robot file {path}: caster '{name}' is no sphere, expected one")
+                raise FileError(f"robot file {path}: caster '{name}' is no sphere, expected one")
             geom.contype, geom.condim, geom.friction = 0, 1, [0.0, 0.0, 0.0]
     for geom in [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_CYLINDER]:
         _warn(f"{path}: cylinder '{geom.name}' now collides as four boxes, an octagon")
@@ -194,7 +195,7 @@ def _add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
     own = child.joint(joint.name)
     effort = float(own.actfrcrange[1])
     if not effort > 0:
-        raise ValueError(
+        raise FileError(
             f"robot file {path}: joint '{joint.name}' has no torque limit; give one (URDF: <limit effort>, "
             f"MJCF: actuatorfrcrange, or torque_limits={{'{joint.name}': ...}})"
         )

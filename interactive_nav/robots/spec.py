@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from interactive_nav_common.errors import ConfigError
+
 
 class RobotState(NamedTuple):
     """The robot's part of the physics state that a control law may read; leading batch axes as the caller has them."""
@@ -54,9 +56,9 @@ def wheel_twist(wheel_radius_m: float, track_m: float, sides: tuple[int, ...]) -
 
 
 def check_mode(robot: str, mode: str, known: tuple[str, ...]) -> None:
-    """Raises ValueError for a control mode that the robot does not have."""
+    """Raises ConfigError for a control mode that the robot does not have."""
     if mode not in known:
-        raise ValueError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
+        raise ConfigError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
 
 
 def set_servo(
@@ -166,10 +168,10 @@ class RobotSpec:
         """Actions [..., A] that ask the base for a velocity.
 
         Raises:
-            ValueError: this control mode has no twist map.
+            ConfigError: this control mode has no twist map.
         """
         if self.twist is None:
-            raise ValueError(
+            raise ConfigError(
                 f"robot '{self.name}' in control mode '{self.control_mode}' takes no base velocity; "
                 f"choose another of its modes: {', '.join(self.control_modes)}"
             )

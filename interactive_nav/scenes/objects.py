@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.categories import MaskClasses, class_id
 
 Rgba = tuple[float, float, float, float]
@@ -273,14 +274,14 @@ def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[Smal
         variant: which two models of each kind; 0 is the default set, and they come round again in the end.
 
     Raises:
-        ValueError: a negative number, or an unknown split.
+        ConfigError: a negative number, or an unknown split.
     """
     if num_objects < 0:
-        raise ValueError(f"num_objects is {num_objects}, expected 0 or more")
+        raise ConfigError(f"num_objects is {num_objects}, expected 0 or more")
     if variant < 0:
-        raise ValueError(f"variant is {variant}, expected 0 or more")
+        raise ConfigError(f"variant is {variant}, expected 0 or more")
     if split not in MODELS:
-        raise ValueError(f"split is {split!r}, expected one of {', '.join(SPLITS)}")
+        raise ConfigError(f"split is {split!r}, expected one of {', '.join(SPLITS)}")
     chosen = []
     for i in range(num_objects):
         kind = KINDS[i % len(KINDS)]

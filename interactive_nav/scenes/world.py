@@ -21,6 +21,7 @@ from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Movable, Scene
 from interactive_nav.scenes.spec import build_spec, parking_spot, sorted_movables
+from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.schema import SceneError
 
 _SETTLE_TIME_S = 3.0
@@ -101,14 +102,14 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         config: the environment's settings.
 
     Raises:
-        ValueError: no scene, or hulls with several scenes.
+        ConfigError: no scene, or hulls with several scenes.
         SceneError: a scene whose furniture does not come to rest at finite coordinates, or a folder in
             `config.objects` that is no object.
     """
     if not scenes:
-        raise ValueError("scenes is empty, expected at least one scene folder")
+        raise ConfigError("scenes is empty, expected at least one scene folder")
     if config.physics.collision == "hulls" and len(scenes) > 1:
-        raise ValueError(
+        raise ConfigError(
             f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
             "use collision='boxes'"
         )

@@ -14,6 +14,7 @@ from interactive_nav.robots.spec import Camera
 from interactive_nav.sensing.base import CameraPose, look_along
 from interactive_nav.sensing.boxes import compose, rotate, swing
 from interactive_nav_common.config import nearest
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 
 
@@ -72,12 +73,12 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:
         camera: its body lies in the base's subtree.
 
     Raises:
-        ValueError: no such body, or one that is not part of the robot.
+        ConfigError: no such body, or one that is not part of the robot.
     """
     base, body = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in (base_body, camera.body))
     own = [model.body(b).name for b in range(model.nbody) if model.body_rootid[b] == base]
     if body < 0 or model.body_rootid[body] != base:
-        raise ValueError(
+        raise ConfigError(
             f"camera body {camera.body!r} is no body of the robot{nearest(camera.body, own)}; "
             f"its bodies: {', '.join(own)}"
         )

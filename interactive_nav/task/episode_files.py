@@ -27,7 +27,7 @@ from interactive_nav.navigation.ways import Ways
 from interactive_nav.scenes.scene import TASK_DIGEST
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import whole_file
 
 FORMAT = "interactive-nav-episodes"
@@ -69,10 +69,10 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
         seed: of the draw.
 
     Raises:
-        ValueError: fewer than one episode.
+        ConfigError: fewer than one episode.
     """
     if episodes < 1:
-        raise ValueError(f"episodes is {episodes}, expected at least 1")
+        raise ConfigError(f"episodes is {episodes}, expected at least 1")
     keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
     starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
     starts, lengths = jax.tree.map(np.asarray, (starts, lengths))

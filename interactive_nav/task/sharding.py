@@ -20,6 +20,8 @@ import numpy as np
 from brax.envs.base import Env, State, Wrapper
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from interactive_nav_common.errors import ConfigError
+
 AXIS = "i"
 """Name of the mesh's axis; Brax's own."""
 
@@ -50,10 +52,10 @@ class ShardedEnv(Wrapper):
         """[N, 2] keys to N states.
 
         Raises:
-            ValueError: N is no multiple of the number of devices.
+            ConfigError: N is no multiple of the number of devices.
         """
         if rng.shape[0] % self.num_devices:
-            raise ValueError(
+            raise ConfigError(
                 f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
                 f"take {self.num_devices * max(1, rng.shape[0] // self.num_devices)}"
             )
@@ -78,10 +80,10 @@ def start_distributed(coordinator: str, num_processes: int, process_id: int) -> 
         process_id: 0 to num_processes - 1.
 
     Raises:
-        ValueError: an impossible process id, or a coordinator without a port.
+        ConfigError: an impossible process id, or a coordinator without a port.
     """
     if not 0 <= process_id < num_processes:
-        raise ValueError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")
+        raise ConfigError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")
     if not coordinator.rpartition(":")[2].isdigit():
-        raise ValueError(f"coordinator is {coordinator!r}, expected host:port such as 10.0.0.1:1234")
+        raise ConfigError(f"coordinator is {coordinator!r}, expected host:port such as 10.0.0.1:1234")
     jax.distributed.initialize(coordinator, num_processes, process_id)

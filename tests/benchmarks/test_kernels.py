@@ -3,6 +3,7 @@
 import pytest
 
 from benchmarks.kernels import busy_share, device_events, part_of, plain_name
+from interactive_nav_common.errors import UserError
 
 
 def test_busy_is_what_the_intervals_cover():
@@ -32,5 +33,5 @@ def test_kernels_are_named_and_sorted(kernel, name, part):
 
 
 def test_a_profile_without_a_gpu_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="no kernels of a GPU"):
+    with pytest.raises(UserError, match="no kernels of a GPU"):
         device_events(tmp_path)

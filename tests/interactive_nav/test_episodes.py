@@ -16,6 +16,7 @@ import interactive_nav
 from interactive_nav import episodes
 from interactive_nav.episodes import EpisodeFileError
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import load_maps, save_maps
 
 
@@ -137,7 +138,7 @@ def test_files_that_do_not_fit_are_refused(env, made, room):
     refused("made with 3 small objects .* set num_objects=3", dataclasses.replace(made, objects_digest="x"))
     longer = ({**made.episodes[0], "shortest_path_m": 9.0}, *made.episodes[1:])
     refused("episode 0: shortest_path_m is 9.000 m", dataclasses.replace(made, episodes=longer))
-    with pytest.raises(ValueError, match="episodes is 0, expected at least 1"):
+    with pytest.raises(UserError, match="episodes is 0, expected at least 1"):
         episodes.draw(env, 0, 0)
 
 

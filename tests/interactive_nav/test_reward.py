@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.reward import interactive_navigation_reward
+from interactive_nav_common.errors import UserError
 
 
 def test_terms_and_their_sum_by_hand():
@@ -25,7 +26,7 @@ def test_jax_arrays_stay_jax_arrays():
 
 
 def test_a_negative_penalty_is_refused():
-    with pytest.raises(ValueError, match="k_int is -0.1, expected a penalty >= 0"):
+    with pytest.raises(UserError, match="k_int is -0.1, expected a penalty >= 0"):
         interactive_navigation_reward(0, 1.0, 1.0, 0, -0.1)
 
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from interactive_nav.task.env import EPISODE_METRICS
 from interactive_nav_common.config import replace
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, UserError
 from interactive_nav_common.rows import write_parquet
 from tests.train.toy_run import build_toy, toy_config
 from train import evaluate, figures
@@ -268,7 +268,7 @@ def test_a_run_folder_with_damaged_files(tmp_path):
     (tmp_path / "summary.json").write_text("[]")
     (tmp_path / "versions.json").write_text("5")
     assert folder.origin()["env_steps"] is None
-    with pytest.raises(ValueError, match="name is '..', expected one folder name"):
+    with pytest.raises(UserError, match="name is '..', expected one folder name"):
         RunConfig(name="..")
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from topological_nav.errors import RunError
 from topological_nav.learn.networks import Contrast, Network, augmented, vicreg_loss
 
 EVALUATED, DEVICE_EVALUATED = (8, 64), (16, 64, 256)
@@ -84,7 +85,7 @@ def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
     mine, theirs = learner.params["body"], donor["params"]["body"]
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (mine, theirs)]
     if shapes[0] != shapes[1]:
-        raise ValueError("its backbone differs in kind or width")
+        raise RunError("its backbone differs in kind or width")
     stats = dict(learner.batch_stats)
     if "body" in stats:
         stats["body"] = donor["batch_stats"]["body"]

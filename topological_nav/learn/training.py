@@ -351,7 +351,7 @@ def _started_from(learner: Learner, run: Path) -> Learner:
     donor = load_trained(run)
     try:
         return with_backbone(learner, donor.variables)
-    except ValueError as error:
+    except RunError as error:
         raise RunError(
             f"init: {run} does not fit: {error}; it is {donor.about['backbone']} of width {donor.about['width']}"
         ) from None

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig
 from topological_nav.errors import SpaceError
 from topological_nav.scenes.plans import RECORDED
@@ -65,12 +66,12 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
         seed: of their starts.
 
     Raises:
-        ValueError: another method, or more clusters than points.
+        ConfigError: another method, or more clusters than points.
     """
     if method not in METHODS:
-        raise ValueError(f"method is '{method}', expected one of {', '.join(METHODS)}")
+        raise ConfigError(f"method is '{method}', expected one of {', '.join(METHODS)}")
     if not 1 <= count <= len(points):
-        raise ValueError(f"count is {count}, expected between 1 and the {len(points)} points")
+        raise ConfigError(f"count is {count}, expected between 1 and the {len(points)} points")
     if count == 1:
         return np.zeros(len(points), np.int32)
     with threadpool_limits(1):  # on problems this small, threads cost more than they give

@@ -24,6 +24,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.networks import FeedForwardNetwork
 from flax import linen
 
+from interactive_nav_common.errors import ConfigError
 from train.config import NetworkConfig
 
 ObservationSize = int | Mapping[str, tuple[int, ...]]
@@ -150,14 +151,14 @@ class TwinHead(linen.Module):
 
 
 def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
-    """Raises ValueError where the images are too small for the convolutions."""
+    """Raises ConfigError where the images are too small for the convolutions."""
     sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)} if isinstance(size, Mapping) else ()
     for side in sides:
         left = side
         for kernel, stride in zip(config.conv_kernels, config.conv_strides, strict=True):
             left = (left - kernel) // stride + 1
         if left < 1:
-            raise ValueError(
+            raise ConfigError(
                 f"images of {side} x {side} pixels are too small for kernels {config.conv_kernels} with strides "
                 f"{config.conv_strides}; expected larger images (env.image_size) or smaller kernels (network)"
             )
@@ -176,12 +177,12 @@ def make_encoder(
     """What comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F].
 
     Raises:
-        ValueError: images too small for the convolutions, or nothing to encode.
+        ConfigError: images too small for the convolutions, or nothing to encode.
     """
     assert isinstance(size, Mapping)
     check_image_size(config, size)
     if not images and "state" not in size:
-        raise ValueError(
+        raise ConfigError(
             "network.critic_inputs is 'state', but the observation holds images only; expected 'all', or "
             "observations with a vector (env.observations=waypoints,goal,velocity,depth,...)"
         )
@@ -281,7 +282,7 @@ def make_ppo_networks(
         normalize_observations: whether the vector is normalised.
 
     Raises:
-        ValueError: see `make_encoder`.
+        ConfigError: see `make_encoder`.
     """
     prepare = preprocess(normalize_observations)
     if not isinstance(size, Mapping):

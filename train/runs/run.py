@@ -49,7 +49,7 @@ def make_env(config: EnvConfig) -> Any:
     """
     try:
         return interactive_nav.make(**flatten(config))
-    except ValueError as error:  # an unknown robot, an unusable scene, settings that exclude each other
+    except UserError as error:  # an unknown robot, an unusable scene, settings that exclude each other
         raise ConfigError(f"env: {error}") from error
 
 
@@ -77,7 +77,7 @@ def config_to_play(
     if not any(word.startswith("env.backend=") for word in words):
         try:
             resolve_backend(env.backend)
-        except ValueError:
+        except ConfigError:
             there = resolve_backend("auto")
             told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(told, highlight=False, soft_wrap=True)

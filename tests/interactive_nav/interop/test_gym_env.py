@@ -14,7 +14,7 @@ import interactive_nav
 from interactive_nav.interop import gym_env
 from interactive_nav.interop.gym_env import InteractiveNavVectorEnv, env_id
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, UserError
 
 ID = "InteractiveNav-TurtleBot-v0"
 N, STEPS = 3, 9
@@ -201,18 +201,18 @@ def test_wrong_use_is_refused_in_one_line(settings, same_step):
         ({"arrays": "tensors"}, "arrays is 'tensors', expected one of numpy, jax, torch"),
         ({"autoreset_mode": "Later"}, "Later"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(UserError, match=message):
             InteractiveNavVectorEnv("turtlebot", **{"num_envs": N, **settings, **wrong})
     for options, message in (
         ({"episode": 3}, "'episode' is unknown; known options: reset_mask, start"),
         ({"reset_mask": np.zeros(N, bool)}, "with 0 set"),
         ({"reset_mask": np.ones(N)}, "reset_mask is float64"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(UserError, match=message):
             same_step.reset(options=options)
-    with pytest.raises(ValueError, match="seed has 2 entries"):
+    with pytest.raises(UserError, match="seed has 2 entries"):
         same_step.reset(seed=[1, 2])
-    with pytest.raises(ValueError, match="did you mean 'k_int'"):
+    with pytest.raises(UserError, match="did you mean 'k_int'"):
         gymnasium.make(ID, **settings, kint=0.1)
     fresh = InteractiveNavVectorEnv.__new__(InteractiveNavVectorEnv)
     fresh.__dict__.update(same_step.__dict__, _state=None)

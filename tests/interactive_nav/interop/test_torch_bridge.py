@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
+from interactive_nav_common.errors import UserError
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 
@@ -36,7 +37,7 @@ def test_trees_keep_their_structure():
 
 
 def test_a_tensor_with_a_gradient_is_refused():
-    with pytest.raises(ValueError, match=r"shape \(2,\) requires a gradient, expected a detached one"):
+    with pytest.raises(UserError, match=r"shape \(2,\) requires a gradient, expected a detached one"):
         to_jax(torch.ones(2, requires_grad=True))
 
 

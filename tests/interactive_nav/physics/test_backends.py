@@ -21,6 +21,7 @@ from interactive_nav.scenes.contacts import combine
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
@@ -303,7 +304,7 @@ def test_upstream_mjx_jax_still_damps_a_saturated_motor():
 
 def test_warp_is_refused_with_the_remedy_where_it_is_missing(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="install the gpu extra"):
+    with pytest.raises(UserError, match="install the gpu extra"):
         resolve_backend("warp")
     assert "turtlebot" in interactive_nav.robot_names()
 

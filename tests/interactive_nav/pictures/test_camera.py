@@ -19,6 +19,7 @@ from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav.sensing.rays import RayRenderer
 from interactive_nav.sensing.sensors import Sensors
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import SEGMENTATIONS
 from tests.toys import write_room
 
@@ -100,14 +101,14 @@ def test_the_follower_sees_the_robot(scene_and_state):
 def test_what_cannot_be_drawn_is_refused(scene_and_state):
     env, state = scene_and_state
     camera = Camera(env, "rays")
-    with pytest.raises(ValueError, match="engine is 'opengl', expected one of auto, gl, warp, rays"):
+    with pytest.raises(UserError, match="engine is 'opengl', expected one of auto, gl, warp, rays"):
         Camera(env, "opengl")
-    with pytest.raises(ValueError, match="streams is .*, expected a choice from rgb, normals, depth, segmentation"):
+    with pytest.raises(UserError, match="streams is .*, expected a choice from rgb, normals, depth, segmentation"):
         camera.frame(state, streams=("colour",))
-    with pytest.raises(ValueError, match="view is 'side', expected one of robot, top, follow"):
+    with pytest.raises(UserError, match="view is 'side', expected one of robot, top, follow"):
         camera.frame(state, view="side")
     batch = types.SimpleNamespace(pipeline_state=types.SimpleNamespace(qpos=np.zeros((3, 9))), info=state.info)
-    with pytest.raises(ValueError, match=r"state is a batch of shape \(3,\), expected one environment"):
+    with pytest.raises(UserError, match=r"state is a batch of shape \(3,\), expected one environment"):
         camera.frame(batch)
 
 

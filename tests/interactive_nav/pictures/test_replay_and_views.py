@@ -34,6 +34,7 @@ from interactive_nav.pictures.views import (
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import CATEGORIES, SEGMENTATIONS, class_id
 
@@ -93,7 +94,7 @@ def test_a_planner_on_the_host_sees_the_state_and_the_step(env):
     assert asked == [(2, t, [t]) for t in range(run.num_steps)]
     np.testing.assert_allclose(run.action, 0.4)
     assert np.linalg.norm(run.robot_xy_w[10] - run.robot_xy_w[0]) > 0.1
-    with pytest.raises(ValueError, match="expected exactly one of them"):
+    with pytest.raises(UserError, match="expected exactly one of them"):
         Player(env)
 
 
@@ -226,7 +227,7 @@ print(matplotlib.get_backend(), pyplot.get_fignums())
 
 
 def test_a_body_that_is_not_there_is_refused(view):
-    with pytest.raises(ValueError, match="no body 'lamp_0' in this scene with robot 'turtlebot'"):
+    with pytest.raises(UserError, match="no body 'lamp_0' in this scene with robot 'turtlebot'"):
         view.place(("lamp_0",), np.zeros((1, 3)), np.array([IDENTITY]))
 
 
@@ -317,7 +318,7 @@ def test_a_map_shows_what_was_moved(played, room, tmp_path):
     assert topdown.main([str(tmp_path), "-o", str(tmp_path / "map.png")]) == 0
     with Image.open(tmp_path / "map.png") as picture:
         assert picture.size[0] > 500
-    with pytest.raises(ValueError, match="colour_by is 'speed', expected one of time, contact"):
+    with pytest.raises(UserError, match="colour_by is 'speed', expected one of time, contact"):
         topdown.draw(axis, played, scene, "speed")
 
 
@@ -331,5 +332,5 @@ def test_gymnasium_renders_the_view_from_behind(room):
     # The robot stands before the camera: its dark body is in the middle column.
     assert frame[150:260, 200:280].min() < 60
     assert yaw_from_quat(np.array([math.cos(0.4), 0, 0, math.sin(0.4)])) == pytest.approx(0.8)
-    with pytest.raises(ValueError, match="render_mode is 'human', expected one of rgb_array"):
+    with pytest.raises(UserError, match="render_mode is 'human', expected one of rgb_array"):
         gym_env.InteractiveNavEnv("turtlebot", [str(room)], **{**settings, "render_mode": "human"})

@@ -12,6 +12,7 @@ import pytest
 from interactive_nav import robots
 from interactive_nav.robot_study import evidence
 from interactive_nav.robot_study.picture import stage
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
 DOC = Path(__file__).parents[3] / "docs" / "add-a-robot.md"
@@ -162,7 +163,7 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
     ],
 )
 def test_what_cannot_be_used_is_refused_with_the_remedy(tmp_path, text, settings, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         _from_file(_write(tmp_path, text), **{**PORTER, **settings})
 
 
@@ -174,10 +175,10 @@ def test_torque_limits_complete_a_file(tmp_path):
 
 
 def test_a_missing_file_and_a_taken_name_are_refused(tmp_path, registry):
-    with pytest.raises(ValueError, match="does not exist"):
+    with pytest.raises(UserError, match="does not exist"):
         _from_file(tmp_path / "none.urdf", **PORTER)
-    with pytest.raises(ValueError, match="exists already"):
+    with pytest.raises(UserError, match="exists already"):
         robots.register("fetch", lambda mode: robots.get_robot("fetch", mode))
     factory = _from_file(_write(tmp_path, URDF), **PORTER)
-    with pytest.raises(ValueError, match="is called 'porter', expected 'other'"):
+    with pytest.raises(UserError, match="is called 'porter', expected 'other'"):
         robots.register("other", factory)

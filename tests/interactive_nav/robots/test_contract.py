@@ -7,6 +7,7 @@ import pytest
 
 import interactive_nav
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
 ENVS, STEPS = 2, 3
@@ -79,5 +80,5 @@ def test_every_mode_of_every_robot_maps_actions_to_its_actuators(name):
 
 
 def test_an_unknown_robot_is_answered_with_the_list():
-    with pytest.raises(ValueError, match="did you mean 'fetch'.*known robots: .*fetch.*turtlebot"):
+    with pytest.raises(UserError, match="did you mean 'fetch'.*known robots: .*fetch.*turtlebot"):
         interactive_nav.make("fetsch", ["nowhere"])

@@ -11,6 +11,7 @@ import pytest
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.gait import Legged, base_motion, gait_law
 from interactive_nav.robots.spec import RobotState
+from interactive_nav_common.errors import UserError
 from tests.interactive_nav.robots.motion import extents, hall_world, home_data, move, plain_model, schedule
 
 LEGGED = ("ant", "humanoid", "minitaur")
@@ -266,5 +267,5 @@ def test_a_gait_asks_alike_on_host_and_device_and_within_the_ranges(name):
 
 def test_unknown_modes_are_answered_with_the_list():
     for name in (*LEGGED, "quadrotor"):
-        with pytest.raises(ValueError, match=f"'{name}' has no control mode 'hop'; it has native, "):
+        with pytest.raises(UserError, match=f"'{name}' has no control mode 'hop'; it has native, "):
             get_robot(name, "hop")

@@ -14,6 +14,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
 
@@ -61,7 +62,7 @@ def test_unknown_control_mode_lists_the_known_ones():
 
 
 def test_a_robot_without_twist_cannot_be_driven():
-    with pytest.raises(ValueError, match="takes no base velocity"):
+    with pytest.raises(UserError, match="takes no base velocity"):
         dataclasses.replace(get_robot("turtlebot"), twist=None).drive(np.float64(0.1), np.float64(0.0))
 
 

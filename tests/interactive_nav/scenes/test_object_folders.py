@@ -18,6 +18,7 @@ from interactive_nav.pictures.replay import Player, load, save
 from interactive_nav.scenes.object_folders import load_object, small_objects
 from interactive_nav.scenes.objects import Box, pick
 from interactive_nav.topdown import outlines
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import SceneError
 
 
@@ -105,9 +106,9 @@ def test_replays_draw_the_objects(env, tmp_path):
 
 
 def test_refusals(tmp_path, folders):
-    with pytest.raises(ValueError, match=r"objects is 'a/b', expected a list of object folders; write \['a/b'\]"):
+    with pytest.raises(UserError, match=r"objects is 'a/b', expected a list of object folders; write \['a/b'\]"):
         make_config(objects="a/b")
-    with pytest.raises(ValueError, match="small_objects is 'test', expected train, its default"):
+    with pytest.raises(UserError, match="small_objects is 'test', expected train, its default"):
         make_config(objects=folders, small_objects="test")
     with pytest.raises(SceneError, match="is no usable object .*made by 'python -m converters object'"):
         load_object(tmp_path)

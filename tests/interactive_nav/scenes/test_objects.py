@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.scenes.objects import KINDS, MODELS, add_shapes, pick
+from interactive_nav_common.errors import UserError
 
 ALL = [o for kinds in MODELS.values() for models in kinds.values() for o in models]
 
@@ -46,7 +47,7 @@ def test_variants_go_through_all_training_models():
      ((3, "train", -2), "variant is -2")],
 )  # fmt: skip
 def test_refusals(arguments, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         pick(*arguments)
 
 

@@ -14,6 +14,7 @@ from interactive_nav.scenes import objects
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.spec import FEET, foot_points
 from interactive_nav.scenes.world import build_world
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import SceneError, load_maps, save_maps
 from tests.toys import write_room
 
@@ -106,15 +107,15 @@ def test_small_objects_are_of_four_kinds_with_real_masses():
     ten = objects.pick(10)
     assert [sum(o.category == k for o in ten) for k in ("basket", "shoe", "pot", "toy")] == [3, 3, 2, 2]
     assert all(0.2 < o.mass_kg < 2.0 and 0.09 < o.radius_m < 0.25 for o in ten)
-    with pytest.raises(ValueError, match="num_objects is -1"):
+    with pytest.raises(UserError, match="num_objects is -1"):
         objects.pick(-1)
 
 
 def test_hulls_take_one_scene_only(room, two_rooms):
     scenes = (load_scene(room), load_scene(two_rooms))
-    with pytest.raises(ValueError, match="collision='hulls' with 2 scenes"):
+    with pytest.raises(UserError, match="collision='hulls' with 2 scenes"):
         build_world(get_robot("turtlebot"), scenes, NavConfig.of(collision="hulls"))
-    with pytest.raises(ValueError, match="scenes is empty"):
+    with pytest.raises(UserError, match="scenes is empty"):
         build_world(get_robot("turtlebot"), (), NavConfig())
 
 

@@ -11,6 +11,7 @@ from interactive_nav.scenes.objects import pick
 from interactive_nav.sensing.base import look_along
 from interactive_nav.sensing.boxes import box_poses
 from interactive_nav.sensing.mount import make_mount
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import OBJECT_CATEGORIES, SEGMENTATIONS, class_id
 
 
@@ -20,7 +21,7 @@ def test_class_ids_are_the_originals(world, boxes):
     assert class_id("desk", 5) == 11 and class_id("table", 5) == 4
     first = [int(boxes.class_id[0, np.flatnonzero(boxes.body == m)[0]]) for m in range(4)]
     assert first == [6, 10, 7, 9]
-    with pytest.raises(ValueError, match="category 'char' has no segmentation id, did you mean 'chair'"):
+    with pytest.raises(UserError, match="category 'char' has no segmentation id, did you mean 'chair'"):
         class_id("char")
     walls = boxes.body == len(world.layout.slot_qpos)
     assert (np.asarray(boxes.class_id)[:, walls] == 0).all()
@@ -98,9 +99,9 @@ def test_a_camera_on_a_jointed_head_is_where_c_mujoco_has_it():
 
 def test_a_camera_on_no_body_of_the_robot_is_refused():
     model = mujoco.MjModel.from_xml_string(ARM)
-    with pytest.raises(ValueError, match="camera body 'hed' is no body of the robot, did you mean 'head'"):
+    with pytest.raises(UserError, match="camera body 'hed' is no body of the robot, did you mean 'head'"):
         make_mount(model, "base", Camera("hed", (0, 0, 0)))
-    with pytest.raises(ValueError, match="camera body 'other'"):
+    with pytest.raises(UserError, match="camera body 'other'"):
         make_mount(model, "base", Camera("other", (0, 0, 0)))
 
 

@@ -20,6 +20,7 @@ from interactive_nav.sensing.observation import advance_odometry
 from interactive_nav.sensing.sensors import Sensors, stream
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import NavInfo
+from interactive_nav_common.errors import UserError
 
 YAW = 0.3
 ALL = ("goal", "velocity", "waypoints", "localisation", "odometry", "collision", "joints", "lidar")
@@ -191,7 +192,7 @@ def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
     ],
 )
 def test_bad_settings_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         NavConfig.of(**settings)
 
 

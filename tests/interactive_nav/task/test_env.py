@@ -9,6 +9,7 @@ import interactive_nav
 from interactive_nav import metrics
 from interactive_nav.task.env import EPISODE_METRICS, SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common.errors import UserError
 
 N = 6
 
@@ -298,12 +299,12 @@ def test_observation_parts_can_be_chosen(room):
     ],
 )
 def test_bad_settings_are_refused(room, settings, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         interactive_nav.make("turtlebot", [room], **settings)
 
 
 def test_unknown_robot_lists_the_known_ones(room):
-    with pytest.raises(ValueError, match="unknown robot 'turtlbot', did you mean 'turtlebot'"):
+    with pytest.raises(UserError, match="unknown robot 'turtlbot', did you mean 'turtlebot'"):
         interactive_nav.make("turtlbot", [room])
-    with pytest.raises(ValueError, match="expected a list of scene folders"):
+    with pytest.raises(UserError, match="expected a list of scene folders"):
         interactive_nav.make("turtlebot", str(room))

@@ -17,7 +17,7 @@ from interactive_nav.task.env import SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.config import replace
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
 from tests.toys import write_room
 
@@ -96,7 +96,7 @@ def test_the_original_code_at_once():
     changed = {k: getattr(config, k) for k in ORIGINAL_CODE}
     assert changed == {**ORIGINAL_CODE, "episode_steps": 200}
     assert ORIGINAL_CODE["episode_steps"] == 500 and not config.bootstrap_at_time_limit
-    with pytest.raises(ValueError, match="variant is 'codes', expected one of paper, code"):
+    with pytest.raises(UserError, match="variant is 'codes', expected one of paper, code"):
         make_config(variant="codes")
     assert make_config() == make_config(variant="paper")
 
@@ -106,7 +106,7 @@ def test_the_original_code_at_once():
     ["interaction_with", "kinematic_sum", "force_part", "force_sum", "robot_mass", "waypoint_style", "scene_choice"],
 )
 def test_a_word_that_is_no_choice_is_refused(setting):
-    with pytest.raises(ValueError, match=f"{setting} is 'nonsense', expected one of "):
+    with pytest.raises(UserError, match=f"{setting} is 'nonsense', expected one of "):
         make_config(**{setting: "nonsense"})
 
 

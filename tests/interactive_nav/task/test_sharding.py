@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.task.sharding import ShardedEnv, start_distributed
+from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
 ROOT = Path(__file__).parents[3]
@@ -144,12 +145,12 @@ def test_a_batch_that_does_not_divide_is_refused():
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
     np.testing.assert_array_equal(sharded.reset(keys), keys)
     sharded.mesh = type("Mesh", (), {"size": 2})()
-    with pytest.raises(ValueError, match="3 environments over 2 devices, expected a multiple: take 2"):
+    with pytest.raises(UserError, match="3 environments over 2 devices, expected a multiple: take 2"):
         sharded.reset(keys)
 
 
 def test_impossible_processes_are_refused():
-    with pytest.raises(ValueError, match="process_id is 2, expected 0 to 1"):
+    with pytest.raises(UserError, match="process_id is 2, expected 0 to 1"):
         start_distributed("localhost:1234", 2, 2)
-    with pytest.raises(ValueError, match="expected host:port"):
+    with pytest.raises(UserError, match="expected host:port"):
         start_distributed("localhost", 2, 0)

@@ -9,6 +9,7 @@ from sklearn.metrics import adjusted_rand_score
 from converters.generate import design_building
 from converters.recipes import load_recipes
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import UserError
 from topological_nav.scenes import rooms
 from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.space import free_space
@@ -44,9 +45,9 @@ def test_the_number_of_squares_is_chosen():
 
 
 def test_wrong_requests_are_refused():
-    with pytest.raises(ValueError, match="method is 'dbscan', expected one of kmeans, gmm, spectral"):
+    with pytest.raises(UserError, match="method is 'dbscan', expected one of kmeans, gmm, spectral"):
         rooms.cluster(np.zeros((5, 2)), "dbscan", 2, 0)
-    with pytest.raises(ValueError, match="count is 6, expected between 1 and the 5 points"):
+    with pytest.raises(UserError, match="count is 6, expected between 1 and the 5 points"):
         rooms.cluster(np.zeros((5, 2)), "gmm", 6, 0)
 
 

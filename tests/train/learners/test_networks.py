@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from brax.training.agents.ppo import losses as ppo_losses
 
+from interactive_nav_common.errors import UserError
 from tests.train.learners.test_ppo import Recorder
 from tests.train.toy_env import ToyConfig, batched
 from tests.train.toy_pixels import SIDE, SMALL, ToyPixels
@@ -106,15 +107,15 @@ def test_an_action_reaches_both_critics():
     ],
 )
 def test_impossible_encoders_are_refused(settings, told):
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(UserError, match=told):
         NetworkConfig(**settings)
 
 
 def test_images_too_small_for_the_kernels_are_refused():
-    with pytest.raises(ValueError, match=r"12 x 12 pixels are too small for kernels \(8, 4, 3\)"):
+    with pytest.raises(UserError, match=r"12 x 12 pixels are too small for kernels \(8, 4, 3\)"):
         make(NetworkConfig())
     images = {name: shape for name, shape in TINY.items() if name != "state"}
-    with pytest.raises(ValueError, match="images only"):
+    with pytest.raises(UserError, match="images only"):
         make(dataclasses.replace(SMALL, critic_inputs="state"), images)
 
 
