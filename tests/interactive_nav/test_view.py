@@ -49,7 +49,7 @@ def test_without_a_display_and_mjviser_the_command_says_so_in_one_line(room, mon
     assert view.main([str(room), "--objects", "2"]) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert error == [
-        "error: no screen to open a window on, and mjviser is not installed; "
+        "interactive_nav.view: no screen to open a window on, and mjviser is not installed; "
         "'pip install mjviser' shows the scene in a browser"
     ]
 

@@ -199,10 +199,11 @@ def test_wrong_use_is_refused_in_one_line(settings, same_step):
     for wrong, message in (
         ({"num_envs": 0}, "num_envs is 0, expected at least 1"),
         ({"arrays": "tensors"}, "arrays is 'tensors', expected one of numpy, jax, torch"),
-        ({"autoreset_mode": "Later"}, "Later"),
     ):
         with pytest.raises(UserError, match=message):
             InteractiveNavVectorEnv("turtlebot", **{"num_envs": N, **settings, **wrong})
+    with pytest.raises(ValueError, match="'Later' is not a valid AutoresetMode"):  # Gymnasium's own
+        InteractiveNavVectorEnv("turtlebot", num_envs=N, **settings, autoreset_mode="Later")
     for options, message in (
         ({"episode": 3}, "'episode' is unknown; known options: reset_mask, start"),
         ({"reset_mask": np.zeros(N, bool)}, "with 0 set"),

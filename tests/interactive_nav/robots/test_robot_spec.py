@@ -55,9 +55,7 @@ def test_twist_mode_makes_the_same_wheel_speeds():
 
 
 def test_unknown_control_mode_lists_the_known_ones():
-    with pytest.raises(
-        ValueError, match="no control mode 'sideways'; it has native, twist, velocity, position, torque"
-    ):
+    with pytest.raises(UserError, match="no control mode 'sideways'; it has native, twist, velocity, position, torque"):
         get_robot("turtlebot", "sideways")
 
 
