@@ -27,7 +27,7 @@ from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.records.errors import StageFailed
 from converters.sets import Runner, run_side_by_side
 from interactive_nav_common.errors import ConfigError, FileError, UserError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.rows import write_parquet
 
 ROWS = "conversions.parquet"
@@ -122,7 +122,8 @@ def _named(sources: Sequence[Path]) -> dict[str, Path]:
         else os.path.abspath(source).rpartition(os.sep)[2]
         for source in sources
     ]
-    for name in names:
+    for name, source in zip(names, sources, strict=True):
+        check_name(name, f"--into: the name of {source}", ConfigError)
         if names.count(name) > 1:
             raise ConfigError(f"--into: two sources are named {name}, expected one; rename a folder")
     return dict(zip(names, sources, strict=True))

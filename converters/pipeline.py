@@ -42,7 +42,7 @@ from converters.structure.walls import wall_boxes
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest
 from converters.write.texture import bake_object, bake_structure, colour_cloud
-from interactive_nav_common.files import part_folder, publish
+from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
@@ -337,6 +337,7 @@ def _convert(
     warn: Callable[[str], None] | None = None,
 ) -> tuple[Converted, ...]:
     clock = Clock(report or (lambda stage, share: None))
+    check_name(target.name, f"{target}: the scene's name")
     with contextlib.ExitStack() as stack:
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(part_folder(target, config.overwrite))

@@ -20,7 +20,7 @@ from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_c
 from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, convert
 from interactive_nav_common.config import nearest
-from interactive_nav_common.files import part_folder, publish
+from interactive_nav_common.files import check_name, part_folder, publish
 
 MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
 """Split -> CAD models of sparse buildings: held-out models are held out here."""
@@ -166,7 +166,7 @@ def parse_recipes(data: Any, where: str) -> Recipes:
     check_conversion(conversion, f"{where}: conversion")
     scenes = []
     for name, recipe in data["scenes"].items():
-        here = f"{where}: scenes: {name}"
+        here = f"{where}: scenes: {check_name(str(name), f'{where}: scenes: a name', GenerationError)}"
         if not isinstance(recipe, dict):
             raise GenerationError(f"{here}: got {recipe!r}, expected a mapping with split, seed and building")
         _refuse_unknown(recipe, ("split", "seed", "tier", "building"), here)

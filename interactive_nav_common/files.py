@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, UserError
 from interactive_nav_common.locks import is_locked, release, take_lock
 from interactive_nav_common.signals import signals_wait
 
@@ -24,6 +24,24 @@ STALE_S = 1.0
 """Something unfinished younger than this may be what its maker has not locked yet."""
 PARTIAL = ".partial-"
 """Begins the names of unfinished files."""
+LONGEST_NAME = 100
+"""Bytes of a name: file systems take 255, and names of our files add to it."""
+
+
+def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
+    """A name that comes from a file or a user and becomes one part of a path.
+
+    Raises:
+        UserError: of the kind `error`; it is no such name, or would lead elsewhere.
+    """
+    good = name.isprintable() and name[:1] not in ("", ".") and not set("/\\") & set(name)
+    if not good or len(name.encode()) > LONGEST_NAME:
+        shown = repr(name if len(name) <= 40 else f"{name[:37]}...")
+        raise error(
+            f"{what} is {shown}, expected one folder name: at most {LONGEST_NAME} printable letters, no '/' or "
+            "'\\', not beginning with '.'"
+        )
+    return name
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ import numpy as np
 
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.files import check_name
 from scenes_mjcf.categories import OBJECT_CATEGORIES
 
 SCHEMA_VERSION = 1
@@ -132,6 +133,7 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
             non-positive mass or friction.
     """
     data = dict(known_keys(data, SceneManifest, where))
+    check_name(data["name"], f"{where}: name", SceneError)
     if data.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
         raise SceneError(
             f"{where}: schema_version is {data['schema_version']}, expected {SCHEMA_VERSION}; convert the scene again"

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import check_name, write_text
 from scenes_mjcf.schema import SPLITS, SceneError, known_keys, load_maps
 
 FILE = "set.json"
@@ -91,6 +91,7 @@ def read_set(path: Path) -> SceneSet:
     data = dict(known_keys(data, SceneSet, str(path)))
     members = {}
     for name, raw in data["scenes"].items():
+        check_name(name, f"{path}: scenes: a name", SceneError)
         members[name] = Member(**known_keys(raw, Member, f"{path}: scenes: {name}"))
         if members[name].split not in SPLITS:
             raise SceneError(

@@ -28,6 +28,7 @@ def test_round_trip(room, tmp_path):
         (lambda d: d["objects"][0].update(category="lamp"), "category is 'lamp', expected one of chair"),
         (lambda d: d["objects"][0].update(mass_kg=0), "mass_kg is 0, expected a positive number"),
         (lambda d: d["objects"].append(d["objects"][0]), "two objects share a name"),
+        (lambda d: d.update(name="/tmp"), "scene.json: name is '/tmp', expected one folder name"),
         (lambda d: d.update(schema_version=9), "schema_version is 9, expected 1"),
         (lambda d: d.update(objects=None), "objects is null, expected a list"),
         (lambda d: d.update(objects=[1, 2]), r"objects.0.: got int, expected a JSON object"),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from interactive_nav.config import PhysicsConfig, SensorConfig, TaskRules
 from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, flat, replace
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import check_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,8 +226,8 @@ class RunConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.name != Path(self.name).name or self.name == "..":
-            raise ConfigError(f"name is {self.name!r}, expected one folder name (out_dir says where it lies)")
+        if self.name:
+            check_name(self.name, "name", ConfigError)
         if self.checkpoint_every_steps < self.log_every_steps:
             raise ConfigError(
                 f"checkpoint_every_steps is {self.checkpoint_every_steps}, "

@@ -6,7 +6,6 @@ each model's `trs` CAD -> world, and both keypoint sets stand in that world (the
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder
 from converters.records.errors import SceneRejected
 from converters.records.raw import SYNSETS, Annotation, CadModel, Hinge
+from interactive_nav_common.files import check_name
 
-CAD_ID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
-"""Ids become paths: nothing that could leave the library's folder."""
 OUTSIDE_M = 0.5
 """An object this far from everything scanned stands outside the scan."""
 
@@ -87,8 +85,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
             if synset not in SYNSETS:
                 known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
                 raise SceneRejected(f"{where}: category id is {synset}, expected one of {known}")
-            if not CAD_ID.fullmatch(cad_id):
-                raise SceneRejected(f"{where}: id_cad is {cad_id!r}, expected letters, digits, '_', '-' and '.'")
+            check_name(cad_id, f"{where}: id_cad", SceneRejected)
             pose_y_up = trs_matrix(model["trs"])
             if abs(np.linalg.det(pose_y_up)) < 1e-9:
                 raise SceneRejected(f"{where}: the scale is {model['trs']['scale']}, expected three non-zero numbers")

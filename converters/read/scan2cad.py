@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.read.annotations import CAD_ID, inside_scan, parse_annotations
+from converters.read.annotations import inside_scan, parse_annotations
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder, read_json, read_mesh, vertex_colours
 from converters.read.surfaces import check_upright
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene, ScanMesh
+from interactive_nav_common.files import check_name
 
 ANNOTATION = "full_annotations.json"
 LICENCE = "ScanNet terms of use and ShapeNet terms of use: research only, no redistribution"
@@ -35,8 +36,7 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
     source = SourceFolder(root, strict)
     path = source.use(ANNOTATION, "expected Scan2CAD's annotation of one scan beside scan/ and cad/")
     scan_id, records = parse_annotations(read_json(path), path)
-    if not CAD_ID.fullmatch(scan_id):
-        raise SceneRejected(f"{path}: id_scan is {scan_id!r}, expected letters, digits, '_', '-' and '.'")
+    check_name(scan_id, f"{path}: id_scan", SceneRejected)
     stem = f"scan/{scan_id}_vh_clean_2"
     mesh = read_mesh(source.use(f"{stem}.ply", f"expected ScanNet's reconstruction of {scan_id}"))
     label_path = source.use(f"{stem}.labels.ply", f"expected ScanNet's per-vertex labels of {scan_id}")

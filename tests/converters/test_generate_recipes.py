@@ -104,6 +104,19 @@ def test_bad_recipes_are_named(change, message):
         parse_recipes(data, "x")
 
 
+@pytest.mark.parametrize("name", ["../victim", ".", "..", "/{0}/victim", "", ".recipes", "a\\\\\\\\b", "n" * 101])
+def test_a_name_that_leads_elsewhere_removes_nothing(tmp_path, capsys, name):
+    out, name = tmp_path / "out", name.replace("/{0}", str(tmp_path))
+    for kept in (out / "other" / "scene.json", tmp_path / "victim" / "scene.json"):
+        kept.parent.mkdir(parents=True)
+        kept.write_text("mine")
+    (out / "recipes.yaml").write_text(f'scenes: {{"{name}": {{split: train, seed: 1}}}}')
+    before = digest(tmp_path)
+    assert main(["generate-scenes", str(out), "--overwrite", "--recipes", str(out / "recipes.yaml")]) == 2
+    assert "scenes: a name is '" in (told := capsys.readouterr().err) and "expected one folder name" in told
+    assert digest(tmp_path) == before
+
+
 def test_a_home_without_a_plan_takes_the_next_of_its_seeds(tmp_path, monkeypatch):
     tried: list[int] = []
 

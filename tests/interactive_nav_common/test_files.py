@@ -12,6 +12,7 @@ import pytest
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import (
+    check_name,
     part_folder,
     publish,
     remove_partial,
@@ -28,6 +29,16 @@ def interruptible():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", ".a", "a/b", "a\\b", "/", "a\0b", "a\nb", "é" * 51])
+def test_what_is_no_single_part_of_a_path_is_no_name(name):
+    with pytest.raises(FileError, match=r"^x: name is .*expected one folder name.*$"):
+        check_name(name, "x: name")
+
+
+def test_other_names_are_names():
+    assert [check_name(n, "") for n in ("a..b", "two words", "é" * 50, "-1")] == ["a..b", "two words", "é" * 50, "-1"]
 
 
 def test_publishing_is_all_or_nothing(tmp_path, monkeypatch):

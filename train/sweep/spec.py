@@ -24,6 +24,7 @@ from interactive_nav_common.config import (
     settings_help,
 )
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import check_name
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import TrainConfig, validate
@@ -161,8 +162,7 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
         ConfigError: an unknown key, a wrong type or a value out of range.
     """
     config = overlay(SweepConfig(), plain, where)
-    if config.name != Path(config.name).name or config.name == "..":
-        raise ConfigError(f"{where}: name is {config.name!r}, expected one folder name (out_dir says where it lies)")
+    check_name(config.name or default_name, f"{where}: name", ConfigError)
     if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
     evaluate = dataclasses.replace(config.evaluate, scenes=scene_folders(config.evaluate.scenes))

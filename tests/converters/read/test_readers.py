@@ -274,7 +274,7 @@ def test_a_y_up_mesh_given_as_z_up(gibson_raw):
 
 def test_ids_cannot_leave_the_library(gibson_raw):
     edit_json(gibson_raw / "alignments.json", lambda d: d[0]["aligned_models"][0].update(id_cad="../../../etc"))
-    refused(read_gibson, gibson_raw, "id_cad is '../../../etc'", "expected letters")
+    refused(read_gibson, gibson_raw, "id_cad is '../../../etc'", "expected one folder name")
 
 
 @pytest.mark.parametrize("keep", [0, 200, 5000])
