@@ -56,9 +56,12 @@ def release(descriptor: int | None) -> None:
 
 def is_locked(path: Path) -> bool:
     """Whether somebody holds a lock for itself; asking does not take it."""
-    if not path.exists():
+    try:
+        descriptor = _open(path, os.O_RDONLY)
+    except FileError:
+        if path.exists():
+            raise
         return False
-    descriptor = _open(path, os.O_RDONLY)
     try:
         return not _flock(descriptor, path, fcntl.LOCK_SH)
     finally:

@@ -84,7 +84,14 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
 
 def list_checkpoints(root: Path) -> list[CheckpointMeta]:
     """All whole checkpoints, oldest first."""
-    return [read_meta(path) for path in sorted(root.glob("[0-9]*")) if (path / META).is_file()]
+    found = []
+    for path in sorted(root.glob("[0-9]*")):
+        try:
+            found.append(read_meta(path))
+        except CheckpointError:
+            if (path / META).is_file():  # else it went meanwhile
+                raise
+    return found
 
 
 def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:

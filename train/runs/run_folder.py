@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -134,9 +135,8 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
     needed_mb += HEADROOM_MB
     with writing(path, "expected a writable folder (run.out_dir)"):
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".write-probe"
-        probe.write_bytes(bytes(1 << 16))
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=path) as probe:  # of no fixed name: many may claim one folder at once
+            probe.write(bytes(1 << 16))
         free_mb = shutil.disk_usage(path).free / 1e6
     if free_mb < needed_mb:
         raise FileError(

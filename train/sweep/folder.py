@@ -91,19 +91,27 @@ class SweepFolder:
         metrics = last_line(folder.metrics)
         origin = folder.origin()
         steps, total = int(metrics.get("env_steps", 0)), run.config.run.num_timesteps
-        failed = self.root / "failed" / f"{run.name}.json"
+        failed = self._failure(run.name)
         over = bool(origin["completed"]) and (origin["env_steps"] or 0) >= total
         if is_locked(self.lock(run.name)):
             state = "running"
         elif over:
             state = "done" if self.evaluated(run) else "trained"
             steps = origin["env_steps"]
-        elif failed.is_file():
+        elif failed:
             state = "failed"
         else:
             state = "stopped" if steps else "waiting"
-        reason = json.loads(failed.read_text())["reason"] if failed.is_file() and state != "done" else ""
+        reason = "" if state == "done" else failed
         return RunState(run.name, state, steps, max(total, steps), metrics, reason, over)
+
+    def _failure(self, run: str) -> str:
+        """Why a run was given up; empty where it was not. Read once: another sweep may try the run again meanwhile."""
+        path = self.root / "failed" / f"{run}.json"
+        try:
+            return json.loads(path.read_text())["reason"]
+        except FileNotFoundError:
+            return ""
 
     def asked(self, run: RunSpec) -> EvaluationAsked:
         """The evaluation that the sweep wants of a run."""

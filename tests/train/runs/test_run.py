@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -243,6 +244,12 @@ def test_folder_trouble_is_found_before_training(tmp_path, monkeypatch):
         train_run(toy_config(tmp_path), quiet(), build_env=lambda _: pytest.fail("too late"))
     with pytest.raises(FileError, match="10 MB free on its disk, expected 164 MB"):
         claim(tmp_path, 100.0)
+
+
+def test_many_claim_one_folder_at_once(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: claim(tmp_path / "sweep"), range(2000)))
+    assert list((tmp_path / "sweep").iterdir()) == []
 
 
 def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -112,6 +113,29 @@ def test_stages_can_be_run_and_repeated_alone(tmp_path):
     assert {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()} == written
     sweep(path, stages=("evaluate",), redo=True)
     assert all(p.stat().st_mtime_ns > written[p] for p in folder.rows.iterdir())
+
+
+def test_how_far_a_run_is_is_told_while_another_sweep_tries_it_again(tmp_path):
+    folder = SweepFolder(spec.load(str(write_sweep(tmp_path))))
+    folder.prepare()
+    run, over = folder.sweep.runs[0], threading.Event()
+
+    def other_sweep() -> None:
+        while not over.is_set():
+            folder.give_up(run.name, "train: ended with exit code 1", 3)
+            folder.try_again(run.name)
+
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(other_sweep)
+        try:
+            told, until = set(), time.monotonic() + 1.0
+            while time.monotonic() < until:
+                state = folder.state(run)
+                told.add((state.state, state.reason))
+        finally:
+            over.set()
+        other.result()
+    assert told == {("waiting", ""), ("failed", "train: ended with exit code 1")}
 
 
 def test_what_a_killed_evaluation_left_goes_at_the_next_start(tmp_path):
