@@ -30,19 +30,18 @@ LIMITS = {"cold_s": 600.0, "warm_s": 30.0, "memory_mib": 6 * 1024.0}
 """What the converter is meant to keep on two cores."""
 
 MEASURE = """
-import json, resource, sys, time
+import json, os, sys, time
 start = time.perf_counter()
 from pathlib import Path
+from converters.clock import peak_memory_mib
 from converters.pipeline import ConvertConfig, convert
 done = convert(Path(sys.argv[1]), Path(sys.argv[2]), ConvertConfig(jobs=int(sys.argv[4])), cache=Path(sys.argv[3]))
-usage = {who: resource.getrusage(getattr(resource, f"RUSAGE_{who}")) for who in ("SELF", "CHILDREN")}
-peak = {who: u.ru_maxrss / 1024 for who, u in usage.items()}
 print(json.dumps({
     "wall_s": round(time.perf_counter() - start, 1),
-    "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in usage.values()), 1),
+    "cpu_s": round(sum(os.times()[:4]), 1),
     "stage_s": {k: round(v, 2) for k, v in done.stage_s.items()},
-    "peak_mib": round(peak["SELF"]),
-    "peak_child_mib": round(peak["CHILDREN"]),
+    "peak_mib": round(peak_memory_mib()),
+    "peak_child_mib": round(done.worker_mib),
     "objects": len(done.manifest.objects),
     "hulls": sum(o.n_hulls for o in done.manifest.objects),
     "floor_area_m2": done.manifest.floor_area_m2,

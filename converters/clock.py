@@ -1,10 +1,12 @@
-"""How long each stage of a conversion takes, and what share of it all is done."""
+"""How long each stage of a conversion takes, what share of it all is done, and the memory that it takes."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 STAGES = {
     "read": 1.0,
@@ -21,6 +23,18 @@ STAGES = {
 
 Report = Callable[[str, float], None]
 """Called with the stage's name and the share of the whole work that is done, 0 to 1."""
+
+
+def peak_memory_mib(pid: int | str = "self") -> float:
+    """Most memory that a process has held, MiB; 0 where the system does not tell, or it has ended.
+
+    VmHWM and not `getrusage`: Linux keeps the latter's `ru_maxrss` through fork and exec, so a process started by a
+    large one reports its parent's.
+    """
+    with contextlib.suppress(OSError):
+        if found := re.search(r"VmHWM:\s+(\d+) kB", Path("/proc", str(pid), "status").read_text()):
+            return int(found[1]) / 1024
+    return 0.0
 
 
 class Clock:

@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import resource
 import signal
 import sys
 import tempfile
@@ -22,7 +21,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from converters.clock import STAGES
+from converters.clock import STAGES, peak_memory_mib
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.records.errors import StageFailed
 from converters.sets import Runner, run_side_by_side
@@ -40,7 +39,7 @@ SCHEMA = pa.schema(
         "movables": pa.int32(),
         "area_m2": pa.float64(),  # traversable, of all floors
         **dict.fromkeys(("seconds", *(f"{stage}_s" for stage in STAGES)), pa.float64()),
-        "peak_memory_mib": pa.float64(),  # of the process, then of the largest one that it started
+        "peak_memory_mib": pa.float64(),  # of the process, then of the largest decomposition that it started
         "worker_memory_mib": pa.float64(),
     }
 )
@@ -139,7 +138,6 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
     """What a row says of a conversion that was done in this process; gates carry the scene's name where several are."""
     gates = [(g.name if len(results) == 1 else f"{r.folder.name}/{g.name}", g.passed) for r in results for g in r.gates]
-    own, started = (resource.getrusage(of).ru_maxrss / 1024 for of in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return {
         "scenes": [r.folder.name for r in results],
         "gates_passed": [name for name, passed in gates if passed],
@@ -149,8 +147,8 @@ def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
         "area_m2": sum(r.manifest.floor_area_m2 for r in results),
         "seconds": seconds,
         **{f"{stage}_s": value for stage, value in results[0].stage_s.items()},
-        "peak_memory_mib": own,
-        "worker_memory_mib": started,
+        "peak_memory_mib": peak_memory_mib(),
+        "worker_memory_mib": max(r.worker_mib for r in results),
     }
 
 

@@ -88,6 +88,8 @@ class Converted:
     n_walls: int
     stage_s: dict[str, float]
     """Stage -> seconds."""
+    worker_mib: float = 0.0
+    """Most memory that one of the decomposition's processes held."""
 
 
 def with_retrieved(
@@ -285,7 +287,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
         manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
         save_manifest(manifest, folder)
-    return Converted(folder, manifest, gates, settled, len(walls), clock.seconds)
+    return Converted(folder, manifest, gates, settled, len(walls), clock.seconds, decomposed.worker_mib)
 
 
 def convert_building(

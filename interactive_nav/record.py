@@ -249,7 +249,7 @@ def record(source: Path, arguments: argparse.Namespace, console: Console) -> Non
     """Draws a replay as the words of `add_picture_words` say.
 
     Raises:
-        ValueError, OSError: the replay or its scene cannot be read, or the video not be written.
+        UserError: the replay or its scene cannot be read, or the video not be written.
     """
     replay, out = load(source), Path(arguments.out)
     compositor = Compositor(replay, load_scene(replay.scene), arguments.height)

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from converters.clock import peak_memory_mib
 from converters.geometry.boxes import Hull, convex_hull
 from converters.records.cache import LIMIT_BYTES, store, touch
 from converters.records.errors import CANNOT_WRITE, StageFailed
@@ -97,6 +98,8 @@ class Decomposition:
     """Name -> hulls, in the mesh's own frame."""
     fallbacks: dict[str, str]
     """Name -> why its one convex hull stands for it."""
+    worker_mib: float = 0.0
+    """Most memory that one of its processes held."""
 
 
 @dataclasses.dataclass
@@ -106,6 +109,7 @@ class _Job:
     process: subprocess.Popen
     started: float
     output: Path
+    peak_mib: float = 0.0
 
 
 def decompose_all(
@@ -136,6 +140,7 @@ def decompose_all(
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore
     keys = {name: content_key(v, f, configs[name]) for name, (v, f) in meshes.items()}
     done: dict[str, tuple[Hull, ...]] = {}
+    worker_mib = 0.0
     failed: dict[str, str] = {}
     waiting: list[tuple[str, str]] = []
     for name, key in keys.items():
@@ -151,7 +156,8 @@ def decompose_all(
     tell = progress or (lambda share: None)
     tell(len(done) / max(total, 1))
     with contextlib.closing(_results(waiting, meshes, configs, max(jobs, 1), config.timeout_s)) as results:
-        for key, name, hulls, reason in results:
+        for job, hulls, reason in results:
+            key, name, worker_mib = job.key, job.name, max(worker_mib, job.peak_mib)
             if hulls is None:
                 if strict:
                     raise StageFailed(f"decompose: {reason}")
@@ -163,6 +169,7 @@ def decompose_all(
     return Decomposition(
         {name: done[key] for name, key in keys.items()},
         {name: failed[key] for name, key in keys.items() if key in failed},
+        worker_mib,
     )
 
 
@@ -172,8 +179,8 @@ def _results(
     configs: Mapping[str, DecomposeConfig],
     jobs: int,
     timeout_s: float,
-) -> Generator[tuple[str, str, tuple[Hull, ...] | None, str], None, None]:
-    """Key, name, hulls and what `_finish` says of each that waits, as they end; closed early, it ends what runs."""
+) -> Generator[tuple[_Job, tuple[Hull, ...] | None, str], None, None]:
+    """Job, hulls and what `_finish` says of each that waits, as they end; closed early, it ends what runs."""
     running: list[_Job] = []
     with tempfile.TemporaryDirectory(prefix="hulls-") as scratch:
         try:
@@ -182,11 +189,12 @@ def _results(
                     key, name = waiting.pop(0)
                     running.append(_start(key, name, *meshes[name], configs[name], Path(scratch)))
                 for job in list(running):
+                    job.peak_mib = max(job.peak_mib, peak_memory_mib(job.process.pid))
                     late = time.monotonic() - job.started > timeout_s
                     if job.process.poll() is not None or late:
                         hulls, reason = _finish(job, timeout_s)
                         running.remove(job)
-                        yield job.key, job.name, hulls, reason
+                        yield job, hulls, reason
                 if running:
                     time.sleep(0.05)
         finally:

@@ -37,7 +37,7 @@ def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
         control_mode: one of the robot's `control_modes`; `native` is the original benchmark's action.
 
     Raises:
-        ConfigError: unknown name (a mode: ValueError); the message lists the known ones.
+        ConfigError: unknown name or mode; the message lists the known ones.
     """
     if name not in _FACTORIES:
         near = nearest(str(name), list(_FACTORIES))

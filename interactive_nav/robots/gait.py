@@ -148,7 +148,7 @@ def legged_robot(legs: Legged, control_mode: str, **figures: Any) -> RobotSpec:
         **figures: other fields of `RobotSpec`, or other values of those set here.
 
     Raises:
-        ValueError: unknown mode.
+        ConfigError: unknown mode.
     """
     check_mode(legs.name, control_mode, legs.modes)
     joint_mode = legs.native if control_mode == "native" else control_mode

@@ -16,7 +16,7 @@ def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str) -> Ren
         backend: of the physics: warp, jax or native.
 
     Raises:
-        ValueError: warp where the package warp-lang is not installed.
+        ConfigError: warp where the package warp-lang is not installed.
     """
     from interactive_nav.physics import resolve_backend
 

@@ -64,7 +64,7 @@ class InteractiveNav(Env):
             config: settings.
 
         Raises:
-            ValueError: settings that do not fit each other or the backend.
+            ConfigError: settings that do not fit each other or the backend.
             SceneError: a scene with no room.
         """
         robot = robot.symmetric() if config.rules.symmetric_actions else robot

@@ -12,12 +12,13 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from converters import many, sets
 from converters.__main__ import main
-from converters.clock import STAGES
+from converters.clock import STAGES, peak_memory_mib
 from converters.many import ROWS, convert_many, digest_of
 from converters.pipeline import ConvertConfig
 from scenes_mjcf.schema import load_manifest
@@ -75,7 +76,7 @@ def test_a_row_each_and_no_other_is_lost(converted, sources):
     assert "drift_boxes" in first["gates_passed"]
     stages = sum(first[f"{stage}_s"] for stage in STAGES)
     assert 0 < stages <= first["seconds"] < stages + 5
-    assert 50 < first["peak_memory_mib"] < 5000
+    assert 50 < first["peak_memory_mib"] < 5000 and 20 < first["worker_memory_mib"] < 5000
     assert "killed: killed by signal 9" in lines
 
 
@@ -166,3 +167,11 @@ def test_a_signal_ends_what_runs_and_leaves_no_part(sources, tmp_path, number, c
     _, said = running.communicate(timeout=60)
     assert running.returncode == code and "nothing was written" in said
     assert list(into.iterdir()) == []
+
+
+def test_the_memory_of_a_process_is_its_own_and_not_that_of_the_large_one_which_started_it():
+    held = np.ones(400 * 2**17)  # 400 MiB
+    code = "from converters.clock import peak_memory_mib; print(peak_memory_mib())"
+    child = float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+    assert 5 < child < 100 and peak_memory_mib() > held.nbytes / 2**20
+    assert peak_memory_mib(2**22 + 1) == 0  # no such process

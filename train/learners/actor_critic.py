@@ -139,7 +139,7 @@ def make_networks(
         Observations to what parametrises actions [..., outputs]; observations and actions to values [..., critics].
 
     Raises:
-        ValueError: images too small for the convolutions, or nothing for the critics to see.
+        ConfigError: images too small for the convolutions, or nothing for the critics to see.
     """
     size: Any = env.observation_size
     prepare: Any = networks.preprocess(config.normalize_observations)

@@ -162,7 +162,7 @@ def make_agent(env: Env, config: TrainConfig) -> DDPG:
     """The networks and settings for an environment's observations and actions.
 
     Raises:
-        ValueError: images too small for the convolutions, or nothing for the critic to see.
+        ConfigError: images too small for the convolutions, or nothing for the critic to see.
     """
     size: Any = env.observation_size
     policy_network, q_network = make_networks(

@@ -95,7 +95,7 @@ def make_parts(
         network: encoders of images.
 
     Raises:
-        ValueError: the encoders do not fit the images.
+        ConfigError: the encoders do not fit the images.
     """
     network = network or NetworkConfig()
     made = nets.make_ppo_networks(

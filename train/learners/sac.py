@@ -134,7 +134,7 @@ def make_agent(env: Env, config: TrainConfig) -> SAC:
     """The networks and settings for an environment's observations and actions.
 
     Raises:
-        ValueError: images too small for the convolutions, or nothing for the critics to see.
+        ConfigError: images too small for the convolutions, or nothing for the critics to see.
     """
     size: Any = env.observation_size
     actions = distribution.NormalTanhDistribution(event_size=env.action_size)

@@ -124,7 +124,7 @@ def ant(control_mode: str = "native") -> RobotSpec:
             velocity of the base through its gait.
 
     Raises:
-        ValueError: unknown mode.
+        ConfigError: unknown mode.
     """
     return legged_robot(
         LEGS,

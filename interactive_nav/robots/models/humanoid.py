@@ -257,7 +257,7 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
             linear and angular velocity of the base through its gait, which also balances it.
 
     Raises:
-        ValueError: unknown mode.
+        ConfigError: unknown mode.
     """
     return legged_robot(
         LEGS,

@@ -168,7 +168,7 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
             base through a scripted trot.
 
     Raises:
-        ValueError: unknown mode.
+        ConfigError: unknown mode.
     """
     figures: dict[str, Any] = {}
     if control_mode == "leg":

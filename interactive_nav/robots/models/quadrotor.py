@@ -196,7 +196,7 @@ def quadrotor(control_mode: str = "native") -> RobotSpec:
             `thrust`: four rotor thrusts; `kinematic`: the original's six base velocities, without gravity.
 
     Raises:
-        ValueError: unknown mode.
+        ConfigError: unknown mode.
     """
     check_mode("quadrotor", control_mode, _MODES)
     names, low, high, law = _TABLE["velocity" if control_mode == "native" else control_mode]
