@@ -17,32 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 from interactive_nav import mjx_without_warp
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.moved import keep_old_names
 
 # The scenes' tables are constants of `reset` and `step`, tens to hundreds of megabytes. Without this, JAX
 # writes them as text into every program that it compiles (measured: 23 s instead of 8 s for a small room).
 # JAX reads it once, at its own import: import interactive_nav first, or set the variable yourself.
 os.environ.setdefault("JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS", "1")
 mjx_without_warp.hush()
-
-# What was documented before packages had rooms; new code uses the new names.
-keep_old_names(
-    {
-        "interactive_nav.env": "interactive_nav.task.env",
-        "interactive_nav.gym_env": "interactive_nav.interop.gym_env",
-        "interactive_nav.objects": "interactive_nav.scenes.objects",
-        "interactive_nav.observation": "interactive_nav.sensing.observation",
-        "interactive_nav.rendering.camera": "interactive_nav.pictures.camera",
-        "interactive_nav.replay": "interactive_nav.pictures.replay",
-        "interactive_nav.robots.evidence": "interactive_nav.robot_study.evidence",
-        "interactive_nav.sb3_env": "interactive_nav.interop.sb3_env",
-        "interactive_nav.scene": "interactive_nav.scenes.scene",
-        "interactive_nav.sharding": "interactive_nav.task.sharding",
-        "interactive_nav.torch_bridge": "interactive_nav.interop.torch_bridge",
-        "interactive_nav.views": "interactive_nav.pictures.views",
-        "interactive_nav.wrappers": "interactive_nav.task.wrappers",
-    }
-)
 
 if TYPE_CHECKING:
     from interactive_nav import geodesic, metrics, reward

@@ -13,7 +13,6 @@ import interactive_nav
 from interactive_nav.pictures.camera import ENGINES, STREAMS, VIEWS, Camera
 from interactive_nav.pictures.shading import PALETTES
 
-__path__: list[str] = []  # `interactive_nav.rendering.camera` still imports: `interactive_nav.__init__`
 _GAP_PX, _LABEL_PX = 8, 22
 
 

@@ -52,8 +52,8 @@ def register_envs() -> None:
         if env_id(robot) not in gymnasium.registry:
             gymnasium.register(
                 env_id(robot),
-                entry_point="interactive_nav.gym_env:InteractiveNavEnv",
-                vector_entry_point="interactive_nav.gym_env:InteractiveNavVectorEnv",
+                entry_point=f"{__name__}:InteractiveNavEnv",
+                vector_entry_point=f"{__name__}:InteractiveNavVectorEnv",
                 kwargs={"robot": robot},
             )
 

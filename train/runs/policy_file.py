@@ -48,8 +48,8 @@ def acting_part(learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
 
 
 def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarray]:
-    """Large weights as Huffman codes (u8) of i8, with their shapes under `<name>:shape` and the f32 scales of their last
-    axis under `<name>:scale`; others as f16; vectors as is.
+    """Large weights as Huffman codes (u8) of i8, with their shapes under `<name>:shape` and the f32 scales of their
+    last axis under `<name>:scale`; others as f16; vectors as is.
 
     Rounded weights hold no repetitions, which is all that zip's own methods would add: those take a tenth more.
 

@@ -22,23 +22,23 @@ from interactive_nav.config import WINDOW
 from interactive_nav.physics import resolve_backend
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
+from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
-from interactive_nav_common.metrics_file import mean_over_episodes
 from interactive_nav_common.locks import locked
+from interactive_nav_common.metrics_file import mean_over_episodes
 from interactive_nav_common.signals import stop_signals
-from train.runs import checkpoint, tracking
+from interactive_nav_common.versions import versions
 from scenes_mjcf.sets import scene_folders
 from train import config_io
-from train.learners.algorithms import ALGORITHMS
-from train.runs.checkpoint import CheckpointMeta
 from train.config import EnvConfig, TrainConfig, resolve
 from train.errors import CheckpointError
+from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult, Update
+from train.runs import checkpoint, tracking
+from train.runs.checkpoint import CheckpointMeta
 from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import RunFolder, claim
-from interactive_nav_common.config import flatten, replace
-from interactive_nav_common.versions import versions
 
 
 def make_env(config: EnvConfig) -> Any:

@@ -16,7 +16,6 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
 from train.config import TrainConfig
 
-
 ID_FILE = "wandb_id"
 
 

@@ -19,11 +19,11 @@ from rich.console import Console
 
 from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
-from train.runs import checkpoint, policy_file
-from train.learners.algorithms import ALGORITHMS
 from train.config import EnvConfig, TrainConfig, resolve
 from train.errors import CheckpointError
+from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot
+from train.runs import checkpoint, policy_file
 from train.runs.run import train_run
 
 TOY = EnvConfig.of(scenes=("toy",), backend="native")

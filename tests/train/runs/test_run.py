@@ -25,17 +25,16 @@ from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import release, take_lock
+from interactive_nav_common.metrics_file import mean_over_episodes, read_metrics
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import __main__ as program
-from interactive_nav_common import versions
-from train.runs import checkpoint, run, run_folder
 from train.config import resolve
 from train.config_io import from_yaml
 from train.errors import CheckpointError, DivergedError
+from train.runs import checkpoint, run, run_folder
 from train.runs.run import check_fits, failures, train_run
 from train.runs.run_folder import RunFolder, claim
-from interactive_nav_common.metrics_file import mean_over_episodes, read_metrics
 
 
 def quiet() -> Console:
@@ -278,8 +277,10 @@ def test_checkpoints_have_no_score_before_every_environment_had_time_for_an_epis
     saved = {c.env_steps: c.score for c in checkpoint.list_checkpoints(folder.checkpoints)}
     assert list(saved) == [512, 1024, 1536] and saved[512] is None
     assert all(line["episodes"] > 0 for line in lines if line["env_steps"] in (512, 768))  # in no score
-    assert saved[1024] == pytest.approx(mean_over_episodes([line for line in lines if line["env_steps"] == 1024], "episode/ins_0.5"))
-    assert saved[1536] == pytest.approx(mean_over_episodes([line for line in lines if line["env_steps"] > 1024], "episode/ins_0.5"))
+    first = [line for line in lines if line["env_steps"] == 1024]
+    later = [line for line in lines if line["env_steps"] > 1024]
+    assert saved[1024] == pytest.approx(mean_over_episodes(first, "episode/ins_0.5"))
+    assert saved[1536] == pytest.approx(mean_over_episodes(later, "episode/ins_0.5"))
     # Without room for the environments all begin anew, and the wait with them.
     config = toy_config(tmp_path, updates=10, keep_checkpoints=9, env_state_limit_mb=0.0)
     (folder.checkpoints / "000000001536" / checkpoint.ENV_STATE).unlink()

@@ -17,9 +17,9 @@ from rich.console import Console
 
 from interactive_nav_common.errors import ConfigError
 from tests.train.toy_run import build_toy, toy_config
-from train.runs import tracking
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult
+from train.runs import tracking
 from train.runs.run import train_run
 
 
