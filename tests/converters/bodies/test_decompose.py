@@ -41,7 +41,9 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
     entry = hull_cache / f"{content_key(vertices, faces, CONFIG)}.npz"
     own = tmp_path / entry.name
     own.write_bytes(entry.read_bytes()[:100])  # cut short
-    again = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path).hulls["a"]
+    made = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path)
+    again = made.hulls["a"]
+    assert 20 < made.worker_mib < 2000
     assert own.read_bytes() == entry.read_bytes()
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.vertices, other.vertices)
@@ -50,7 +52,9 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
         raise AssertionError("a cached mesh must not be decomposed")
 
     monkeypatch.setattr(decompose, "_start", no_process)
-    cached = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path).hulls
+    there = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path)
+    cached = there.hulls
+    assert there.worker_mib == 0
     assert len(cached["a"]) == len(cached["b"]) == len(first)
 
 
