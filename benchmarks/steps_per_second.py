@@ -80,7 +80,7 @@ def _physics_only(env, num_envs: int):
         command = jnp.asarray(env.robot.command(action, jnp), jnp.float32)
         nav = state.info["nav"]
         physics, _ = jax.vmap(env.physics.step)(nav.scene_index, state.pipeline_state, command, jnp.zeros(num_envs))
-        return state.replace(pipeline_state=physics)
+        return state.replace(pipeline_state=physics.replace(control_steps=state.pipeline_state.control_steps))
 
     return step
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from interactive_nav.robots import get_robot, robot_names
     from interactive_nav.scenes.scene import load_scene
     from interactive_nav.task.env import InteractiveNav
+    from interactive_nav.task.wrappers import wrap_for_brax_training
 
 _HOME = {
     "InteractiveNav": "task.env",
@@ -37,6 +38,7 @@ _HOME = {
     "get_robot": "robots",
     "load_scene": "scenes.scene",
     "robot_names": "robots",
+    "wrap_for_brax_training": "task.wrappers",
 }
 _MODULES = ("geodesic", "metrics", "reward")
 
@@ -88,4 +90,5 @@ __all__ = [
     "metrics",
     "reward",
     "robot_names",
+    "wrap_for_brax_training",
 ]

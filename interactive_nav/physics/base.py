@@ -32,6 +32,8 @@ class PhysicsState:
     """[nv] f32."""
     qacc_warmstart: Any
     """[nv] f32."""
+    control_steps: Any = None
+    """[] i32 since the episode began: the environment's clock, which backends leave out."""
 
 
 @flax.struct.dataclass

@@ -50,7 +50,8 @@ class InteractiveNav(Env):
     Action: f32 (A,) in [-1, 1], one per actuator (wheels: left, right).
     Reward: success + potential + interaction, see `interactive_nav.reward`.
     Done: success, time limit, a non-finite state, or dropped contacts; `info["truncation"]` is 1 where the
-    episode was cut by the time limit or by dropped contacts, `info["time_out"]` for the former alone.
+    episode was cut by the time limit or by dropped contacts, `info["time_out"]` for the former alone. `done` stays 1
+    until a reset, and pays nothing.
     Metrics: `EPISODE_METRICS` are the episode's scores on its last step and 0 before, so that their sum
     over an episode is the score; `REWARD_TERMS` are each step's reward terms.
     """
@@ -154,38 +155,50 @@ class InteractiveNav(Env):
         scene = start.scene_index
         goal = goal_field(self.tables, scene, start.goal_xy_w)
         waypoints_b = self._waypoints(scene, goal, pos_w, rotation)
-        zero, count = jnp.zeros(()), jnp.zeros((), jnp.int32)
-        slots = self.world.layout.num_slots
+        geodesic_m = self._geodesic(scene, goal, pos_w)
         nav = NavInfo(
             scene_index=scene,
             goal_xy_w=start.goal_xy_w,
             goal_field=goal,
             start_xy_w=start.start_xy_w,
-            robot_pos_w=pos_w,
-            yaw_rad=_yaw(rotation),
             waypoints_b=waypoints_b,
-            object_pos_w=self._object_positions(scene, physics),
-            geodesic_m=self._geodesic(scene, goal, pos_w),
             shortest_path_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
-            robot_path_m=zero,
-            object_path_m=jnp.zeros(slots),
-            object_contact_steps=jnp.zeros(slots, jnp.int32),
-            object_force_sum_n=jnp.zeros(slots),
-            force_sum_n=zero,
-            interaction_steps=count,
-            structure_steps=count,
-            overflow_steps=count,
-            left_out_steps=count,
-            unconverged_steps=count,
-            lifted_steps=count,
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
-            step_count=count,
-            odometry=jnp.zeros(3),
-            touching=jnp.zeros(2, bool),
+            **self._at_start(scene, physics, geodesic_m),
         )
+        zero = jnp.zeros(())
         info = {"nav": nav, "rng": rng, "truncation": zero, "time_out": zero}
         names = (*EPISODE_METRICS, *REWARD_TERMS)
         return State(physics, (), zero, zero, {name: zero for name in names}, info)  # pyright: ignore[reportArgumentType]
+
+    def _at_start(self, scene: jax.Array, physics: PhysicsState, geodesic_m: jax.Array) -> dict[str, jax.Array]:
+        """The fields of `NavInfo` that tell of the way since the start, with nothing done yet."""
+        pos_w, rotation = self._robot_pose(physics)
+        zero, count, slots = jnp.zeros(()), jnp.zeros((), jnp.int32), self.world.layout.num_slots
+        counts = ("interaction_steps", "structure_steps", "overflow_steps", "left_out_steps", "unconverged_steps")
+        return {
+            "robot_pos_w": pos_w,
+            "yaw_rad": _yaw(rotation),
+            "object_pos_w": self._object_positions(scene, physics),
+            "geodesic_m": geodesic_m,
+            "robot_path_m": zero,
+            "object_path_m": jnp.zeros(slots),
+            "object_contact_steps": jnp.zeros(slots, jnp.int32),
+            "object_force_sum_n": jnp.zeros(slots),
+            "force_sum_n": zero,
+            **dict.fromkeys((*counts, "lifted_steps", "step_count"), count),
+            "odometry": jnp.zeros(3),
+            "touching": jnp.zeros(2, bool),
+        }
+
+    def _of_physics(self, nav: NavInfo, physics: PhysicsState, again: jax.Array) -> NavInfo:
+        """The task's memory that belongs to this physics: none yet where a wrapper (Brax's auto-reset) has put the
+        episode's first state back, which the clock in it tells (`again`)."""
+        scene, geodesic_m = nav.scene_index, nav.shortest_path_m
+        if self.config.rules.potential == "quantised":
+            geodesic_m = self._geodesic(scene, nav.goal_field, self._robot_pose(physics)[0])
+        first = self._at_start(scene, physics, geodesic_m)
+        return nav.replace(**{name: jnp.where(again, value, getattr(nav, name)) for name, value in first.items()})
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one environment by one control period.
@@ -210,15 +223,18 @@ class InteractiveNav(Env):
 
     def advance(self, state: State, action: jax.Array) -> State:
         """`step` without an observation: `obs` stays what it was until `observe`."""
-        nav: NavInfo = state.info["nav"]
         action = jnp.where(jnp.isfinite(action), action, 0.0)
         command = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
         before: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        again = before.control_steps < state.info["nav"].step_count
+        last = nav = self._of_physics(state.info["nav"], before, again)
+        over = (state.done > 0) & ~again
         physics, signals = self.physics.step(
             nav.scene_index, before, command, nav.step_count * self.config.physics.control_dt_s
         )
         broken = signals.nonfinite > 0
         nav = self._advance(nav, physics, signals, broken, state.info["rng"])
+        physics = physics.replace(control_steps=nav.step_count)  # pyright: ignore[reportAttributeAccessIssue]
 
         # Contacts were dropped: what the robot did is no longer known, and the episode ends here.
         lost = ~broken & (signals.overflow > 0)
@@ -233,7 +249,7 @@ class InteractiveNav(Env):
             interacts = self._touches(nav.scene_index, signals)
         reward, terms = interactive_navigation_reward(
             success.astype(jnp.float32),
-            state.info["nav"].geodesic_m,
+            last.geodesic_m,
             nav.geodesic_m,
             interacts.astype(jnp.float32),
             self.config.rules.k_int,
@@ -245,17 +261,19 @@ class InteractiveNav(Env):
         values = {name: done * value for name, value in values.items()}
         values |= {f"reward/{name}": term for name, term in terms.items()}
         truncated = timed_out | lost if self.config.rules.bootstrap_at_time_limit else lost
+        told = {"truncation": truncated.astype(jnp.float32), "time_out": timed_out.astype(jnp.float32)}
+        # After its end an episode pays nothing and scores nothing more; that its physics broke is still told.
+        terms = {f"reward/{name}": jnp.zeros(()) for name in terms}
+        old = {**state.metrics, **terms, "nonfinite": jnp.maximum(state.metrics["nonfinite"], values["nonfinite"])}
+        old = {name: old[name] for name in values}, {name: state.info[name] for name in told}, 0.0, 1.0
+        new = values, told, reward, done
+        values, told, reward, done = jax.tree.map(lambda a, b: jnp.where(over, a, b), old, new)
         return state.replace(
             pipeline_state=physics,
             reward=reward,
             done=done,
             metrics={**state.metrics, **values},
-            info={
-                **state.info,
-                "nav": nav,
-                "truncation": truncated.astype(jnp.float32),
-                "time_out": timed_out.astype(jnp.float32),
-            },
+            info={**state.info, "nav": nav, **told},
         )
 
     def initial_physics(self, start: EpisodeStart) -> PhysicsState:
@@ -272,7 +290,7 @@ class InteractiveNav(Env):
             address = layout.slot_qpos[: self._num_small, None] + np.arange(7)
             qpos = qpos.at[address].set(jnp.stack(columns, -1))
         still = jnp.zeros(self.physics.nv, jnp.float32)
-        return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still)
+        return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still, control_steps=jnp.zeros((), jnp.int32))
 
     def _robot_pose(self, physics: PhysicsState) -> tuple[jax.Array, jax.Array]:
         at = self.world.layout.robot_qpos

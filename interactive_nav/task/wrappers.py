@@ -6,11 +6,14 @@ episode for ever, and what the task keeps in `info` would leak into it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
 
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav_common.errors import ConfigError
 
 DRAW_SHARE = 16
 """New episodes are drawn for this fraction of the batch at a time."""
@@ -60,6 +63,48 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
     return jax.lax.while_loop(lambda carry: carry[1].any(), some, (current, over))[0]
 
 
+def wrap_for_brax_training(
+    env: Any, episode_length: int | None = None, action_repeat: int = 1, randomization_fn: Any = None
+) -> AutoResetEnv:
+    """What Brax's learners take as `wrap_env_fn`, as MuJoCo Playground has it: every episode is newly drawn.
+
+    Args:
+        env: what `interactive_nav.make` returns, or a wrapper of it: see `AutoResetEnv`.
+        episode_length: at least the environment's own `episode_steps`, which ends its episodes; None: that.
+        action_repeat: control steps that an action is held for.
+        randomization_fn: none: scenes and episodes are drawn by the environment.
+
+    Raises:
+        ConfigError: a shorter `episode_length`, a `randomization_fn`, or a wrapper that would be passed over.
+    """
+    steps = env.config.rules.episode_steps
+    if episode_length is not None and episode_length < steps:
+        raise ConfigError(
+            f"episode_length is {episode_length}, expected at least the environment's {steps}: "
+            f"make it with episode_steps={episode_length}"
+        )
+    if randomization_fn is not None:
+        raise ConfigError("randomization_fn is given, expected None: the environment draws its scenes by itself")
+    return AutoResetEnv(env, action_repeat)
+
+
+def _refuse_passed_over(env: Any) -> None:
+    """Refuses wrappers whose `step` or `reset` is never called: a batch calls their finer parts."""
+    while isinstance(env, Wrapper):
+        own = {name for name in ("reset", "step", "draw", "advance", "observe") if name in _overridden(type(env))}
+        for name, part in (("step", "advance"), ("reset", "draw")):
+            if name in own and not own & {part, "observe"}:
+                raise ConfigError(
+                    f"{type(env).__name__} overrides `{name}`, which a batch that resets itself never calls; expected "
+                    f"`{part}` (the {name} without its observation) or `observe`: override that too"
+                )
+        env = env.env
+
+
+def _overridden(kind: type) -> set[str]:
+    return {name for base in kind.__mro__[: kind.__mro__.index(Wrapper)] for name in vars(base)}
+
+
 class AutoResetEnv(Wrapper):
     """N environments as one natively batched Brax environment (`wrap_env=False` for Brax's learners).
 
@@ -70,6 +115,21 @@ class AutoResetEnv(Wrapper):
     """
 
     env: InteractiveNav
+
+    def __init__(self, env: Any, action_repeat: int = 1):
+        """Wraps an environment.
+
+        Args:
+            env: of one episode; wrappers of it override `draw`, `advance` and `observe`, of which `reset` and `step`
+                are made.
+            action_repeat: control steps that an action is held for; rewards are summed.
+
+        Raises:
+            ConfigError: a wrapper that overrides `step` or `reset` alone, and so would never be asked.
+        """
+        super().__init__(env)
+        _refuse_passed_over(env)
+        self.action_repeat = action_repeat
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
         """[N, 2] keys to N states.
@@ -91,9 +151,15 @@ class AutoResetEnv(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         """N states and [N, A] actions to N states."""
-        stepped = jax.vmap(self.env.advance)(state, action)
+        # What ended in the last step has begun anew.
+        stepped = jax.vmap(self.env.advance)(state.replace(done=jnp.zeros_like(state.done)), action)
+        for _ in range(self.action_repeat - 1):
+            paid = stepped.reward
+            stepped = jax.vmap(self.env.advance)(stepped, action)
+            stepped = stepped.replace(reward=paid + stepped.reward)
         done = stepped.done > 0
         steps = stepped.info["nav"].step_count.astype(jnp.float32)
+        steps = jnp.where(done, stepped.metrics["episode_steps"], steps)
         total = state.info["running_reward"] + stepped.reward
         finished = {name: stepped.metrics[name] for name in EPISODE_METRICS}
         finished |= {"length": steps, "sum_reward": total}

@@ -135,7 +135,8 @@ def test_following_the_path_succeeds_and_the_reward_adds_up(programs):
         live = ~ended
         terms = {k: np.asarray(state.metrics[f"reward/{k}"]) for k in ("success", "potential", "interaction")}
         np.testing.assert_allclose(state.reward, sum(terms.values()), atol=1e-5)
-        np.testing.assert_allclose(terms["potential"], before - np.asarray(state.info["nav"].geodesic_m), atol=1e-5)
+        nearer = before - np.asarray(state.info["nav"].geodesic_m)
+        np.testing.assert_allclose(terms["potential"], np.where(live, nearer, 0.0), atol=1e-5)
         assert set(np.unique(terms["interaction"])) <= {0.0, -0.5}
         potential += live * terms["potential"]
         total += live * np.asarray(state.reward)
