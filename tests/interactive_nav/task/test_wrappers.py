@@ -134,24 +134,25 @@ def test_brax_own_ppo_learns_on_the_environment(tmp_path, wrap):
     )
     rewards = []
     small = {"policy_hidden_layer_sizes": (32, 32), "value_hidden_layer_sizes": (32, 32)}
-    ppo.train(
-        env,
-        num_timesteps=25_000,
-        num_envs=64,
-        episode_length=60,
-        wrap_env_fn=wrap,
-        learning_rate=1e-3,
-        entropy_cost=1e-2,
-        discounting=0.97,
-        unroll_length=20,
-        batch_size=16,
-        num_minibatches=4,
-        num_updates_per_batch=4,
-        normalize_observations=True,
-        num_evals=2,
-        num_eval_envs=64,
-        seed=0,
-        progress_fn=lambda steps, told: rewards.append(float(told["eval/episode_reward"])),
-        network_factory=functools.partial(networks.make_ppo_networks, **small),
-    )
+    with jax.numpy_rank_promotion("allow"):  # Brax's code counts on it
+        ppo.train(
+            env,
+            num_timesteps=25_000,
+            num_envs=64,
+            episode_length=60,
+            wrap_env_fn=wrap,
+            learning_rate=1e-3,
+            entropy_cost=1e-2,
+            discounting=0.97,
+            unroll_length=20,
+            batch_size=16,
+            num_minibatches=4,
+            num_updates_per_batch=4,
+            normalize_observations=True,
+            num_evals=2,
+            num_eval_envs=64,
+            seed=0,
+            progress_fn=lambda steps, told: rewards.append(float(told["eval/episode_reward"])),
+            network_factory=functools.partial(networks.make_ppo_networks, **small),
+        )
     assert len(rewards) == 2 and rewards[1] > rewards[0] + 5
