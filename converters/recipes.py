@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -19,8 +19,9 @@ from converters.generate.design.config import NAMES, BuildingConfig, GenerationE
 from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_config, home_fields
 from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, convert
-from interactive_nav_common.config import nearest
+from interactive_nav_common.config import Natural, nearest
 from interactive_nav_common.files import check_name, part_folder, publish
+from interactive_nav_common.records import Reader
 
 MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
 """Split -> CAD models of sparse buildings: held-out models are held out here."""
@@ -61,6 +62,28 @@ class Recipes:
     scenes: tuple[SceneRecipe, ...]
     conversion: dict[str, Any]
     """Settings of `ConvertConfig` that all scenes share: how large meshes and textures may be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Recipe:
+    """A scene as a recipe file says it."""
+
+    split: Literal["train", "test"]
+    seed: Natural
+    tier: str = SPARSE
+    building: dict[str, Any] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _File:
+    """A recipe file; `shared` only holds anchors."""
+
+    scenes: dict[str, _Recipe]
+    conversion: dict[str, Any] | None = None
+    shared: Any = None
+
+
+_RECIPES = Reader(GenerationError, "scenes_mjcf/recipes.yaml shows the form")
 
 
 def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> None:
@@ -129,7 +152,7 @@ def parse_settings(words: Iterable[str]) -> dict[str, Any]:
             raise GenerationError(f"got '{word}', expected KEY=VALUE, such as floor_area_m2=80")
         try:
             settings[key] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise GenerationError(f"{key}: cannot read '{value}', expected a number or [lowest, highest]") from error
     return settings
 
@@ -157,27 +180,14 @@ def parse_recipes(data: Any, where: str) -> Recipes:
     Raises:
         GenerationError: an unknown or missing key, a wrong type, or a building that is refused.
     """
-    if not isinstance(data, dict) or not isinstance(data.get("scenes"), dict):
-        raise GenerationError(f"{where}: expected a mapping with the key 'scenes', each a name and its recipe")
-    _refuse_unknown(data, ("scenes", "conversion", "shared"), where)
-    conversion = data.get("conversion") or {}
-    if not isinstance(conversion, dict):
-        raise GenerationError(f"{where}: conversion is {conversion!r}, expected a mapping")
+    found = _RECIPES.record(data, _File, where)
+    conversion = found.conversion or {}
     check_conversion(conversion, f"{where}: conversion")
     scenes = []
-    for name, recipe in data["scenes"].items():
-        here = f"{where}: scenes: {check_name(str(name), f'{where}: scenes: a name', GenerationError)}"
-        if not isinstance(recipe, dict):
-            raise GenerationError(f"{here}: got {recipe!r}, expected a mapping with split, seed and building")
-        _refuse_unknown(recipe, ("split", "seed", "tier", "building"), here)
-        if recipe.get("split") not in MODELS:
-            raise GenerationError(f"{here}: split is {recipe.get('split')!r}, expected one of {', '.join(MODELS)}")
-        seed = recipe.get("seed")
-        if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
-            raise GenerationError(f"{here}: seed is {seed!r}, expected a whole number of 0 or more")
-        settings = recipe.get("building") or {}
-        building = building_of(recipe.get("tier", SPARSE), settings, recipe["split"], f"{here}: building")
-        scenes.append(SceneRecipe(str(name), recipe["split"], seed, building))
+    for name, recipe in found.scenes.items():
+        here = f"{where}: scenes: {check_name(str(name), f'{where}: scenes: a name', GenerationError)}: building"
+        building = building_of(recipe.tier, recipe.building or {}, recipe.split, here)
+        scenes.append(SceneRecipe(str(name), recipe.split, recipe.seed, building))
     return Recipes(tuple(scenes), dict(conversion))
 
 
@@ -188,12 +198,11 @@ def load_recipes(path: Path) -> Recipes:
         GenerationError: no such file, not YAML, or wrong content.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise GenerationError(f"{path}: no such file; give the recipes with --recipes") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GenerationError(f"{path}: not readable as YAML ({error})") from error
-    return parse_recipes(data, str(path))
+        text = path.read_bytes()
+    except OSError as error:
+        why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
+        raise GenerationError(f"{path}: {why}; give the recipes with --recipes") from None
+    return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 
 def _generate(recipe: SceneRecipe, raw: Path, report: Report) -> None:

@@ -214,7 +214,7 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
             raise ConfigError(f"override {word!r}: expected key=value, for example {example}")
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, RecursionError):
             value = text
         settings.append((name, value))
     return nested(settings, "override")
@@ -347,7 +347,7 @@ def _scalar(value: Any, kind: type) -> Any:
             value = float(value)
         except ValueError:
             return None
-    if not isinstance(value, (int, float)) or math.isnan(value):
+    if not isinstance(value, (int, float)) or not (abs(value) < 2.0**64 or abs(value) == math.inf):
         return None
     if kind is int:
         return int(value) if float(value).is_integer() else None

@@ -8,32 +8,27 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
-from typing import Any, get_origin, get_type_hints
+from typing import Any, Literal
 
 import numpy as np
 
-from interactive_nav_common.config import nearest
+from interactive_nav_common.config import Positive
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import check_name
+from interactive_nav_common.records import Reader
 from scenes_mjcf.categories import OBJECT_CATEGORIES
 
 SCHEMA_VERSION = 1
 CATEGORIES = OBJECT_CATEGORIES
 SPLITS = ("train", "test")
-JSON_TYPES: dict[Any, tuple[tuple[type, ...], str]] = {
-    str: ((str,), "a string"),
-    int: ((int,), "a whole number"),
-    float: ((int, float), "a number"),
-    tuple: ((list, tuple), "a list"),
-    dict: ((dict,), "an object"),
-}
-"""A field's type -> what decoded JSON holds there, and its name in errors."""
 
 
 class SceneError(UserError):
     """A scene folder that cannot be used; the message says what, where, what was expected and what to do."""
+
+
+SCENES = Reader(SceneError, "convert the scene again")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +39,9 @@ class SceneObject:
     """Body name in scene.xml, `<category>_<k>`."""
     category: str
     """One of `CATEGORIES`."""
-    mass_kg: float
+    mass_kg: Positive
     """Density times decomposed volume, or the source's own mass."""
-    friction: float
+    friction: Positive
     """Sliding friction coefficient of its geoms."""
     n_hulls: int
     """Convex hulls (and as many boxes) it collides with."""
@@ -59,7 +54,7 @@ class SceneManifest:
     """Content of `scene.json`: what a scene is, where it came from, and which gates it passed."""
 
     name: str
-    split: str
+    split: Literal["train", "test"]
     source: dict[str, Any]
     """`format`, path names relative to the source folder, and their `sha256`."""
     licence: str
@@ -94,33 +89,6 @@ class SceneMaps:
     """Height of the floor in the scan's own frame (0 in the scene's)."""
 
 
-def known_keys(data: Any, cls: type, where: str) -> dict[str, Any]:
-    """The JSON object, when it has the record's keys and their types."""
-    if not isinstance(data, dict):
-        raise SceneError(f"{where}: got {type(data).__name__}, expected a JSON object; convert the scene again")
-    names = {f.name for f in dataclasses.fields(cls)}
-    required = {
-        f.name
-        for f in dataclasses.fields(cls)
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    }
-    for key in data:
-        if key not in names:
-            near = nearest(key, sorted(names))
-            raise SceneError(f"{where}: unknown key '{key}'{near}; known keys: {', '.join(sorted(names))}")
-    missing = sorted(required - data.keys())
-    if missing:
-        raise SceneError(f"{where}: missing key '{missing[0]}'; convert the scene again to rewrite the file")
-    hints = get_type_hints(cls)
-    for key, value in data.items():
-        kinds, words = JSON_TYPES[get_origin(hints[key]) or hints[key]]
-        if not isinstance(value, kinds) or isinstance(value, bool):
-            got = json.dumps(value, default=repr)
-            got = got if len(got) <= 60 else f"{got[:57]}..."
-            raise SceneError(f"{where}: {key} is {got}, expected {words}; convert the scene again")
-    return data
-
-
 def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
     """Builds a manifest from decoded JSON.
 
@@ -132,32 +100,21 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
         SceneError: no JSON object, unknown or missing key, a value of another type, unknown category or split,
             non-positive mass or friction.
     """
-    data = dict(known_keys(data, SceneManifest, where))
-    check_name(data["name"], f"{where}: name", SceneError)
-    if data.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+    manifest = SCENES.record(data, SceneManifest, where)
+    check_name(manifest.name, f"{where}: name", SceneError)
+    if manifest.schema_version != SCHEMA_VERSION:
         raise SceneError(
-            f"{where}: schema_version is {data['schema_version']}, expected {SCHEMA_VERSION}; convert the scene again"
+            f"{where}: schema_version is {manifest.schema_version}, expected {SCHEMA_VERSION}; convert the scene again"
         )
-    objects = []
-    for i, raw in enumerate(data["objects"]):
-        here = f"{where}: objects[{i}]"
-        obj = SceneObject(**known_keys(raw, SceneObject, here))
+    for i, obj in enumerate(manifest.objects):
         if obj.category not in CATEGORIES:
-            raise SceneError(f"{here}: category is '{obj.category}', expected one of {', '.join(CATEGORIES)}")
-        for field in ("mass_kg", "friction"):
-            value = getattr(obj, field)
-            if not 0 < value < math.inf:
-                raise SceneError(f"{here}: {field} is {value!r}, expected a positive number")
-        objects.append(obj)
-    names = [o.name for o in objects]
+            raise SceneError(
+                f"{where}: objects[{i}]: category is '{obj.category}', expected one of {', '.join(CATEGORIES)}"
+            )
+    names = [o.name for o in manifest.objects]
     if len(set(names)) != len(names):
         raise SceneError(f"{where}: two objects share a name; names must be unique")
-    if data["split"] not in SPLITS:
-        raise SceneError(f"{where}: split is {data['split']!r}, expected one of {', '.join(SPLITS)}")
-    data["objects"] = tuple(objects)
-    data["alignment"] = tuple(data.get("alignment", ()))
-    data["warnings"] = tuple(data.get("warnings", ()))
-    return SceneManifest(**data)
+    return manifest
 
 
 def load_manifest(folder: str | Path) -> SceneManifest:
@@ -172,11 +129,7 @@ def load_manifest(folder: str | Path) -> SceneManifest:
             f"{path}: no such file; expected a scene folder (scene.xml, scene.json, maps.npz, assets/), "
             "make one with 'python -m converters convert SRC OUT'"
         )
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # no UTF-8, no JSON, a number too long, brackets too deep
-        raise SceneError(f"{path}: not readable as JSON ({error}); convert the scene again") from error
-    return manifest_from_dict(data, str(path))
+    return manifest_from_dict(SCENES.json(path), str(path))
 
 
 def save_manifest(manifest: SceneManifest, folder: str | Path) -> None:

@@ -13,25 +13,27 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
 
 from interactive_nav_common.files import check_name, write_text
-from scenes_mjcf.schema import SPLITS, SceneError, known_keys, load_maps
+from interactive_nav_common.records import Reader
+from scenes_mjcf.schema import SPLITS, SceneError, load_maps
 
 FILE = "set.json"
 HERE = Path(__file__).parent
 COMMITTED = HERE / "sets"
 """Folder of the package's own sets, `<name>.json`."""
+_SETS = Reader(SceneError, "make the set again")
 
 
 @dataclasses.dataclass(frozen=True)
 class Member:
     """One scene of a set."""
 
-    split: str
+    split: Literal["train", "test"]
     seed: int
     """Of the recipe."""
     digest: str = ""
@@ -84,20 +86,10 @@ def read_set(path: Path) -> SceneSet:
     Raises:
         SceneError: it cannot be read, or breaks the schema.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise SceneError(f"{path}: not readable as JSON ({error}); make the set again") from None
-    data = dict(known_keys(data, SceneSet, str(path)))
-    members = {}
-    for name, raw in data["scenes"].items():
+    scenes = _SETS.record(_SETS.json(path), SceneSet, str(path))
+    for name in scenes.scenes:
         check_name(name, f"{path}: scenes: a name", SceneError)
-        members[name] = Member(**known_keys(raw, Member, f"{path}: scenes: {name}"))
-        if members[name].split not in SPLITS:
-            raise SceneError(
-                f"{path}: scenes: {name}: split is {members[name].split!r}, expected one of {', '.join(SPLITS)}"
-            )
-    return SceneSet(data["tier"], members, data.get("folder", "."))
+    return scenes
 
 
 def write_set(scenes: SceneSet, path: Path) -> None:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from interactive_nav.config import WINDOW
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.metrics_file import PACKED_METRICS, read_metrics
+from interactive_nav_common.records import PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from topological_nav.evaluate.scores import differences, markdown, summary
 from train.figures import tables

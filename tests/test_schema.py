@@ -31,13 +31,13 @@ def test_round_trip(room, tmp_path):
         (lambda d: d.update(name="/tmp"), "scene.json: name is '/tmp', expected one folder name"),
         (lambda d: d.update(schema_version=9), "schema_version is 9, expected 1"),
         (lambda d: d.update(objects=None), "objects is null, expected a list"),
-        (lambda d: d.update(objects=[1, 2]), r"objects.0.: got int, expected a JSON object"),
+        (lambda d: d.update(objects=[1, 2]), r"objects.0.: got 1, expected a mapping"),
         (lambda d: d["objects"][0].update(name=["a"]), r"objects.0.: name is \[\"a\"\], expected a string"),
         (lambda d: d["objects"][0].update(n_hulls=True), r"n_hulls is true, expected a whole number"),
         (lambda d: d["objects"][0].update(mass_kg="5"), r'mass_kg is "5", expected a number'),
-        (lambda d: d.update(gates=[]), r"gates is \[\], expected an object"),
+        (lambda d: d.update(gates=[]), r"gates is \[\], expected a mapping"),
         (lambda d: d.update(warnings=None), "warnings is null, expected a list"),
-        (lambda d: d.update(source="x" * 999), r'source is "x{50,80}\.\.\., expected an object'),
+        (lambda d: d.update(source="x" * 999), r'source is "x{50,80}\.\.\., expected a mapping'),
     ],
 )
 def test_bad_manifests_are_named(room, change, message):

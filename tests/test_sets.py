@@ -123,6 +123,7 @@ def test_a_set_without_scenes_of_a_split(own: Path, monkeypatch: pytest.MonkeyPa
         ({"scenes": {"one": {"split": "valid", "seed": 1}}}, "one: split is 'valid', expected one of train, test"),
         ({"scenes": {"one": {"split": "train"}}}, "one: missing key 'seed'"),
         ({"scenes": {"../x": {"split": "train", "seed": 1}}}, "scenes: a name is '../x', expected one folder name"),
+        ({"scenes": {"n" * 300: {"split": "train", "seed": 1}}}, "scenes: a name is 'n+...', expected one folder name"),
         ({"scene": {}}, "unknown key 'scene', did you mean 'scenes'"),
     ],
 )

@@ -11,6 +11,7 @@ import yaml
 
 from interactive_nav_common.config import flatten, nearest, overlay, read_words, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.records import Reader
 from scenes_mjcf.sets import scene_folders
 from train.config import AUTO as AUTO_SIZES
 from train.config import TrainConfig, validate
@@ -43,10 +44,7 @@ def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config")
 
 
 def _parsed(text: str, where: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where}: not readable as YAML: {' '.join(str(error).split())}") from None
+    return Reader(ConfigError, "expected settings, see --help", finite=False).decoded(text, "YAML", where)
 
 
 def presets() -> list[str]:

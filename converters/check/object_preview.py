@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import dataclasses
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -15,7 +15,8 @@ from scipy.spatial import ConvexHull
 from converters.read.files import read_image, read_textured_obj
 from converters.records.raw import ScanMesh
 from converters.write.texture import colour_cloud
-from scenes_mjcf.schema import SceneError
+from interactive_nav_common.files import check_name
+from scenes_mjcf.schema import SCENES, SceneError
 
 VIEWS = {
     "from above": np.eye(3),
@@ -40,18 +41,28 @@ def view(
     return image.reshape(*shape, 3)
 
 
+@dataclasses.dataclass(frozen=True)
+class _About:
+    """What is asked of object.json."""
+
+    name: str
+    category: str
+    mass_kg: float
+
+
 def draw_object(folder: Path) -> Figure:
     """Draws the textured surface, and the hulls and boxes that collide, as the object stands at rest.
 
     Raises:
         SceneError: the folder is no readable object.
     """
+    described = folder / "object.json"
+    about = SCENES.record(SCENES.json(described), _About, str(described), others=True)
+    name = check_name(about.name, f"{described}: name", SceneError)
     try:
-        about = json.loads((folder / "object.json").read_text(encoding="utf-8"))
-        name, category, mass_kg = str(about["name"]), str(about["category"]), float(about["mass_kg"])
         model = mujoco.MjModel.from_xml_path(str(folder / "object.xml"))
         body = model.body(name).id
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, ValueError) as error:
         raise SceneError(f"{folder}: is no readable object ({error}); convert it again") from error
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -83,7 +94,9 @@ def draw_object(folder: Path) -> Figure:
     grid[0, 0].plot([left, left + bar_m], [bottom] * 2, color="black", linewidth=4, solid_capstyle="butt")
     grid[0, 0].text(left, bottom, f" {100 * bar_m:g} cm", va="bottom", fontsize=8)
     hulls = sum(model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX for g in range(model.ngeom))
-    figure.suptitle(f"{name}: {category}, {mass_kg:.3g} kg; below: {hulls} hulls (filled) and their boxes (lines)")
+    figure.suptitle(
+        f"{name}: {about.category}, {about.mass_kg:.3g} kg; below: {hulls} hulls (filled) and their boxes (lines)"
+    )
     figure.tight_layout()
     return figure
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import trimesh
 from PIL import Image
 
 from converters.records.errors import SceneRejected
+from interactive_nav_common.records import Reader
 
 
 class SourceFolder:
@@ -92,12 +92,9 @@ def read_json(path: Path) -> Any:
     """Decodes one JSON file.
 
     Raises:
-        SceneRejected: not JSON.
+        SceneRejected: not JSON, or with a number that is not finite or above 2**64.
     """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, a number too long, brackets too deep
-        raise SceneRejected(f"{path}: not readable as JSON ({error}); fetch the file again") from error
+    return Reader(SceneRejected, "fetch the file again").json(path)
 
 
 def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,9 +12,24 @@ import numpy as np
 
 from interactive_nav.scenes.objects import Box, SmallObject, pick
 from interactive_nav.scenes.scene import Movable, read_movable
+from interactive_nav_common.config import Positive
+from interactive_nav_common.files import check_name
+from interactive_nav_common.records import Reader
 from scenes_mjcf.schema import CATEGORIES, SceneError
 
 RGBA = (0.6, 0.6, 0.6, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class _About:
+    """What is asked of object.json."""
+
+    name: str
+    category: str
+    friction: Positive
+
+
+_OBJECTS = Reader(SceneError, "expected a folder made by 'python -m converters object'")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,18 +68,17 @@ def load_object(folder: str | Path) -> ConvertedObject:
     from scenes_mjcf.categories import class_id  # which imports the world that small objects are part of
 
     folder = Path(folder)
-    xml = folder / "object.xml"
+    xml, described = folder / "object.xml", folder / "object.json"
+    about = _OBJECTS.record(_OBJECTS.json(described), _About, str(described), others=True)
+    category, friction = about.category, about.friction
+    name = check_name(about.name, f"{described}: name", SceneError)
     try:
-        about = json.loads((folder / "object.json").read_text(encoding="utf-8"))
-        name, category, friction = str(about["name"]), str(about["category"]), float(about["friction"])
         hulls = sorted((folder / "assets").glob("*_hull_*.obj"))
         sha256 = hashlib.sha256(b"".join(p.read_bytes() for p in (xml, *hulls))).hexdigest()
         model = mujoco.MjModel.from_xml_path(str(xml))
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        reason = f"no key {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
-        raise SceneError(
-            f"{folder}: is no usable object ({reason}), expected a folder made by 'python -m converters object'"
-        ) from error
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise SceneError(f"{folder}: is no usable object ({reason}), {_OBJECTS.remedy}") from error
     if category not in CATEGORIES:
         raise SceneError(f"{folder}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
     movable = _standing(read_movable(model, xml, name, category, friction))

@@ -12,7 +12,6 @@ import functools
 import gzip
 import hashlib
 import json
-import math
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,8 +26,10 @@ from interactive_nav.navigation.ways import Ways
 from interactive_nav.scenes.scene import TASK_DIGEST
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
+from interactive_nav_common.config import Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.records import Reader
 
 FORMAT = "interactive-nav-episodes"
 VERSION = 1
@@ -42,7 +43,7 @@ class EpisodeFile:
     """N episodes, as they stand in a file."""
 
     robot: str
-    seed: int
+    seed: Seed
     scenes: tuple[tuple[str, str], ...]
     """(name, digest) of each scene: `Scene.task_digest`, in old files `Scene.digest`."""
     objects: tuple[str, ...]
@@ -56,8 +57,24 @@ class EpisodeFile:
     that can be moved; metres and radians, world frame."""
 
 
+@dataclasses.dataclass(frozen=True)
+class _Episode:
+    """An entry of `EpisodeFile.episodes`."""
+
+    scene: Natural
+    start_xy_w: tuple[float, float]
+    start_yaw_rad: float
+    goal_xy_w: tuple[float, float]
+    objects: tuple[tuple[float, float, float] | None, ...]
+    shortest_path_m: NotNegative
+    push_needed: bool | None = None
+
+
 class EpisodeFileError(UserError):
     """An episode file that cannot be used; the message says what, where, what was expected and what to do."""
+
+
+_FILES = Reader(EpisodeFileError, "make it again")
 
 
 def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
@@ -229,36 +246,29 @@ def load(path: str | Path) -> EpisodeFile:
         EpisodeFileError: no such file, not such a file, another version, a missing or impossible value.
     """
     try:
-        data = Path(path).read_bytes()
-        data = json.loads(gzip.decompress(data) if Path(path).suffix == PACKED else data)
+        text = Path(path).read_bytes()
+        text = gzip.decompress(text) if Path(path).suffix == PACKED else text
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise EpisodeFileError(f"{path}: not readable as packed with gzip ({error}); make it again") from None
     except OSError as error:
         raise EpisodeFileError(
             f"{path}: cannot read ({error.strerror}); make one with 'python -m interactive_nav.episodes make'"
         ) from None
-    except ValueError:
-        raise EpisodeFileError(f"{path}: not readable as JSON, expected an episode file") from None
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
+    data = _FILES.decoded(text, "JSON", str(path))
+    if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise EpisodeFileError(f"{path}: not an episode file (format is not '{FORMAT}')")
-    if data.get("version") != VERSION:
-        raise EpisodeFileError(f"{path}: version is {data.get('version')!r}, expected {VERSION}; make it again")
-    try:
-        scenes = tuple((str(name), str(digest)) for name, digest in data["scenes"])
-        file = EpisodeFile(
-            robot=str(data["robot"]),
-            seed=int(data["seed"]),
-            scenes=scenes,
-            objects=tuple(data["objects"]),
-            objects_digest=str(data["objects_digest"]),
-            episodes=tuple(data["episodes"]),
-        )
-        for i, row in enumerate(file.episodes):
-            _check(row, i, file)
-    except (KeyError, TypeError) as error:
-        raise EpisodeFileError(f"{path}: missing or malformed entry ({error}); make it again") from None
-    except ValueError as error:
-        raise EpisodeFileError(f"{path}: {error}; make it again") from None
+    if (version := data.pop("version", None)) != VERSION:
+        raise EpisodeFileError(f"{path}: version is {version!r}, expected {VERSION}; make it again")
+    file = _FILES.record(data, EpisodeFile, str(path))
+    if not file.episodes:
+        raise EpisodeFileError(f"{path}: episodes is [], expected at least one; make it again")
+    for i, row in enumerate(file.episodes):
+        episode = _FILES.record(row, _Episode, f"{path}: episodes[{i}]")
+        if episode.scene >= len(file.scenes) or len(episode.objects) != len(file.objects):
+            raise EpisodeFileError(
+                f"{path}: episodes[{i}] is in scene {episode.scene} with {len(episode.objects)} objects, expected one "
+                f"of {len(file.scenes)} scenes and {len(file.objects)} objects; make it again"
+            )
     return file
 
 
@@ -284,14 +294,3 @@ def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
     contents = [Path(path).read_bytes() for path in paths]
     content = contents[0] if len(paths) == 1 else b"".join(hashlib.sha256(data).digest() for data in contents)
     return dataclasses.replace(first, scenes=scenes, episodes=tuple(rows)), hashlib.sha256(content).hexdigest()[:16]
-
-
-def _check(row: dict[str, Any], index: int, file: EpisodeFile) -> None:
-    numbers = [*row["start_xy_w"], row["start_yaw_rad"], *row["goal_xy_w"], row["shortest_path_m"]]
-    numbers += [value for pose in row["objects"] if pose is not None for value in pose]
-    if len(row["start_xy_w"]) != 2 or len(row["goal_xy_w"]) != 2 or not all(math.isfinite(v) for v in numbers):
-        raise ValueError(f"episode {index} has a number missing or not finite")
-    if any(pose is not None and len(pose) != 3 for pose in row["objects"]):
-        raise ValueError(f"episode {index} has an object whose pose is not [x, y, yaw]")
-    if not 0 <= row["scene"] < len(file.scenes) or len(row["objects"]) != len(file.objects):
-        raise ValueError(f"episode {index} names scene {row['scene']} of {len(file.scenes)} or has other objects")

@@ -83,6 +83,7 @@ def test_wrong_tiers_and_settings_of_one_building_are_told_in_a_line(tmp_path, c
     [
         (lambda d: d.update(scene={}), "unknown key 'scene', did you mean 'scenes'"),
         (lambda d: d["scenes"].update(a=3), "scenes: a: got 3, expected a mapping"),
+        (lambda d: d["scenes"]["a"].update(split=["train"]), r'split is \["train"\], expected one of train, test'),
         (lambda d: d["scenes"]["a"].update(split="val"), "split is 'val', expected one of train, test"),
         (lambda d: d["scenes"]["a"].update(tier="full"), "building: tier is 'full', expected one of sparse, furnished"),
         (lambda d: d["scenes"]["a"].update(tier="furnished"), "building: unknown key 'n_chairs'"),

@@ -147,10 +147,22 @@ def test_files_that_do_not_fit_are_refused(env, made, room):
     [
         (lambda d: d.update(version=2), "version is 2, expected 1"),
         (lambda d: d.update(format="x"), "not an episode file"),
-        (lambda d: d.pop("robot"), "missing or malformed entry"),
-        (lambda d: d["episodes"][0].pop("goal_xy_w"), "missing or malformed entry"),
-        (lambda d: d["episodes"][1].update(start_yaw_rad=float("nan")), "episode 1 has a number missing or not finite"),
-        (lambda d: d["episodes"][1].update(scene=7), "episode 1 names scene 7 of 2"),
+        (lambda d: d.pop("robot"), "missing key 'robot'"),
+        (lambda d: d["episodes"][0].pop("goal_xy_w"), r"episodes\[0\]: missing key 'goal_xy_w'"),
+        (
+            lambda d: d["episodes"][1].update(start_yaw_rad=float("nan")),
+            r"\[1\]: start_yaw_rad is NaN, expected a finite",
+        ),
+        (
+            lambda d: d["episodes"][1].update(start_yaw_rad=10**400),
+            r"\[1\]: start_yaw_rad is 10+\.\.\., expected a finite",
+        ),
+        (lambda d: d["episodes"][1].update(scene=7), r"episodes\[1\] is in scene 7 with 3 objects, expected one of 2"),
+        (lambda d: d["episodes"][1].update(scene=0.5), r"episodes\[1\]: scene is 0.5, expected a whole number"),
+        (lambda d: d["episodes"][1].update(start_xy_w=[1.0]), r"start_xy_w is \[1.0\], expected a list of 2"),
+        (lambda d: d.update(episodes=[]), "episodes is \\[\\], expected at least one"),
+        (lambda d: d.update(seed=float("inf")), "seed is Infinity, expected a finite number"),
+        (lambda d: d.update(objects=[["chair"]] * 3), r"objects\[0\] is \[\"chair\"\], expected a string"),
     ],
 )
 def test_damaged_files_are_named(made, tmp_path, change, message):

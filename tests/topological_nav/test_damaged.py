@@ -1,7 +1,5 @@
 """Damaged files and impossible values are told in one line each."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -19,12 +17,19 @@ from topological_nav.weights.packaged import Choice, fitting_map
 
 def told_once(error) -> str:
     text = str(error.value)
-    assert "\n" not in text and "not readable" in text
+    assert "\n" not in text
     return text
 
 
 @pytest.mark.parametrize(
-    "text", ['{"task": "ro', "[]", '{"task": "rooms"}', json.dumps({"task": "rooms", "digest": "d"})]
+    "text",
+    [
+        '{"task": "ro',
+        "[]",
+        '{"task": "rooms"}',
+        '{"task": "rooms", "digest": "d", "export": null}',
+        '{"task": "rooms", "digest": "d"}',
+    ],
 )
 def test_a_damaged_description_of_a_network(text, tmp_path, capsys):
     (tmp_path / "network.json").write_text(text)

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.pictures import replay
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.records import read_metrics
 from tests.toys import write_room
 from tests.train.toy_pixels import SMALL
 from tests.train.toy_run import UPDATE_STEPS, toy_config

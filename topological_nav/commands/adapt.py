@@ -58,7 +58,7 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
 
 
 def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
-    from interactive_nav_common.metrics_file import read_metrics
+    from interactive_nav_common.records import read_metrics
     from topological_nav.adapt.adaptation import adapt_features, target_rooms
     from topological_nav.data.dataset import load_rooms
     from topological_nav.figures.maps import save
@@ -77,7 +77,7 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
 
 
 def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
-    from interactive_nav_common.metrics_file import read_metrics
+    from interactive_nav_common.records import read_metrics
     from topological_nav.adapt.transfer import CONFIGURATIONS, passage_configurations
     from topological_nav.data.dataset import load_passages
     from topological_nav.data.domains import as_seen, preset

@@ -83,7 +83,7 @@ def train(arguments: argparse.Namespace) -> None:
     if config.init != "selfsup":
         refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
-    from interactive_nav_common.metrics_file import read_metrics
+    from interactive_nav_common.records import read_metrics
     from topological_nav.figures.maps import curves_figure, save
     from topological_nav.learn.localise import in_words
     from topological_nav.learn.training import train as train_network
@@ -106,7 +106,7 @@ def _policy(arguments: argparse.Namespace) -> None:
     if arguments.grid:
         refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
-    from interactive_nav_common.metrics_file import read_metrics
+    from interactive_nav_common.records import read_metrics
     from topological_nav.drives.frames import embed_drives
     from topological_nav.drives.imitation import grid_table, train_grid, train_policy
     from topological_nav.figures.drive_figures import policy_figure

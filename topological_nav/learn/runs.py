@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import lzma
@@ -19,7 +20,7 @@ import yaml
 
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.records import Reader, read_metrics
 from interactive_nav_common.versions import versions
 from topological_nav.errors import Asked, RunError, Stopped, readable
 
@@ -153,6 +154,15 @@ def weights_content(run: Path) -> bytes:
     return lzma.decompress(path.read_bytes()) if path.is_file() else (run / WEIGHTS).read_bytes()
 
 
+@dataclasses.dataclass(frozen=True)
+class _Description:
+    """What is asked of every network.json."""
+
+    task: str
+    digest: str
+    export: dict[str, str] = dataclasses.field(default_factory=dict)
+
+
 def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
     """The network.json of a finished run.
 
@@ -167,9 +177,10 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
     path = run / DESCRIPTION
     if not path.is_file():
         raise RunError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")
-    with readable(path, RunError, "train again"):
-        about = json.loads(path.read_text())
-        return {**about, "task": about["task"], "digest": about["digest"]}
+    reader = Reader(RunError, "train again", finite=False)
+    about = reader.json(path)
+    reader.record(about, _Description, str(path), others=True)
+    return about
 
 
 def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:

@@ -29,6 +29,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_folder, write_text
+from interactive_nav_common.records import Reader
 from interactive_nav_common.versions import versions
 from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
@@ -279,10 +280,11 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
     for name in (CONFIG, VERSIONS, RESULTS):
         if not (run / name).is_file():
             raise RunError(f"{run}: has no {name}; finish the run first")
-    made = json.loads((run / VERSIONS).read_text())
+    reader = Reader(RunError, "finish the run first", finite=False)
+    made = reader.typed(reader.json(run / VERSIONS), dict[str, Any], f"{run / VERSIONS}")
     made["commit"] = made.get("commit") or config.commit
     made["argv"] = [_without_folder(word) for word in made.get("argv", [])]
-    device = made.get("device", {}).get("kind")
+    device = reader.typed(made.get("device", {}), dict[str, Any], f"{run / VERSIONS}: device").get("kind")
     if not made["commit"] or not device:
         raise RunError(f"{run}: {VERSIONS} names no {'device' if made['commit'] else 'commit'}; say commit=HASH")
     about = json.loads((run / DESCRIPTION).read_text())

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from interactive_nav_common.errors import FileError, reports_errors
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, read_metrics
+from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves

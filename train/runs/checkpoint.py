@@ -16,8 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav_common.config import Natural
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import writing
+from interactive_nav_common.records import Reader
 from train.errors import CheckpointError
 from train.runs import policy_file
 from train.runs.run_folder import GOES_ON
@@ -29,7 +31,7 @@ LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 class CheckpointMeta:
     """What a checkpoint is of; `meta.json`."""
 
-    env_steps: int
+    env_steps: Natural
     wall_s: float
     """Training time up to here, over all sittings."""
     score: float | None
@@ -128,11 +130,8 @@ def read_meta(folder: Path) -> CheckpointMeta:
     Raises:
         CheckpointError: its `meta.json` is damaged.
     """
-    try:
-        plain = json.loads((folder / META).read_text())
-        return CheckpointMeta(**{**plain, "observations": tuple(plain["observations"])})
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise CheckpointError(f"{folder / META}: not readable ({error}); remove this checkpoint") from None
+    reader = Reader(CheckpointError, "remove this checkpoint", finite=False)
+    return reader.record(reader.json(folder / META), CheckpointMeta, str(folder / META))
 
 
 def is_whole(folder: Path) -> bool:
@@ -189,13 +188,21 @@ def load_learner(folder: Path, template: Any) -> Any:
 
 
 def load_env_state(folder: Path, template: Any) -> Any | None:
-    """The environments of a checkpoint in the template's structure; None if it has none that fit it."""
+    """The environments of a checkpoint in the template's structure; None if it has none that fit it.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
     path = folder / ENV_STATE
     if not path.is_file():
         return None
     leaves, structure = jax.tree.flatten(template)
-    with np.load(path) as stored:
-        arrays = [stored[f"arr_{i}"] for i in range(len(stored.files))]
+    try:
+        with np.load(path) as stored:
+            arrays = [stored[f"arr_{i}"] for i in range(len(stored.files))]
+    except Exception as error:  # a damaged archive fails in zipfile, zlib or NumPy, each in its own way
+        told = " ".join(str(error).split())
+        raise CheckpointError(f"{path}: not readable ({told}); remove it: the run goes on with new episodes") from None
     like = [_raw(leaf) for leaf in leaves]
     if [(a.shape, a.dtype) for a in arrays] != [(x.shape, x.dtype) for x in like]:
         return None

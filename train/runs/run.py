@@ -26,7 +26,7 @@ from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import locked
-from interactive_nav_common.metrics_file import mean_over_episodes
+from interactive_nav_common.records import mean_over_episodes
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.versions import versions
 from scenes_mjcf.sets import scene_folders

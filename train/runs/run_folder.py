@@ -11,16 +11,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from interactive_nav_common.config import flatten
+from interactive_nav_common.config import Natural, NotNegative, flatten
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_text, writing
-from interactive_nav_common.metrics_file import METRICS, read_metrics, write_metrics
+from interactive_nav_common.records import METRICS, RUNS, read_metrics, write_metrics
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.config_io import from_yaml, to_yaml
@@ -32,7 +33,25 @@ MAY_CHANGE = (
 )
 """Settings that a run may be continued with at other values: they do not change what an update does."""
 HEADROOM_MB = 64.0
+VERSIONS = "versions.json"
 GOES_ON = "make room and start again: the run continues from its last checkpoint"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Summary:
+    """What is asked of summary.json."""
+
+    completed: bool = False
+    env_steps: Natural | None = None
+    wall_s: NotNegative | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Versions:
+    """What is asked of versions.json."""
+
+    device: dict[str, Any] | None = None
+    commit: str | None = None
 
 
 class RunFolder:
@@ -82,26 +101,19 @@ class RunFolder:
                         "set run.name to begin another run, or remove the folder"
                     )
         write_text(self.config, to_yaml(config))
-        write_text(self.path / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        write_text(self.path / VERSIONS, json.dumps(versions(), indent=1) + "\n")
         return exists
 
     def origin(self) -> dict[str, Any]:
-        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known."""
-        kept = {}
-        for name in ("summary.json", "versions.json"):
-            try:
-                found = json.loads((self.path / name).read_text())
-            except (OSError, ValueError):
-                found = {}
-            kept[name] = found if isinstance(found, dict) else {}
-        summary, versions = kept.values()
-        return {
-            "completed": summary.get("completed", False),
-            "env_steps": summary.get("env_steps"),
-            "wall_s": summary.get("wall_s"),
-            "device": versions.get("device", {}).get("kind"),
-            "commit": versions.get("commit"),
-        }
+        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known.
+
+        Raises:
+            FileError: summary.json or versions.json is damaged.
+        """
+        found = {}
+        for path, kind in ((self.summary, _Summary), (self.path / VERSIONS, _Versions)):
+            found |= dataclasses.asdict(RUNS.record(RUNS.json(path, {}), kind, str(path), others=True))
+        return {**found, "device": (found["device"] or {}).get("kind")}
 
     def append_metrics(self, line: dict[str, Any]) -> None:
         """Adds one line to metrics.jsonl.

@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 
 from interactive_nav_common.files import whole_file, writing
-from interactive_nav_common.metrics_file import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
+from interactive_nav_common.records import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from train.errors import CheckpointError
 from train.runs import checkpoint

@@ -21,8 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav.task.episode_files import load_all
+from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_partial, write_text
 from interactive_nav_common.locks import is_locked
+from interactive_nav_common.records import RUNS
 from interactive_nav_common.rows import read_notes
 from train.config_io import to_yaml
 from train.runs.run_folder import RunFolder
@@ -47,6 +49,14 @@ class RunState:
     """Why it failed, one line."""
     over: bool = False
     """Nothing is left to train, whoever works on it now."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Failure:
+    """Content of failed/<run>.json."""
+
+    reason: str
+    attempts: int
 
 
 class SweepFolder:
@@ -109,9 +119,9 @@ class SweepFolder:
         """Why a run was given up; empty where it was not. Read once: another sweep may try the run again meanwhile."""
         path = self.root / "failed" / f"{run}.json"
         try:
-            return json.loads(path.read_text())["reason"]
-        except FileNotFoundError:
-            return ""
+            return RUNS.record(RUNS.json(path, {"reason": "", "attempts": 0}), _Failure, str(path)).reason
+        except FileError as error:
+            return str(error)
 
     def asked(self, run: RunSpec) -> EvaluationAsked:
         """The evaluation that the sweep wants of a run."""
@@ -152,7 +162,9 @@ class SweepFolder:
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:
         """Notes why a run was given up."""
-        write_text(self.root / "failed" / f"{run}.json", json.dumps({"reason": reason, "attempts": attempts}) + "\n")
+        write_text(
+            self.root / "failed" / f"{run}.json", json.dumps(dataclasses.asdict(_Failure(reason, attempts))) + "\n"
+        )
 
     def try_again(self, run: str) -> None:
         """Forgets that a run was given up."""

@@ -231,7 +231,7 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
             raise ConfigError(f"--where {word!r}: expected setting=value[,value], for example env.robot=fetch")
         try:
             chosen = [yaml.safe_load(item) for item in text.split(",")]
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, RecursionError):
             raise ConfigError(f"--where {word!r}: not readable, expected setting=value[,value]") from None
         wanted = _where({axis: chosen}, sweep.config, f"--where {word}")
         runs = [run for run in runs if _matches(wanted, run.values)]

@@ -173,7 +173,10 @@ class _Reader:
             origin = _numbers(about, "COM", (0.0, 0.0, 0.0), config)
         mass = _number(about, "mass", DEFAULT_MASS_KG, config) if kind == OBJECT else None
         friction = _number(about, "friction_coefficient", 0.0, config)
-        label = self._classes.get(about.get("semantic_id") if kind == OBJECT else None, "")
+        number = about.get("semantic_id") if kind == OBJECT else None
+        if not isinstance(number, int | None):
+            raise SceneRejected(f"{config}: semantic_id is {_short(number)}, expected a whole number")
+        label = self._classes.get(number, "")
         own = Path(name).name
         return _Asset(
             render, collision, origin, f"{own}_{label}" if label else own, mass, friction if 0 < friction <= 2 else None
@@ -286,7 +289,7 @@ def _numbers(parent: dict[str, Any], key: str, default: tuple[float, ...], path:
     value = parent.get(key, default)
     try:
         found = np.array(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.full(1, np.nan)
     if found.shape != np.shape(default) or not np.isfinite(found).all() or np.abs(found).max() > 1e6:
         raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {len(default)} usable numbers")

@@ -27,6 +27,7 @@ from interactive_nav_common.rotations import matrix_from_quat
 DEEPEST = 16
 """Includes within includes."""
 MOST_GEOMS = 100_000
+FARTHEST_M = 1e4
 FOLDERS = ("assetdir", "meshdir", "texturedir")
 _GEOM = mujoco.mjtGeom
 
@@ -108,6 +109,8 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
     for joint in range(model.njnt):
         if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             dropped[f"{mujoco.mjtJoint(model.jnt_type[joint]).name[6:].lower()} joint (stays as it is)"] += 1
+    if not (np.abs(data.geom_xpos) < FARTHEST_M).all():  # NaN too
+        raise SceneRejected(f"{path}: a geom stands at no usable place, expected all within {FARTHEST_M:g} m")
     span = float(2.0 * max(np.abs(data.geom_xpos).max(initial=0.0), 2.0))
     parts = []
     for body in range(model.nbody):

@@ -110,7 +110,7 @@ def test_refusals(tmp_path, folders):
         make_config(objects="a/b")
     with pytest.raises(UserError, match="small_objects is 'test', expected train, its default"):
         make_config(objects=folders, small_objects="test")
-    with pytest.raises(SceneError, match="is no usable object .*made by 'python -m converters object'"):
+    with pytest.raises(SceneError, match="object.json: cannot be read .*made by 'python -m converters object'"):
         load_object(tmp_path)
     about = json.loads((tmp_path.parent / folders[0] / "object.json").read_text())
     (tmp_path / "object.json").write_text(json.dumps(about | {"category": "ship"}))

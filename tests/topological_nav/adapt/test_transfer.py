@@ -12,7 +12,7 @@ from PIL import Image
 
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.records import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.adapt import adaptation, transfer
 from topological_nav.adapt.config import AdaptConfig

@@ -11,7 +11,7 @@ import optax
 import pytest
 
 from interactive_nav_common.config import overridden
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.records import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
 from topological_nav.drives import imitation

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from interactive_nav_common.config import overridden
-from interactive_nav_common.metrics_file import read_metrics
+from interactive_nav_common.records import read_metrics
 from topological_nav.config import TrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.errors import RunError, Stopped

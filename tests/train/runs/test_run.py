@@ -25,7 +25,7 @@ from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import release, take_lock
-from interactive_nav_common.metrics_file import mean_over_episodes, read_metrics
+from interactive_nav_common.records import mean_over_episodes, read_metrics
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import __main__ as program
@@ -243,6 +243,29 @@ def test_folder_trouble_is_found_before_training(tmp_path, monkeypatch):
         train_run(toy_config(tmp_path), quiet(), build_env=lambda _: pytest.fail("too late"))
     with pytest.raises(FileError, match="10 MB free on its disk, expected 164 MB"):
         claim(tmp_path, 100.0)
+
+
+def test_damaged_files_of_a_checkpoint_and_of_a_run_are_one_line_each(finished, tmp_path):
+    config, *_ = finished
+    shutil.copytree(Path(config.run.out_dir) / config.run.name, tmp_path / config.run.name)
+    run = dataclasses.replace(config.run, out_dir=str(tmp_path), num_timesteps=config.run.num_timesteps + UPDATE_STEPS)
+    folder = RunFolder(tmp_path / config.run.name)
+    path, _ = checkpoint.find(folder.checkpoints, "last")
+    whole = (path / checkpoint.ENV_STATE).read_bytes()
+    (path / checkpoint.ENV_STATE).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError, match="env_state.npz: not readable .*; remove it"):
+        train_run(dataclasses.replace(config, run=run), quiet(), build_env=build_toy)
+    about = json.loads((path / checkpoint.META).read_text())
+    for wrong, told in (("x", '"x"'), (1.5, "1.5"), (-1, "-1"), (None, "null")):
+        (path / checkpoint.META).write_text(json.dumps(about | {"env_steps": wrong}))
+        with pytest.raises(CheckpointError, match=f"meta.json: env_steps is {told}, expected a whole number"):
+            checkpoint.list_checkpoints(folder.checkpoints)
+    (folder.path / "versions.json").write_text('{"device": "cpu"}')
+    with pytest.raises(FileError, match='versions.json: device is "cpu", expected a mapping'):
+        folder.origin()
+    folder.summary.write_text('{"env_steps": "7"}')
+    with pytest.raises(FileError, match='summary.json: env_steps is "7", expected a whole number'):
+        folder.origin()
 
 
 def test_many_claim_one_folder_at_once(tmp_path):

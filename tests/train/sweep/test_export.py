@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from interactive_nav_common.metrics_file import PACKED_METRICS, read_metrics
+from interactive_nav_common.records import PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from tests.train.sweep.test_sweep import write_sweep
 from tests.train.synthetic import run_rows

@@ -123,19 +123,30 @@ def test_how_far_a_run_is_is_told_while_another_sweep_tries_it_again(tmp_path):
     def other_sweep() -> None:
         while not over.is_set():
             folder.give_up(run.name, "train: ended with exit code 1", 3)
+            time.sleep(1e-4)
             folder.try_again(run.name)
 
     with ThreadPoolExecutor(1) as pool:
         other = pool.submit(other_sweep)
         try:
             told, until = set(), time.monotonic() + 1.0
-            while time.monotonic() < until:
+            while time.monotonic() < until or len(told) < 2:
                 state = folder.state(run)
                 told.add((state.state, state.reason))
         finally:
             over.set()
         other.result()
     assert told == {("waiting", ""), ("failed", "train: ended with exit code 1")}
+
+
+def test_a_truncated_reason_is_told_with_the_status(tmp_path, capsys):
+    path = write_sweep(tmp_path)
+    folder = SweepFolder(spec.load(str(path)))
+    folder.prepare()
+    (folder.root / "failed" / f"{folder.sweep.runs[0].name}.json").write_text('{"reason": "tr')
+    assert main([str(path), "--status"]) == 0
+    state = folder.state(folder.sweep.runs[0])
+    assert state.state == "failed" and "not readable as JSON" in state.reason
 
 
 def test_what_a_killed_evaluation_left_goes_at_the_next_start(tmp_path):

@@ -161,6 +161,25 @@ def test_any_value_anywhere_is_read_or_refused(source, where, key, value):
         path.write_text(before)
 
 
+@pytest.mark.parametrize(
+    ("where", "key", "value", "message"),
+    [
+        ("objects/0f3a.object_config.json", "semantic_id", [1], r"semantic_id is \[1\], expected a whole number"),
+        (f"configs/scenes/apt_0{SCENE}", "rotation", [10**400, 0, 0, 0], r"rotation\[0\] is 10+\.\.\., expected a"),
+    ],
+)
+def test_what_numpy_or_a_table_cannot_take_is_told_with_its_key(source, where, key, value, message):
+    before = (source / where).read_text()
+    table = json.loads(before)
+    (table["object_instances"][1] if "object_instances" in table else table)[key] = value
+    (source / where).write_text(json.dumps(table))
+    try:
+        with pytest.raises(SceneRejected, match=message):
+            read_habitat(source)
+    finally:
+        (source / where).write_text(before)
+
+
 def test_what_lies_outside_of_the_folder_is_not_read(source, tmp_path):
     config = source / "objects" / "0f3a.object_config.json"
     before = config.read_text()

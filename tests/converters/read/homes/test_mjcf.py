@@ -99,6 +99,7 @@ def test_a_scene_of_our_own_comes_back(tmp_path):
         ('file="more.xml"', 'file="home.xml"', "does one include itself"),
         ('file="more.xml"', 'file="absent.xml"', "no such file"),
         ('type="capsule"', 'type="donut"', "MuJoCo refuses it"),
+        ('pos="-1 0.5 0"', 'pos="NaN 0.5 0"', "home.xml: a geom stands at no usable place"),
         ("</worldbody>", "", "not readable as MJCF|no known layout|are none"),
     ],
 )

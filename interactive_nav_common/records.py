@@ -1,0 +1,215 @@
+"""JSON and YAML files in, plain values and typed records out; every mistake is one line that names file and key.
+
+A record is a dataclass: its types say what its keys may hold, `Annotated` with `Bounds` how large numbers may be.
+Lines of metrics too, packed or not, and back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import gzip
+import json
+import types
+import typing
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+
+from interactive_nav_common.config import Bounds, nearest
+from interactive_nav_common.errors import FileError, UserError
+from interactive_nav_common.files import whole_file, write_text
+
+Record = TypeVar("Record")
+LARGEST = 2.0**64
+"""Of numbers: seeds and sizes in bytes are below, and no float of 32 bits overflows."""
+KINDS: dict[Any, tuple[type | types.UnionType, str]] = {
+    str: (str, "a string"),
+    bool: (bool, "true or false"),
+    int: (int, "a whole number"),
+    float: (int | float, "a number"),
+    tuple: (list | tuple, "a list"),
+    dict: (dict, "a mapping"),
+}
+"""A type -> what decoded files hold for it, and its name in errors."""
+
+
+@functools.cache
+def _fields(cls: type) -> dict[str, tuple[Any, bool]]:
+    """Name of each field -> its type, and whether it must be given."""
+    hints, none = typing.get_type_hints(cls, include_extras=True), dataclasses.MISSING
+    return {f.name: (hints[f.name], f.default is none and f.default_factory is none) for f in dataclasses.fields(cls)}
+
+
+def shown(value: Any, most: int = 60) -> str:
+    """A decoded value as a file writes it, cut to `most` characters."""
+    try:
+        text = json.dumps(value, default=repr)
+    except (ValueError, TypeError, RecursionError):  # a number of thousands of digits, a key of another kind, a circle
+        text = type(value).__name__
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """How files of one kind are read."""
+
+    error: type[UserError]
+    """Raised for what cannot be used."""
+    remedy: str
+    """Ends its message."""
+    finite: bool = True
+    """All numbers must be finite and below 2**64; measured scores may be none."""
+
+    def json(self, path: Path, absent: Any = None) -> Any:
+        """The decoded file; `absent`, unless None, where there is none.
+
+        Raises:
+            UserError: it cannot be read, is not JSON, or holds such a number.
+        """
+        try:
+            return self.decoded(path.read_bytes(), "JSON", str(path))
+        except OSError as error:
+            if isinstance(error, FileNotFoundError) and absent is not None:
+                return absent
+            raise self.error(f"{path}: cannot be read ({error.strerror or error}); {self.remedy}") from None
+
+    def decoded(self, text: str | bytes, kind: Literal["JSON", "YAML"], where: str) -> Any:
+        """As `json`, of a file's text."""
+        try:
+            value = (json.loads if kind == "JSON" else yaml.safe_load)(text)
+        except (ValueError, RecursionError, yaml.YAMLError) as error:  # no UTF-8, a number too long, brackets too deep
+            told = " ".join(str(error).split())[:200]
+            raise self.error(f"{where}: not readable as {kind} ({told}); {self.remedy}") from None
+        if self.finite:
+            self._check_numbers(value, where)
+        return value
+
+    def record(self, data: Any, cls: type[Record], where: str, others: bool = False) -> Record:
+        """A decoded mapping as a record: lists become tuples, mappings records where the types say so.
+
+        Args:
+            data: decoded.
+            cls: dataclass.
+            where: named in errors.
+            others: keys that the record lacks are passed over.
+
+        Raises:
+            UserError: no mapping, an unknown or missing key, a value of another type or out of bounds.
+        """
+        if not isinstance(data, dict):
+            raise self.error(f"{where}: got {shown(data)}, expected a mapping; {self.remedy}")
+        fields = _fields(cls)
+        data = {key: value for key, value in data.items() if key in fields} if others else data
+        for key in data:
+            if key not in fields:
+                known = sorted(fields)
+                near = nearest(str(key), known)
+                raise self.error(f"{where}: unknown key '{key!s:.60}'{near}; known keys: {', '.join(known)}")
+        for key, (_, required) in fields.items():
+            if required and key not in data:
+                raise self.error(f"{where}: missing key '{key}'; {self.remedy}")
+        return cls(**{key: self.typed(value, fields[key][0], f"{where}: {key}") for key, value in data.items()})
+
+    def typed(self, value: Any, hint: Any, where: str) -> Any:
+        """A decoded value as its type wants it.
+
+        Raises:
+            UserError: it is of another type or out of bounds.
+        """
+        origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+        if hint is Any or (origin in (types.UnionType, typing.Union) and value is None and type(None) in arguments):
+            return value
+        if dataclasses.is_dataclass(hint):
+            return self.record(value, typing.cast(type, hint), where)
+        if origin in (types.UnionType, typing.Union):  # the first that takes it; else what the last one says
+            *others, last = (kind for kind in arguments if kind is not type(None))
+            for kind in others:
+                try:
+                    return self.typed(value, kind, where)
+                except self.error:
+                    continue
+            return self.typed(value, last, where)
+        if origin is Literal:
+            if not isinstance(value, str) or value not in arguments:
+                told = repr(value) if isinstance(value, str) and len(value) < 60 else shown(value)
+                raise self.error(f"{where} is {told}, expected one of {', '.join(map(str, arguments))}; {self.remedy}")
+            return value
+        if origin is Annotated:
+            bounds = Bounds(*arguments[1])
+            if not bounds.hold(self.typed(value, arguments[0], where)):
+                what = f"a whole number, {bounds}" if arguments[0] is int else bounds
+                raise self.error(f"{where} is {shown(value)}, expected {what}; {self.remedy}")
+            return value
+        kinds, words = KINDS[origin or hint]
+        if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
+            raise self.error(f"{where} is {shown(value)}, expected {words}; {self.remedy}")
+        if origin is dict:
+            return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in value.items()}
+        if origin is tuple:
+            each = [arguments[0]] * len(value) if arguments[1:] == (...,) else arguments
+            if len(each) != len(value):
+                raise self.error(f"{where} is {shown(value)}, expected a list of {len(each)}; {self.remedy}")
+            return tuple(
+                self.typed(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(value, each, strict=True))
+            )
+        return value
+
+    def _check_numbers(self, value: Any, where: str) -> None:
+        left, seen = [(where, value)], set()
+        while left:
+            place, item = left.pop()
+            if isinstance(item, int | float) and not abs(item) < LARGEST:  # NaN too
+                raise self.error(f"{place} is {shown(item)}, expected a finite number below 2**64; {self.remedy}")
+            if isinstance(item, dict | list) and id(item) not in seen:  # YAML's anchors may share, or make circles
+                seen.add(id(item))
+                pairs = item.items() if isinstance(item, dict) else enumerate(item)
+                left += [(f"{place}[{k}]" if isinstance(item, list) else f"{place}: {k!s:.60}", v) for k, v in pairs]
+
+
+RUNS = Reader(FileError, "make it again or remove it", finite=False)
+"""Small files of runs."""
+METRICS, PACKED_METRICS = "metrics.jsonl", "metrics.jsonl.gz"
+"""Of a run, and of one that was exported."""
+
+
+def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
+    """Writes a metrics.jsonl, or, where the name ends in .gz, a packed one."""
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    if path.suffix == ".gz":
+        with whole_file(path) as partial:
+            partial.write_bytes(gzip.compress(text.encode(), mtime=0))
+    else:
+        write_text(path, text)
+
+
+def mean_over_episodes(lines: Sequence[dict[str, Any]], name: str) -> float | None:
+    """Mean of a score over the episodes of some lines of metrics; None where none ended."""
+    scored = [(line[name], line["episodes"]) for line in lines if name in line]
+    episodes = sum(count for _, count in scored)
+    return sum(score * count for score, count in scored) / episodes if episodes else None
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    try:
+        everything = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    except (OSError, EOFError, zlib.error) as error:
+        raise FileError(f"{path}: not readable ({error}); expected the metrics of a run") from None
+    lines = []
+    for text in everything.decode(errors="replace").splitlines():
+        try:
+            line = json.loads(text)
+        except ValueError:
+            break
+        if not isinstance(line, dict):
+            break
+        lines.append(line)
+    return lines
