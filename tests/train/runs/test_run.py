@@ -246,15 +246,13 @@ def test_folder_trouble_is_found_before_training(tmp_path, monkeypatch):
 
 
 def test_damaged_files_of_a_checkpoint_and_of_a_run_are_one_line_each(finished, tmp_path):
-    config, *_ = finished
-    shutil.copytree(Path(config.run.out_dir) / config.run.name, tmp_path / config.run.name)
-    run = dataclasses.replace(config.run, out_dir=str(tmp_path), num_timesteps=config.run.num_timesteps + UPDATE_STEPS)
-    folder = RunFolder(tmp_path / config.run.name)
+    shutil.copytree(finished[1].path, tmp_path / "toy")
+    folder = RunFolder(tmp_path / "toy")
     path, _ = checkpoint.find(folder.checkpoints, "last")
     whole = (path / checkpoint.ENV_STATE).read_bytes()
     (path / checkpoint.ENV_STATE).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(CheckpointError, match="env_state.npz: not readable .*; remove it"):
-        train_run(dataclasses.replace(config, run=run), quiet(), build_env=build_toy)
+        train_run(toy_config(tmp_path, updates=6), quiet(), build_env=build_toy)
     about = json.loads((path / checkpoint.META).read_text())
     for wrong, told in (("x", '"x"'), (1.5, "1.5"), (-1, "-1"), (None, "null")):
         (path / checkpoint.META).write_text(json.dumps(about | {"env_steps": wrong}))
