@@ -18,6 +18,7 @@ def write_room(
     partition: bool = False,
     resolution_m: float = 0.05,
     split: str = "train",
+    half_m: tuple[float, float, float] = (0.2, 0.2, 0.2),
 ) -> Path:
     """A rectangular room centred on the origin, with cubes of 0.4 m as furniture.
 
@@ -29,6 +30,7 @@ def write_room(
         partition: adds a wall along y at x = 0 with a gap of 1 m at its upper end.
         resolution_m: of the map.
         split: train or test.
+        half_m: half sizes of the furniture, where it is no cube.
     """
     folder = Path(folder)
     (folder / "assets").mkdir(parents=True)
@@ -82,7 +84,7 @@ def write_room(
         objects.append(SceneObject(name, category, mass, friction, len(boxes), "toy"))
 
     for category, x, y, mass, friction in blocks:
-        movable(category, [x, y, 0.2], [((0, 0, 0), (0.2, 0.2, 0.2))], mass, friction)
+        movable(category, [x, y, half_m[2]], [((0, 0, 0), half_m)], mass, friction)
     if door:
         leaf = [((0.4, 0, 0.5), (0.4, 0.02, 0.49))]
         movable("door", [-1.0, -ly / 2 + 0.1, 0.0], leaf, 8.0, 0.4, hinge=(-1.5, 1.5))

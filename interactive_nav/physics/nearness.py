@@ -25,6 +25,10 @@ TOUCH_M = 0.15
 """What is this near to a moving object can be met by it: at 1 m/s it moves 0.1 m in a control step."""
 MOVING_M_S = 0.05
 """Or rad/s. What rests in the solver's tolerance turns by up to 0.02."""
+_PUSH_M = 0.3
+"""What is this near to the robot's footprint may be pushed before the window is chosen anew."""
+_PUSHED = 4
+"""Objects that walls are measured against: the nearest that move or may be pushed."""
 _MOVERS = 2
 """Moving objects that others are measured against: the fastest."""
 FAR_M = 1e6
@@ -98,23 +102,49 @@ class Nearness:
         outside = xp.maximum(xp.abs(offset) - half, 0.0)
         return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
 
-    def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> tuple[Array, Array]:
+    def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
+        """[W] m to where each wall box can be met: within `reach_m` of the robot, or `TOUCH_M` of what it may push.
+
+        Args:
+            scene: [] i32.
+            state: of one environment.
+            reach_m: from the robot's centre.
+            boxes: of all slots.
+            push_m: [M] m to where each may be pushed; negative where it may.
+        """
+        xp, gap = namespace(state.qpos), self.walls_m(scene, state) - reach_m
+        xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
+        walls = Boxes(xpos, xp.pad(xmat, ((0, 0), (0, 0), (0, 1))), xp.pad(half, ((0, 0), (0, 1))))
+        nearest = xp.argsort(push_m)
+        for k in range(min(_PUSHED, len(push_m))):
+            one = nearest[k]
+            if xp is np and push_m[one] >= 0:
+                break
+            behind = walls.gap_m(boxes.centre[one], boxes.axes[one], boxes.half[one]) - TOUCH_M
+            gap = xp.where((push_m[one] < 0) & (used > 0), xp.minimum(gap, behind), gap)
+        return gap
+
+    def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> tuple[Array, Array, Array]:
         """How far each slot is from where it can be met: within `reach_m` of the robot, or `TOUCH_M` of what moves.
 
         Returns:
-            [M] m, negative where it can be met, `FAR_M` for empty slots; [M] whether it moves.
+            [M] m, negative where it can be met, `FAR_M` for empty slots; [M] whether it moves; [W] m to where each
+            wall can be met, see `_walls_gap_m`.
         """
         boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.occupied)[scene]
         gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2, 3), jnp.zeros(3)) - reach_m
         speed = jnp.where(occupied, jnp.abs(state.qvel[self._qvel]).max(-1), 0.0)
         moving = speed > MOVING_M_S
+        push = jnp.where(moving, -FAR_M, gap + (REACH_M - _PUSH_M))
         fastest, movers = jax.lax.top_k(speed, min(_MOVERS, len(self.hinge)))
         for k in range(len(movers)):
             one = movers[k]
             behind = boxes.gap_m(boxes.centre[one], boxes.axes[one], boxes.half[one]) - TOUCH_M
             behind = jnp.where(jnp.arange(len(self.hinge)) == one, FAR_M, behind)
-            gap = jnp.where(fastest[k] > MOVING_M_S, jnp.minimum(gap, behind), gap)
-        return jnp.where(occupied, gap, FAR_M), moving
+            behind = jnp.where(fastest[k] > MOVING_M_S, behind, FAR_M)
+            gap, push = jnp.minimum(gap, behind), jnp.minimum(push, behind)
+        walls = self._walls_gap_m(scene, state, reach_m, boxes, jnp.where(occupied, push, FAR_M))
+        return jnp.where(occupied, gap, FAR_M), moving, walls
 
     def widths(self, reach_m: float) -> dict[str, int]:
         """How many of each kind of slot, and of walls, a window needs: at rest, with the robot anywhere on free floor.
@@ -134,11 +164,13 @@ class Nearness:
                 places = np.asarray(maps.origin_w) + maps.resolution_m * places
                 qpos[self._robot] = places[0]
                 qpos[self._qpos[small, :2]] = places[1:]
-                gap = self.boxes(scene, state).gap_m(qpos[self._robot], np.eye(2, 3), np.zeros(3))
-                near = (gap < reach_m) & world.occupied[scene]
+                boxes = self.boxes(scene, state)
+                gap = np.where(world.occupied[scene], boxes.gap_m(qpos[self._robot], np.eye(2, 3), np.zeros(3)), FAR_M)
+                near = gap < reach_m
+                walls = self._walls_gap_m(scene, state, reach_m, boxes, gap - reach_m + (REACH_M - _PUSH_M))
                 for kind in ("small", "free", "hinge"):
                     counts[kind].append(int(near[kinds == kind].sum()))
-                counts["walls"].append(int((self.walls_m(scene, state) < reach_m).sum()))
+                counts["walls"].append(int((walls < 0).sum()))
         # At least one: 0 stands for all.
         return {k: max(1, int(np.quantile(c, _SHARE, method="higher"))) for k, c in counts.items()}
 

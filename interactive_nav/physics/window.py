@@ -170,8 +170,7 @@ class Window:
 
     def _near(self, scene: jax.Array, state: PhysicsState) -> tuple[jax.Array, jax.Array, jax.Array]:
         """[slots] m to where each can be met, [slots] whether it moves, [walls] m likewise; see `Nearness.measure`."""
-        near, moving = self._nearness.measure(scene, state, self._reach_m)
-        return near, moving, self._nearness.walls_m(scene, state) - self._reach_m
+        return self._nearness.measure(scene, state, self._reach_m)
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
         """Values of all `FIELDS` of the window's model, in MuJoCo's shapes."""

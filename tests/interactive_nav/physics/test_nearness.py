@@ -123,7 +123,7 @@ def test_what_stands_behind_a_moving_thing_is_near_however_far_from_the_robot(wo
     qpos = world.rest_qpos[0].copy()
     qpos[:7] = [0.0, 0.0, 0, 1, 0, 0, 0]
     measure = jax.jit(lambda state: near.measure(jnp.asarray(0), state, 0.78))
-    rest, moving = measure(_state(world, qpos))
+    rest, moving, _ = measure(_state(world, qpos))
     assert not moving.any()
     sofa, chair, table = (slot[f"{name}_0"] for name in ("sofa", "chair", "table"))
     boxes = jax.jit(near.boxes)(jnp.asarray(0), _state(world, qpos))
@@ -131,7 +131,7 @@ def test_what_stands_behind_a_moving_thing_is_near_however_far_from_the_robot(wo
     shadows = [_shadow(boxes.centre[s], _whole(boxes.axes[s]), boxes.half[s]) for s in (sofa, chair)]
     assert between == pytest.approx(shadows[0].distance(shadows[1]), abs=0.02)
     still = jnp.zeros(world.models[0].nv)
-    pushed, moves = measure(_state(world, qpos, still.at[world.layout.slot_qvel[sofa]].set(0.3)))
+    pushed, moves, _ = measure(_state(world, qpos, still.at[world.layout.slot_qvel[sofa]].set(0.3)))
     assert bool(moves[sofa]) and not bool(moves[chair])
     np.testing.assert_allclose(pushed[chair], min(float(rest[chair]), between - TOUCH_M), atol=1e-4)
     assert float(pushed[table]) > 1.0 and float(pushed[sofa]) == pytest.approx(float(rest[sofa]))

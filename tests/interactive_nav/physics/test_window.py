@@ -150,6 +150,55 @@ def test_a_push_in_a_window_is_that_of_the_whole_building(world):
         assert window_force[slot] == 0.0 == force[slot]
 
 
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory):
+    """A sofa of 1.6 m lies along a room 1.6 m wide, 0.05 m from its end; the robot stands behind it."""
+    sofa = (("sofa", 1.65, 0.0, 3.0, 0.3),)
+    folder = write_room(tmp_path_factory.mktemp("narrow") / "room", (5.0, 1.6), sofa, half_m=(0.8, 0.2, 0.2))
+    return build_world(get_robot("turtlebot"), (load_scene(folder),), NavConfig.of(num_objects=0))
+
+
+def test_a_pushed_sofa_does_not_enter_a_wall_in_a_window(narrow):
+    """For 2 s, the window's own model in C MuJoCo against everything: the wall is 1.9 m away from the robot."""
+    world, window = narrow, Window(narrow, NavConfig.of(num_objects=0, active_walls=1))
+    physics = make_physics(world, NavConfig.of(num_objects=0, backend="native", sleep=False))
+    model, data = window.model, mujoco.MjData(window.model)
+    # C MuJoCo's trees of boxes are those of the model as compiled: without them geoms may be resized.
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    model.bvh_aabb[:, 3:] = 10.0
+
+    @jax.jit
+    def enter(state):
+        chosen, walls, _ = window.select(jnp.asarray(0), state)
+        return chosen, window.fields(jnp.asarray(0), chosen, walls), window.enter(state, chosen)
+
+    step, command = jax.jit(physics.step), jnp.full(2, 14.0)
+    first = whole = part = _state(world, 0, (0.6, 0.0))
+    for _ in range(20):
+        whole, _ = step(jnp.asarray(0), whole, command)
+        chosen, fields, inner = enter(part)
+        for name, value in fields.items():
+            getattr(model, name)[:] = np.asarray(value).reshape(getattr(model, name).shape)
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = inner.qpos, inner.qvel, inner.qacc_warmstart
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data, nstep=5)
+        new = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart))
+        part = window.leave(part, PhysicsState(*new), chosen)
+    sofa = world.layout.slot_qpos[world.names[0].index("sofa_0")]
+    moved = [float(s.qpos[sofa] - first.qpos[sofa]) for s in (whole, part)]
+    assert moved == pytest.approx([0.05, 0.05], abs=2e-3), "0.05 m to the wall"
+
+
+def test_walls_left_out_behind_what_may_be_pushed_are_told(narrow):
+    one, two = (Window(narrow, NavConfig.of(num_objects=0, active_walls=n)) for n in (1, 2))
+    beside = _state(narrow, 0, (0.6, 0.4))  # 0.4 m from a side wall, 1.9 m from the wall behind the sofa
+    far = _state(narrow, 0, (-0.5, 0.4))  # out of the sofa's reach
+    left = {n: [int(jax.jit(w.select)(0, s)[2]) for s in (beside, far)] for n, w in ((1, one), (2, two))}
+    assert left == {1: [1, 0], 2: [0, 0]}
+    counts = [int(jax.jit(one.needs)(0, s)["walls"]) for s in (beside, far)]
+    assert counts == [2, 1]
+
+
 @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs the package warp-lang")
 def test_overflow_bits_are_the_engines():
     from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Bit
