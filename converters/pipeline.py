@@ -40,7 +40,7 @@ from converters.structure.floor import level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.structure.walls import wall_boxes
 from converters.write.emit import SceneParts, write_scene
-from converters.write.manifest import make_manifest
+from converters.write.manifest import make_manifest, scene_objects
 from converters.write.texture import bake_object, bake_structure, colour_cloud
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.rotations import matrix_from_quat
@@ -283,7 +283,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         save_maps(maps, folder)
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
-        gates = evaluate(spec, maps, tuple(o.name for o in parts.objects))
+        gates = evaluate(spec, maps, scene_objects(parts))
         area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
         manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
         save_manifest(manifest, folder)

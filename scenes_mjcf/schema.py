@@ -160,8 +160,8 @@ def load_maps(folder: str | Path) -> SceneMaps:
         raise SceneError(f"{path}: traversable is {traversable.dtype}{traversable.shape}, expected a 2-D bool array")
     if not 0 < resolution <= 0.05 + 1e-9:
         raise SceneError(f"{path}: resolution is {resolution} m, expected at most 0.05 m")
-    if origin.shape != (2,):
-        raise SceneError(f"{path}: origin has shape {origin.shape}, expected (2,)")
+    if origin.shape != (2,) or not np.isfinite([*origin, floor_height]).all():
+        raise SceneError(f"{path}: origin is {origin}, floor_height {floor_height}, expected x, y and a height, finite")
     if not traversable.any():
         raise SceneError(f"{path}: the traversable map is empty; the scan needs visible floor")
     return SceneMaps(traversable, resolution, (float(origin[0]), float(origin[1])), floor_height)

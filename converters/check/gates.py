@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -11,9 +12,10 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
+from converters.check.agreement import manifest_values, wall_values
 from converters.records.gate import Gate, Limit
 from converters.structure.maps import label_pieces
-from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
 
 ROBOT_RADIUS_M = 0.18
 """Free space is judged for a TurtleBot-sized disc."""
@@ -35,6 +37,12 @@ LIMITS: dict[str, Limit] = {
     "turn_boxes": Limit("deg", most=1.0, meaning="the same with boxes"),
     "penetration_hulls": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, hulls"),
     "penetration_boxes": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, boxes"),
+    "rim_without_wall": Limit("share", most=0.02, meaning="of the free floor's rim, what no wall bounds"),
+    "walls_in_floor": Limit("share", most=0.01, meaning="of the free floor, what lies within walls"),
+    "manifest_differs": Limit("count", most=0, meaning="masses and frictions that scene.xml and scene.json differ in"),
+    "mass_ratio": Limit("ratio", most=4.0, meaning="of a mass to the nearer end of its category's usual range"),
+    "least_friction": Limit("ratio", least=0.05, meaning="smallest sliding coefficient of a movable"),
+    "physics_changed": Limit("count", most=0, meaning="gravity, air, floor or flags other than every scene's"),
     "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),
     "connected_share": Limit(
         "share", least=0.8, meaning="of the free floor, what a disc of 0.18 m radius covers in one piece"
@@ -191,14 +199,15 @@ def objects_off_map(model: mujoco.MjModel, maps: SceneMaps) -> tuple[str, ...]:
     return tuple(off)
 
 
-def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]) -> tuple[Gate, ...]:
+def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, objects: Sequence[SceneObject]) -> tuple[Gate, ...]:
     """Every gate in the table's order.
 
     Args:
         spec: of the scene; changed in place.
         maps: of the scene.
-        object_names: from its manifest.
+        objects: from its manifest.
     """
+    object_names = [o.name for o in objects]
     try:
         model = collide_with(spec, "hull")
         boxes = collide_with(spec, "box")
@@ -220,8 +229,9 @@ def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, object_names: tuple[str, ...]
     }
     for quantity in ("drift", "turn", "penetration"):
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
-    values |= free_space_values(maps)
-    warnings = {"connected_share": free_space_warnings(maps)}
+    agreed, warnings = manifest_values(model, objects)
+    values |= free_space_values(maps) | wall_values(model, maps) | agreed
+    warnings["connected_share"] = free_space_warnings(maps)
     if off:
         warnings["unmatched_objects"] = (f"{', '.join(off)}: more than {OFF_MAP_M:g} m from all free floor of the map",)
     return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
@@ -241,4 +251,4 @@ def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError:
         return manifest, (judge("compiles", 0.0),)
-    return manifest, evaluate(spec, maps, tuple(o.name for o in manifest.objects))
+    return manifest, evaluate(spec, maps, manifest.objects)

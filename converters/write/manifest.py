@@ -26,6 +26,21 @@ PACKAGES = (
 )
 
 
+def scene_objects(parts: SceneParts) -> tuple[SceneObject, ...]:
+    """The scene's movable things, in its order."""
+    return tuple(
+        SceneObject(
+            name=placed.name,
+            category=placed.category,
+            mass_kg=round(physical.mass_kg, 4),
+            friction=physical.friction,
+            n_hulls=len(placed.hulls_b),
+            cad_id=placed.cad_id,
+        )
+        for placed, physical in zip(parts.objects, parts.physical, strict=True)
+    )
+
+
 def make_manifest(
     raw: RawScene,
     split: str,
@@ -42,17 +57,6 @@ def make_manifest(
     `fallbacks` names the models whose one convex hull stands for them, and why; with `maps`, it is measured too.
     """
     fell = fallbacks or {}
-    objects = tuple(
-        SceneObject(
-            name=placed.name,
-            category=placed.category,
-            mass_kg=round(physical.mass_kg, 4),
-            friction=physical.friction,
-            n_hulls=len(placed.hulls_b),
-            cad_id=placed.cad_id,
-        )
-        for placed, physical in zip(parts.objects, parts.physical, strict=True)
-    )
     parameters = {k: v for k, v in dataclasses.asdict(decompose).items() if k != "timeout_s"}
     return SceneManifest(
         name=parts.name,
@@ -60,7 +64,7 @@ def make_manifest(
         source={"format": raw.source_format, "sha256": raw.sources},
         licence=raw.licence,
         floor_area_m2=round(floor_area_m2, 3),
-        objects=objects,
+        objects=scene_objects(parts),
         collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES}
         | parameters
         | {"convex_hull_only": sorted(fell), "from_source": sorted(k for k, c in raw.cads.items() if c.pieces)},

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from converters.__main__ import main
+from converters.check.agreement import wall_values
 from converters.check.gates import (
     LIMITS,
     check_folder,
@@ -26,7 +27,7 @@ from converters.check.gates import (
 )
 from converters.check.settle import settle
 from converters.records.errors import StageFailed
-from scenes_mjcf.schema import SceneMaps, load_maps, save_maps
+from scenes_mjcf.schema import SceneMaps, load_manifest, load_maps, save_maps
 
 
 def maps_of(traversable: np.ndarray) -> SceneMaps:
@@ -131,7 +132,7 @@ def test_collision_switches_between_hulls_and_boxes(tiny_scene):
 def change(folder: Path, edit) -> set[str]:
     spec = spec_of(folder)
     edit(spec)
-    return failed(evaluate(spec, load_maps(folder), ("table_0", "basket_0")))
+    return failed(evaluate(spec, load_maps(folder), load_manifest(folder).objects))
 
 
 def test_a_floating_object_drifts(tiny_scene):
@@ -202,7 +203,10 @@ def test_split_free_space_fails_its_gate(tiny_scene):
     halves = load_maps(folder).traversable.copy()
     halves[:, halves.shape[1] // 2 - 2 : halves.shape[1] // 2 + 2] = False
     maps = dataclasses.replace(load_maps(folder), traversable=halves)
-    assert failed(evaluate(spec_of(folder), maps, ("table_0", "basket_0"))) == {"connected_share"}
+    assert failed(evaluate(spec_of(folder), maps, load_manifest(folder).objects)) == {
+        "connected_share",
+        "rim_without_wall",
+    }
 
 
 def test_check_warns_of_floor_that_is_cut_off_and_names_a_damaged_map(tiny_scene, tmp_path, capsys):
@@ -218,6 +222,91 @@ def test_check_warns_of_floor_that_is_cut_off_and_names_a_damaged_map(tiny_scene
     assert "maps.npz: not readable (BadZipFile" in error and error.count("\n") == 1
 
 
+def gates_of(folder: Path, maps: SceneMaps) -> set[str]:
+    return failed(evaluate(spec_of(folder), maps, load_manifest(folder).objects))
+
+
+def test_a_map_that_is_not_the_walls_fails(tiny_scene):
+    folder, maps = tiny_scene[0], load_maps(tiny_scene[0])
+    every = dataclasses.replace(maps, traversable=np.ones_like(maps.traversable))
+    assert "rim_without_wall" in gates_of(folder, every)
+    shifted = dataclasses.replace(maps, origin_w=(maps.origin_w[0] + 0.8, maps.origin_w[1]))
+    assert "rim_without_wall" in gates_of(folder, shifted)
+
+    def clear(spec):
+        for geom in [g for g in spec.geoms if g.name.startswith("wall_")]:
+            spec.delete(geom)
+
+    def pass_through(spec):
+        for geom in [g for g in spec.geoms if g.name.startswith("wall_")]:
+            geom.contype = geom.conaffinity = 0
+
+    def build(spec):
+        box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.3, 0.3, 1.0], "pos": [1.5, 0.6, 1.0]}
+        spec.body("structure").add_geom(name="wall_of_no_map", contype=1, conaffinity=1, **box)
+
+    assert "walls_in_floor" in change(folder, build)
+    assert change(folder, clear) == change(folder, pass_through) == {"rim_without_wall"}
+
+
+def test_a_share_of_the_rim_by_hand():
+    spec = mujoco.MjSpec()
+    structure = spec.worldbody.add_body(name="structure")
+    structure.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.1, 1.0], pos=[0.5, -0.1, 1.0])
+    values = wall_values(spec.compile(), maps_of(np.ones((20, 20), bool)))
+    # A rim of 4 x 20 cells and 4 corners; the box bounds 20, two corners, and one cell more at either side's end.
+    assert values == {"rim_without_wall": pytest.approx(1 - 24 / 84), "walls_in_floor": 0.0}
+
+
+@pytest.mark.parametrize(("mass", "friction"), [(100.0, 1e-6), (100.0, 1.0), (1.0, 1e-6)])
+def test_an_altered_scene_json_is_told(tiny_scene, tmp_path, mass, friction):
+    folder = Path(shutil.copytree(tiny_scene[0], tmp_path / "scene"))
+    plain = json.loads((folder / "scene.json").read_text())
+    for item in plain["objects"]:
+        item["mass_kg"] *= mass
+        item["friction"] *= friction
+    (folder / "scene.json").write_text(json.dumps(plain))
+    manifest, gates = check_folder(folder)
+    assert failed(gates) == {"manifest_differs"}
+    (gate,) = [g for g in gates if g.name == "manifest_differs"]
+    assert gate.value == len(manifest.objects) * ((mass > 1) + (friction < 1))
+    said = f"mass_kg is {plain['objects'][0]['mass_kg'] / mass:g} in scene.xml"
+    assert (f"table_0: {said}" in gate.warnings[0]) == (mass > 1)
+
+
+def test_masses_and_frictions_that_nothing_of_the_kind_has_fail_where_both_files_say_so(tiny_scene):
+    folder, objects = tiny_scene[0], load_manifest(tiny_scene[0]).objects
+    spec = spec_of(folder)
+    for item in objects:
+        spec.body(item.name).mass = 1e6
+        for geom in spec.body(item.name).geoms:
+            geom.friction = [1e-6, 0.005, 0.0001]
+    heavy = [dataclasses.replace(item, mass_kg=1e6, friction=1e-6) for item in objects]
+    assert {"mass_ratio", "least_friction"} <= failed(evaluate(spec, load_maps(folder), heavy)) - {"manifest_differs"}
+
+
+def test_a_friction_edited_by_hand_is_told(tiny_scene):
+    def edit(spec):
+        spec.geom("basket_0_hull_0").friction = [0.9, 0.005, 0.0001]
+
+    assert change(tiny_scene[0], edit) == {"manifest_differs"}
+
+
+@pytest.mark.parametrize("option", ["gravity", "contact", "wind", "viscosity", "floor"])
+def test_physics_that_is_not_every_scenes_is_told(tiny_scene, option):
+    def edit(spec):
+        if option == "gravity":
+            spec.option.gravity = [0.0, 0.0, 0.0]
+        elif option == "contact":
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        elif option == "floor":
+            spec.geom("floor").pos = [0.0, 0.0, -0.5]
+        else:
+            setattr(spec.option, option, [1.0, 0.0, 0.0] if option == "wind" else 0.1)
+
+    assert "physics_changed" in change(tiny_scene[0], edit)
+
+
 def test_a_missing_object_is_counted(tiny_scene):
     def drop(spec):
         spec.delete(spec.body("basket_0"))
@@ -229,10 +318,11 @@ def test_no_room_for_start_and_goal(tiny_scene):
     folder, _ = tiny_scene
     maps = load_maps(folder)
     small = dataclasses.replace(maps, traversable=np.ones((15, 15), bool))
-    assert failed(evaluate(spec_of(folder), small, ("table_0", "basket_0"))) == {
+    assert gates_of(folder, small) == {
         "traversable_area",
         "start_goal",
         "unmatched_objects",  # They stand where this small map does not reach.
+        "rim_without_wall",
     }
 
 
