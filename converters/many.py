@@ -156,8 +156,9 @@ def main(task: str) -> int:
     """Converts one source and writes its row; the exit code is that of `python -m converters convert`."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is unfinished is removed
     told, began, code = json.loads(task), time.monotonic(), 2
-    config, library = told["config"], told["config"]["library"]
-    config = ConvertConfig(**{**config, "library": Path(library) if library else None})
+    config = told["config"]
+    places = {word: Path(config[word]) if config[word] else None for word in ("library", "root")}
+    config = ConvertConfig(**{**config, **places})
     try:
         results = convert_building(Path(told["source"]), Path(told["target"]), config)
         row = measured(results, time.monotonic() - began)

@@ -19,14 +19,15 @@ from interactive_nav_common.records import Reader
 class SourceFolder:
     """A raw scene's folder; remembers the sha256 of every file that was read through it, and what was repaired."""
 
-    def __init__(self, root: Path, strict: bool = False) -> None:
-        """Opens the folder; with `strict`, every repair is an error."""
+    def __init__(self, root: Path, strict: bool = False, remedy: str = "put a copy of the file there") -> None:
+        """Opens the folder; with `strict`, every repair is an error; `remedy` is for files that lie outside."""
         if not root.exists():
             raise SceneRejected(f"{root}: no such folder; give the folder that holds the raw scene")
         if not root.is_dir():
             raise SceneRejected(f"{root}: is a file, expected the folder that holds the raw scene")
         self.root = root
         self.strict = strict
+        self.remedy = remedy
         self.sha256: dict[str, str] = {}
         self.warnings: list[str] = []
 
@@ -69,7 +70,7 @@ class SourceFolder:
         except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
             raise SceneRejected(f"{path}: leads nowhere ({error}); put the file itself there") from error
         if not end.is_relative_to(self.root.resolve()):
-            raise SceneRejected(f"{path}: leads out of the source folder, to {end}; put a copy of the file there")
+            raise SceneRejected(f"{path}: leads out of the source folder, to {end}; {self.remedy}")
         return end.relative_to(self.root.resolve()).as_posix()
 
     def note(self, message: str) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from converters.read import gibson, interactive_gibson, meshes, scan2cad
 from converters.read.datasets import scanned
@@ -26,6 +28,8 @@ FILES = {
     (".xml",): (lambda path: path.resolve().parent, mjcf.read_mjcf),
 }
 """Ending of a file that says which home of a folder is meant -> its folder, its reader."""
+WITHIN = (sdf.read_sdf, mjcf.read_mjcf)
+"""Readers of homes that may name files outside of their own folder."""
 
 
 def detect_format(source: Path) -> str:
@@ -47,8 +51,9 @@ def detect_format(source: Path) -> str:
 
 
 def read_source(
-    source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto"
-) -> RawScene:
+    source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto",
+    within: Path | None = None,
+) -> RawScene:  # fmt: skip
     """Reads a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh.
 
     Args:
@@ -57,6 +62,7 @@ def read_source(
         strict: refuse what would be repaired with a warning.
         up: of a mesh file: its axis that points up, or `auto`.
         unit: of a mesh file: its unit, or `auto`.
+        within: of an MJCF or Gazebo home: the folder that may be read; default its own.
 
     Raises:
         SceneRejected: no known layout, or bad input.
@@ -64,14 +70,23 @@ def read_source(
     if source.is_file() and layout == "auto":
         for endings, (root_of, read) in FILES.items():
             if source.name.lower().endswith(endings) and (up, unit) == ("auto", "auto"):
-                return dataclasses.replace(read(root_of(source), strict, source), name=source.name.partition(".")[0])
+                raw = _read(read, root_of(source), strict, source, within=within)
+                return dataclasses.replace(raw, name=source.name.partition(".")[0])
         if source.suffix.lower() not in meshes.SUFFIXES:
             homes = ", ".join(ending for endings in FILES for ending in endings)
             raise SceneRejected(
                 f"{source}: is no mesh file; expected one of {', '.join(meshes.SUFFIXES)}, of a home's ({homes}), or a "
                 "folder"
             )
-        return meshes.read_single_mesh(source, strict, up, unit)
+        return _read(meshes.read_single_mesh, source, strict, up, unit, within=within)
     if (up, unit) != ("auto", "auto"):
         raise SceneRejected(f"{source}: --up and --unit are for a single mesh file; a folder's layout says both")
-    return READERS[layout if layout != "auto" else detect_format(source)][1](source, strict)
+    return _read(READERS[layout if layout != "auto" else detect_format(source)][1], source, strict, within=within)
+
+
+def _read(read: Callable[..., RawScene], *words: Any, within: Path | None) -> RawScene:
+    if within is None:
+        return read(*words)
+    if read not in WITHIN:
+        raise SceneRejected(f"--root {within}: is for MJCF and Gazebo homes; leave it out, {words[0]} is none")
+    return read(*words, within=within)

@@ -43,11 +43,11 @@ def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = m
                 continue
             outline = shapely.MultiPoint(points_w[:, :2]).convex_hull
             x0, y0, x1, y1 = outline.bounds
-            c = slice(max(int((x0 - x) / step), 0), min(int((x1 - x) / step) + 1, columns))
-            r = slice(max(int((y0 - y) / step), 0), min(int((y1 - y) / step) + 1, rows))
-            xs, ys = np.arange(c.start, c.stop), np.arange(r.start, r.stop)
+            # Of an object beside the map, no cells: an end below 0 would count from the map's other side.
+            xs = np.arange(max(int((x0 - x) / step), 0), min(int((x1 - x) / step) + 1, columns))
+            ys = np.arange(max(int((y0 - y) / step), 0), min(int((y1 - y) / step) + 1, rows))
             grid = np.meshgrid(x + (xs + 0.5) * step, y + (ys + 0.5) * step)
-            out[r, c] |= shapely.contains_xy(outline, *grid)
+            out[np.ix_(ys, xs)] |= shapely.contains_xy(outline, *grid)
     return out
 
 

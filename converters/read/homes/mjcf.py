@@ -1,13 +1,15 @@
 """Any MJCF home in (RoboCasa, MolmoSpaces, a scene of our own), `RawScene` out.
 
 MuJoCo itself reads and compiles it, after every file that it names was seen to lie in the source's folder. What hangs
-on a free joint is a part; what no joint lets move is structure, body by body; what hinges and slides carry stays where
-it is, but for doors.
+on a free joint is a part; what no joint lets move is structure, body by body; what hinges and slides carry is fixed to
+its piece, but for doors.
 """
 
 from __future__ import annotations
 
 import collections
+import dataclasses
+import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -23,13 +25,20 @@ from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.categories import CATEGORIES, Category
 
-DEEPEST = 16
-"""Includes within includes."""
+MOST_FILES = 1_000
+"""MJCF files of one home: includes, and models that it attaches."""
 MOST_GEOMS = 100_000
 FARTHEST_M = 1e4
-FOLDERS = ("assetdir", "meshdir", "texturedir")
-_GEOM = mujoco.mjtGeom
+REMEDY = "put a copy of the file there, or give --root DIR, a folder that holds both"
+UNREAD = {
+    **{"actuator": "nu", "sensor": "nsensor", "tendon": "ntendon", "equality": "neq", "flex": "nflex", "skin": "nskin"},
+    **{"light": "nlight", "camera": "ncam"},
+}
+"""What a home may have that is not read -> MuJoCo's name of their number."""
+DOOR = CATEGORIES["door"]
+_GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 
 def mains_of(root: Path) -> list[Path]:
@@ -50,53 +59,120 @@ def looks_like(root: Path) -> bool:
     return root.is_dir() and bool(mains_of(root))
 
 
-def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
+def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
     """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one.
+
+    Args:
+        root: folder.
+        strict: refuse what would be repaired with a warning.
+        chosen: file.
+        within: folder that may be read; default `root`.
 
     Raises:
         SceneRejected: none or several, one that MuJoCo refuses, or it names a file outside of the folder.
     """
-    source = SourceFolder(root, strict)
+    source = SourceFolder(within or root, strict, REMEDY)
     mains = [chosen] if chosen else mains_of(root)
     if len(mains) != 1:
         names = ", ".join(p.name for p in mains) or "none"
         raise SceneRejected(f"{root}: MJCF files are {names}, expected one or scene.xml; give the file of one")
-    _check_files(source, mains[0], 0, dict.fromkeys(FOLDERS, ""))
+    files = _Files(source)
     try:
-        model = mujoco.MjSpec.from_file(str(mains[0])).compile()
-    except (ValueError, RuntimeError) as error:
+        model = mujoco.MjSpec.from_string(files.whole(mains[0]), include=files.models).compile()
+    except (ValueError, RuntimeError) as error:  # RecursionError among them
         raise SceneRejected(f"{mains[0]}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
     if model.ngeom > MOST_GEOMS:
         raise SceneRejected(f"{mains[0]}: has {model.ngeom} geoms, expected a home of at most {MOST_GEOMS}")
     return home(source, "mjcf", _parts(model, source, mains[0]))
 
 
-def _check_files(source: SourceFolder, path: Path, depth: int, folders: dict[str, str]) -> None:
-    """Every file that an MJCF names, with its includes, lies in the source; their hashes are kept.
+@dataclasses.dataclass
+class _Files:
+    """Makes one MJCF of a home's files, in which the full path of every file stands: MuJoCo reads what was checked."""
 
-    Raises:
-        SceneRejected: one does not, or is missing.
-    """
-    relative = source.inside(path)
-    if depth > DEEPEST:
-        raise SceneRejected(f"{path}: includes lie {DEEPEST} deep in includes; does one include itself?")
-    try:
-        root = ElementTree.parse(source.use(relative, "an MJCF names it")).getroot()
-    except ElementTree.ParseError as error:
-        raise SceneRejected(f"{path}: not readable as MJCF ({error}); fetch the file again") from error
-    for compiler in root.iter("compiler"):
-        for word in FOLDERS:
-            folders[word] = compiler.get(word, folders[word])
-    for element in root.iter():
-        for key, name in element.attrib.items():
-            if not key.startswith("file"):
-                continue
-            if element.tag in ("include", "model"):
-                _check_files(source, path.parent / name, depth + 1, folders)
-                continue
-            own = folders["texturedir"] if element.tag == "texture" else folders["meshdir"]
-            place = path.parent / (own or folders["assetdir"]) / name
-            source.use(source.inside(place), f"{path.name} names it")
+    source: SourceFolder
+    models: dict[str, bytes] = dataclasses.field(default_factory=dict)
+    """Name that stands in the MJCF -> a model to attach, as whole as the home itself."""
+    parsed: int = 0
+
+    def whole(self, path: Path) -> str:
+        """The text of an MJCF with its includes. Names mean what they mean to MuJoCo (its `xml_native_reader.cc`).
+
+        Raises:
+            SceneRejected: a file is missing, no MJCF, included twice, or lies outside of the source.
+        """
+        main = Path(os.path.abspath(path))
+        root = self._parse(main)
+        if root.tag != "mujoco":
+            raise SceneRejected(f"{path}: starts with <{root.tag}>, expected <mujoco>")
+        folder: dict[ElementTree.Element, Path] = {}
+        self._include(root, main.parent, main.parent, {main}, folder)
+        # While it parses, MuJoCo looks for names below the last meshdir, or else assetdir; to compile, an assetdir
+        # takes the place of the meshdir before it.
+        words = ("assetdir", "meshdir", "texturedir")
+        looked: dict[str, str] = dict.fromkeys(words, "")
+        used: dict[str, str] = {}
+        strip = False
+        for compiler in root.iter("compiler"):
+            strip = compiler.attrib.pop("strippath", str(strip)).lower() == "true"
+            own = {word: compiler.attrib.pop(word) for word in looked if word in compiler.attrib}
+            looked |= own
+            used |= (dict.fromkeys(looked, own["assetdir"]) if "assetdir" in own else {}) | own
+        for element, at in folder.items():
+            for key, name in element.attrib.items():
+                if not key.startswith("file") or not name or element.tag == "include":
+                    continue
+                name = name.replace("\\", "/")
+                if element.tag == "model":
+                    text = self.whole(_reduced(at / name)).encode()
+                    place = Path(f"model_{len(self.models)}.xml")
+                    self.models[str(place)] = text
+                else:
+                    word = {"texture": "texturedir", "mesh": "meshdir"}.get(element.tag, "assetdir")
+                    sought = "" if element.tag == "flexcomp" else looked[word] or looked["assetdir"]
+                    if not os.path.exists(main.parent / sought / name):
+                        name = str(_reduced(at / name)) if at != main.parent else name
+                    name = name.rpartition("/")[2] if strip else name
+                    place = _reduced(
+                        main.parent / used.get("texturedir" if element.tag == "texture" else "meshdir", "") / name
+                    )
+                    self.source.use(self.source.inside(place), f"{path.name} names it")
+                element.set(key, str(place))
+        return ElementTree.tostring(root, encoding="unicode")
+
+    def _include(
+        self, root: ElementTree.Element, at: Path, main: Path, seen: set[Path], folder: dict[ElementTree.Element, Path]
+    ) -> None:
+        """Puts includes in their places: files below the main file's folder, or else below the including file's."""
+        for parent in list(root.iter()):
+            folder[parent] = at
+            for k, child in reversed(list(enumerate(parent))):
+                name = child.get("file", "").replace("\\", "/")
+                if child.tag.lower() != "include" or len(child) or not name:
+                    continue
+                found = _reduced(main / name)
+                found = found if os.path.exists(found) else _reduced(at / name)
+                if found in seen:
+                    raise SceneRejected(f"{found}: is included twice; does one include itself?")
+                seen.add(found)
+                inner = self._parse(found)
+                self._include(inner, found.parent, main, seen, folder)
+                parent[k : k + 1] = list(inner)
+
+    def _parse(self, path: Path) -> ElementTree.Element:
+        self.parsed += 1
+        if self.parsed > MOST_FILES:
+            raise SceneRejected(f"{path}: more than {MOST_FILES} MJCF files, expected a home")
+        checked = self.source.use(self.source.inside(path), "an MJCF names it")
+        try:
+            return ElementTree.parse(checked).getroot()
+        except (ElementTree.ParseError, ValueError, LookupError) as error:
+            raise SceneRejected(f"{path}: not readable as MJCF ({error}); fetch the file again") from error
+
+
+def _reduced(path: Path) -> Path:
+    """The path without `..`, which MuJoCo takes away before it looks for links."""
+    return Path(os.path.normpath(path))
 
 
 def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part]:
@@ -104,13 +180,14 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_kinematics(model, data)
-    top = _tops(model)
-    dropped: collections.Counter[str] = collections.Counter()
-    for joint in range(model.njnt):
-        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-            dropped[f"{mujoco.mjtJoint(model.jnt_type[joint]).name[6:].lower()} joint (stays as it is)"] += 1
     if not (np.abs(data.geom_xpos) < FARTHEST_M).all():  # NaN too
         raise SceneRejected(f"{path}: a geom stands at no usable place, expected all within {FARTHEST_M:g} m")
+    categories = [category_of(model.body(body).name) for body in range(model.nbody)]
+    top = _tops(model, categories)
+    built_in = [category is not None and not category.is_object for category in categories]
+    for body in range(model.nbody - 1, 0, -1):
+        built_in[model.body_parentid[body]] |= built_in[body]
+    dropped = _unread(model, top, categories)
     span = float(2.0 * max(np.abs(data.geom_xpos).max(initial=0.0), 2.0))
     parts = []
     for body in range(model.nbody):
@@ -123,43 +200,76 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         for geom in np.flatnonzero(np.isin(model.geom_bodyid, members)):
             mesh = _mesh(model, int(geom), span)
             if mesh is None:
-                dropped[_GEOM(model.geom_type[geom]).name[7:].lower()] += 1
+                dropped[f"{_GEOM(model.geom_type[geom]).name[7:].lower()}: dropped"] += 1
                 continue
             at = back @ _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
             collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-            drawn = model.geom_group[geom] < 3 and model.geom_rgba[geom, 3] > 0
             if collides:
-                solid.append((placed(mesh, at), bool(drawn), float(model.geom_friction[geom, 0])))
-            elif drawn:
-                seen.append(placed(mesh, at))
-        surface = joined(seen or [m for m, drawn, _ in solid if drawn] or [m for m, _, _ in solid])
+                solid.append((placed(mesh, at), float(model.geom_friction[geom, 0])))
+            if model.geom_group[geom] < 3 and model.geom_rgba[geom, 3] > 0:
+                seen.append((placed(mesh, at), collides, int(model.geom_group[geom])))
+        # Where a body has a group of geoms to look at, those of other groups that it collides with are not drawn; the
+        # world's own geoms stand each for itself.
+        looks = {group for _, collides, group in seen if body == 0 or not collides} or {group for *_, group in seen}
+        surface = joined([m for m, _, group in seen if body == 0 or group in looks] or [m for m, _ in solid])
         if surface is None:
             continue
-        free = model.body_jntnum[body] == 1 and model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
-        friction = max((f for _, _, f in solid), default=0.0)
+        free = _free(model, body)
+        # A body on a hinge or slide is held, and one that has a counter, a sink or the like within it. What MJCF calls
+        # a box is more often a shape than a carton.
+        jointed = model.body_jntnum[body] > 0 and categories[body] is not DOOR
+        held = not free and bool(built_in[body] or jointed or categories[body] is CATEGORIES["box"])
+        friction = max((f for _, f in solid), default=0.0)
         parts.append(
             Part(
                 model.body(body).name or f"body_{body}",
                 pose,
                 surface,
-                joined([m for m, _, _ in solid]),
+                joined([m for m, _ in solid]),
                 not free,
                 float(model.body_mass[members].sum()) or None,
                 friction if 0 < friction <= 2 else None,
+                held,
             )
         )
-    for kind, count in sorted(dropped.items()):
+    for kind, count in sorted((+dropped).items()):
         source.note(f"{path.name}: {count} x {kind}")
     return parts
 
 
-def _tops(model: mujoco.MjModel) -> np.ndarray:
-    """(nbody,) the body that each one is a part of: the world's children, and what moves or has a name within them."""
+def _unread(model: mujoco.MjModel, top: np.ndarray, categories: list[Category | None]) -> collections.Counter[str]:
+    """How often there is what is not read as it is."""
+    dropped = collections.Counter({f"{word}: dropped": int(getattr(model, count)) for word, count in UNREAD.items()})
+    for joint, body in enumerate(model.jnt_bodyid):
+        kind = _JOINT(model.jnt_type[joint])
+        if kind != _JOINT.mjJNT_FREE:
+            door = top[body] == body and categories[body] is DOOR
+            what = "a door's: swings at its edge if it stands on the floor" if door else "fixed, as part of its piece"
+            dropped[f"{kind.name[6:].lower()} joint ({what})"] += 1
+    for geom in np.flatnonzero((model.geom_matid >= 0) & (model.geom_type != int(_GEOM.mjGEOM_MESH))):
+        if model.mat_texid[model.geom_matid[geom]].max() >= 0:
+            dropped["texture of a geom that is no mesh: dropped"] += 1
+    return dropped
+
+
+def _free(model: mujoco.MjModel, body: int) -> bool:
+    return model.body_jntnum[body] == 1 and model.jnt_type[model.body_jntadr[body]] == _JOINT.mjJNT_FREE
+
+
+def _tops(model: mujoco.MjModel, categories: list[Category | None]) -> np.ndarray:
+    """(nbody,) the body that each one is a part of: the world's children, and what is free or has a name within them.
+
+    Drawers, lids, knobs and the doors of furniture are parts of what they hang on.
+    """
     top = np.arange(model.nbody)
     for body in range(1, model.nbody):
-        parent = int(model.body_parentid[body])
+        parent, category = int(model.body_parentid[body]), categories[body]
+        apart = category is not None and not model.body_jntnum[body]
+        if category is DOOR:
+            first = model.body_jntadr[body]
+            hinged = first >= 0 and model.jnt_type[first] == _JOINT.mjJNT_HINGE
+            apart = hinged and categories[top[parent]] is None
         still = model.body_weldid[parent] == 0
-        apart = model.body_jntnum[body] > 0 or category_of(model.body(body).name) is not None
         top[body] = body if parent == 0 or (still and apart) else top[parent]
     return top
 
@@ -173,7 +283,7 @@ def _matrix(position: np.ndarray, quat: np.ndarray | None, turn: np.ndarray | No
 
 def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | None:
     """A geom's surface in its own frame; None for kinds without one. Planes without an end reach `span_m` far."""
-    size, kind = model.geom_size[geom], model.geom_type[geom]
+    size, kind = model.geom_size[geom], _GEOM(model.geom_type[geom])  # a NumPy integer is `in` no tuple of kinds
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     if kind == _GEOM.mjGEOM_MESH:

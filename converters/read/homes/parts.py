@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from typing import Any
 
 import numpy as np
+import shapely
 
 from converters.geometry.faces import merge_vertices
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
@@ -20,7 +22,7 @@ from converters.read.interactive_gibson import assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import densified, floor_level
+from converters.read.surfaces import densified, face_vectors, floor_level
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh
@@ -47,6 +49,8 @@ ALIASES = {
     "tvstand": "tv_bench",
 }
 """Names that others give to our categories."""
+KNOWN = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
+KNOWN |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
 OTHER_STRUCTURE = 38
 """NYU40's word for what is built in and nothing else."""
 LONG_M = 0.5
@@ -60,6 +64,10 @@ RESTS_M = 0.10
 """What stands on a part may begin so far above the part's top."""
 DOOR_MOST_M = 1.3
 """Wider leaves fold or slide: they stay where they are."""
+SLAB_M, TOUCH_M, HIDDEN_SHARE = 0.3, 0.005, 0.8
+"""A level face is hidden if so much lies below another one that is higher by up to the first."""
+INNER = np.array([(a, b, 6 - a - b) for a in range(1, 5) for b in range(1, 6 - a)]) / 6
+"""(10, 3) barycentric points of a face."""
 MASS_FACTOR = 2.0
 """A mass that far outside of its category's range is a placeholder."""
 
@@ -77,18 +85,20 @@ class Part:
     static: bool
     mass_kg: float | None = None
     friction: float | None = None
+    held: bool = False
+    """It stays where it is whatever its name says."""
 
 
 def category_of(name: str) -> Category | None:
     """The category that a part's name tells, by its last words: an English compound is what its last word says.
 
-    `DeskPortrait` is no desk, `KitchenTable_01` a table. Numbers and single letters are not counted.
+    `DeskPortrait` is no desk, `KitchenTable_01` a table. Numbers and single letters are not counted, nor is what
+    RoboCasa adds: `stool_1_island_group_main` is a stool.
     """
-    words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name) if len(w) > 1]
-    known = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
-    known |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
+    own = re.sub(r"(_[a-z]+_group)?(_(main|root))+$", "", name)
+    words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", own) if len(w) > 1]
     for first in range(len(words)):
-        found = known.get("".join(words[first:])) or known.get("".join(words[first:]).removesuffix("s"))
+        found = KNOWN.get("".join(words[first:])) or KNOWN.get("".join(words[first:]).removesuffix("s"))
         if found is not None:
             return found
     return None
@@ -104,7 +114,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
     whole = joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])
     if whole is None:
         raise SceneRejected(f"{source.root}: holds no part; expected a floor")
-    floor_m = floor_level(whole.vertices, whole.faces, str(source.root))
+    floor_m = floor_level(whole.vertices, _shown(whole.vertices, whole.faces), str(source.root))
     moves = [_moves(part, low, high, floor_m) for part, (low, high) in zip(parts, bounds, strict=True)]
     carried = _carriers(bounds, moves, floor_m)
     structure = [p for p, moving, by in zip(parts, moves, carried, strict=True) if not moving and by is None]
@@ -123,6 +133,15 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
         if moving
     ]
     riders = sum(by is not None for by in carried)
+    stay = [
+        p.name
+        for p, moving, by in zip(parts, moves, carried, strict=True)
+        if not (p.static or moving or by is not None)
+    ]
+    if stay:
+        source.note(
+            f"{len(stay)} loose things stand on no furniture that moves, and stay: {', '.join(sorted(stay)[:5])}"
+        )
     if riders:
         source.note(f"{riders} things stand on furniture and move with it")
     grey = np.full((len(mesh.vertices), 3), 170, np.uint8) if mesh.texture is None else None
@@ -146,6 +165,21 @@ def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
+def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces that look up, but for those below others by up to `SLAB_M`: the slab under a floor is no floor."""
+    area = face_vectors(vertices, faces)
+    level = faces[area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)]
+    corners, height = vertices[level], vertices[level, 2].mean(axis=1)
+    plan: Any = shapely.polygons(corners[..., :2])
+    tree = shapely.STRtree(plan)
+    hidden = np.zeros(len(level))
+    for weights in INNER:
+        point, over = tree.query(shapely.points(np.einsum("k,nkd->nd", weights, corners)[:, :2]), "intersects")
+        above = height[over] - height[point]
+        hidden += np.bincount(point[(above > TOUCH_M) & (above < SLAB_M)], minlength=len(level)) > 0
+    return level[hidden <= HIDDEN_SHARE * len(INNER)]
+
+
 def _small(mesh: TexturedMesh) -> TexturedMesh:
     return mesh if mesh.texture is None else dataclasses.replace(mesh, texture=at_most(mesh.texture, TEXTURE_PX))
 
@@ -154,6 +188,8 @@ def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> boo
     """True for furniture that stands on the floor."""
     category = category_of(part.name)
     if category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M:
+        return False
+    if part.held:
         return False
     movable = not part.static if category is None else category.is_object
     return movable and abs(low[2] - floor_m) < STANDS_M

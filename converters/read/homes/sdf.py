@@ -29,6 +29,8 @@ DEEPEST = 8
 """Models within models."""
 DROPPED = ("actor", "light", "plugin", "population", "road", "sensor", "heightmap", "polyline", "frame")
 """Elements that have no counterpart here; they are counted."""
+GAZEBOS_OWN = ("model://sun", "model://ground_plane")
+"""A light, and a plane of 100 m that homes stand on; Gazebo brings both."""
 ZEROS = (0.0,) * 6
 
 
@@ -48,18 +50,24 @@ def root_of(world: Path) -> Path:
     return world.resolve().parents[1 if world.resolve().parent.name == "worlds" else 0]
 
 
-def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
+def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
     """Reads the only world of a folder, or the chosen one.
+
+    Args:
+        root: folder.
+        strict: refuse what would be repaired with a warning.
+        chosen: file.
+        within: folder that may be read; default `root`.
 
     Raises:
         SceneRejected: none or several worlds, a missing or damaged file, or a number that is none.
     """
-    source = SourceFolder(root, strict)
+    source = SourceFolder(within or root, strict)
     worlds = [chosen] if chosen else worlds_of(root)
     if len(worlds) != 1:
         names = ", ".join(p.name for p in worlds) or "none"
         raise SceneRejected(f"{root}: worlds are {names}, expected one; give the file of one")
-    reader = _Reader(source)
+    reader = _Reader(source, root)
     world = _root(source, source.inside(worlds[0])).find("world")
     if world is None:
         raise SceneRejected(f"{worlds[0]}: has no <world>; give a world, not a model")
@@ -82,6 +90,8 @@ class _Reader:
     """Walks a world; counts what it drops."""
 
     source: SourceFolder
+    root: Path
+    """Of the world."""
     dropped: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     read: int = 0
 
@@ -94,6 +104,8 @@ class _Reader:
         for element in parent:
             if element.tag in DROPPED:
                 self.dropped[element.tag] += 1
+            elif element.tag == "include" and (uri := (element.findtext("uri") or "").strip()) in GAZEBOS_OWN:
+                self.dropped[uri] += 1
             elif element.tag == "include":
                 model, where = self._included(element, path)
                 own = element.find("pose") if element.find("pose") is not None else model.find("pose")
@@ -178,13 +190,17 @@ class _Reader:
     def _find(self, uri: str, path: Path) -> Path:
         """The file or folder that a URI names, within the source."""
         words = uri.removeprefix("model://").removeprefix("file://").lstrip("/")
-        for folder in (path.parent, self.source.root / "models", self.source.root, path.parent.parent / "models"):
+        roots = [root / models for root in (self.root, self.source.root) for models in ("models", "")]
+        for folder in (path.parent, *roots, path.parent.parent / "models"):
             candidate = folder / words
             if words and self.source.relative(candidate) is not None and candidate.exists():
                 return candidate
         bare = find_file(self.source, path.parent, words) if words and path.parent.is_dir() else None
         if bare is None:
-            raise SceneRejected(f"{path}: names '{uri}', which is not in {self.source.root}; put it into its models/")
+            raise SceneRejected(
+                f"{path}: names '{uri}', which is not in {self.source.root}; put it into its models/, or "
+                "give --root DIR, a folder that holds both"
+            )
         return bare
 
     def _pose(self, element: ElementTree.Element | None, path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""MJCF homes: a room written here, and a scene of our own read back; files outside of the folder are refused."""
+"""MJCF homes: rooms written here, and a scene of our own read back; files outside of the folder are refused."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from converters.__main__ import main
 from converters.geometry.faces import face_areas, face_labels
 from converters.pipeline import ConvertConfig, convert
 from converters.read.homes.mjcf import read_mjcf
-from converters.read.source import detect_format
+from converters.read.source import detect_format, read_source
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR
 from scenes_mjcf.schema import load_manifest
@@ -111,6 +112,164 @@ def test_bad_homes_are_one_line(tmp_path, old, new, message):
     with pytest.raises(SceneRejected, match=message) as refusal:
         read_mjcf(root)
     assert "\n" not in str(refusal.value)
+
+
+def size_of_top(root: Path, within: Path | None = None) -> float:
+    """Width of the table's top as we read it."""
+    raw = read_mjcf(root, within=within)
+    table = next(a for a in raw.annotations if a.category == "table")
+    return float(np.ptp(raw.cads[table.cad_id].vertices[:, 0]))
+
+
+def size_in_mujoco(root: Path) -> float:
+    model = mujoco.MjModel.from_xml_path(str(root / "home.xml"))
+    return float(np.ptp(model.mesh_vert, axis=0).max())  # its frame is the inertia's
+
+
+def change(root: Path, *changes: tuple[str, str]) -> None:
+    for old, new in changes:
+        for path in (root / "home.xml", root / "more.xml"):
+            path.write_text(path.read_text().replace(old, new))
+
+
+ASSET = '<asset><mesh name="top" file="top.obj"/></asset>'
+NESTED = (("<worldbody>\n<geom", '<include file="deep/own.xml"/><worldbody>\n<geom'), (ASSET, ""))
+"""The mesh is named by a file in a folder of its own, which the home includes."""
+
+
+@pytest.mark.parametrize(
+    ("changes", "size"),
+    [
+        ((("</mujoco>", '<compiler meshdir="late"/></mujoco>'),), 0.9),
+        ((("</mujoco>", '<compiler assetdir="late"/></mujoco>'),), 0.9),
+        ((('meshdir="parts"', 'meshdir="parts" assetdir="late"'),), 0.8),
+        ((('file="top.obj"', 'file="../late/top.obj"'),), 0.9),
+        ((('file="top.obj"', 'file="..\\late\\top.obj"'),), 0.9),
+        ((('file="top.obj"', 'file="../../absent/top.obj"'), ("meshdir", 'strippath="true" meshdir')), 0.8),
+        (NESTED, 0.8),
+        ((*NESTED, ('meshdir="parts"', "")), 1.1),
+        ((*NESTED, ('meshdir="parts"', 'meshdir="nowhere"')), 1.1),
+        ((*NESTED, ("deep/own.xml", "deep/on.xml")), 0.8),
+    ],
+)
+def test_names_mean_what_they_mean_to_mujoco(tmp_path, changes, size):
+    root = write_room(tmp_path / "home")
+    for folder, width in (("late", 0.9), ("deep", 1.1)):
+        (root / folder).mkdir()
+        trimesh.creation.box((width, 0.6, 0.7)).export(root / folder / "top.obj")
+    (root / "deep" / "own.xml").write_text(f"<x>{ASSET}</x>")
+    (root / "deep" / "on.xml").write_text('<x><include file="own.xml"/></x>')
+    change(root, *changes)
+    assert size_in_mujoco(root) == pytest.approx(size, abs=1e-5)
+    assert size_of_top(root) == pytest.approx(size, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "own"),
+    [
+        (
+            (("</mujoco>", '<include file="deep/own.xml"/></mujoco>'),),
+            '<compiler meshdir=".."/>',
+        ),  # the last one counts
+        (NESTED, ASSET.replace("top.obj", "../../top.obj")),  # below the including file's folder it lies within
+        (NESTED, '<include file="../own.xml"/>'),
+        ((('file="top.obj"', 'file="link.obj"'),), ""),
+        ((*NESTED, ("deep/own.xml", "link.xml")), ""),
+    ],
+)
+def test_no_file_outside_of_the_folder_is_read(tmp_path, changes, own):
+    outside, root = tmp_path / "outside", tmp_path / "outside" / "home"
+    write_room(root)
+    for path, width in ((outside, 3.0), (root / "deep", 0.8), (root / "parts", 0.8), (root, 0.8)):
+        path.mkdir(exist_ok=True)
+        trimesh.creation.box((width, 0.6, 0.7)).export(path / "top.obj")
+    (outside / "own.xml").write_text(f'<x><asset><mesh name="top" file="{outside / "top.obj"}"/></asset></x>')
+    (root / "deep" / "own.xml").write_text(f"<x>{own}</x>")
+    (root / "own.xml").write_text(f"<x>{ASSET}</x>")
+    (root / "parts" / "link.obj").symlink_to(outside / "top.obj")
+    (root / "link.xml").symlink_to(outside / "own.xml")
+    change(root, *changes)
+    assert size_in_mujoco(root) == pytest.approx(3.0, abs=1e-5)  # MuJoCo itself reads what lies outside
+    with pytest.raises(SceneRejected, match="leads out of the source folder.*--root DIR"):
+        read_mjcf(root)
+    assert size_of_top(root, outside) == pytest.approx(3.0, abs=1e-5)  # with --root
+
+
+def test_a_folder_that_may_be_read_is_named(tmp_path, capsys, monkeypatch, hull_cache):
+    root = write_room(tmp_path / "assets" / "arenas")
+    (root / "parts").rename(tmp_path / "assets" / "parts")
+    change(root, ('meshdir="parts"', 'meshdir="../parts"'))
+    monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
+    command = ["convert", str(root / "home.xml"), str(tmp_path / "out"), "--jobs", "1"]
+    assert main(command) == 2 and "--root DIR" in " ".join(capsys.readouterr().err.split())
+    assert main([*command, "--root", str(tmp_path / "assets")]) == 0
+    assert {o.category for o in load_manifest(tmp_path / "out").objects} == {"chair", "table"}
+    (tmp_path / "outside.obj").write_text("v 0 0 0\n")
+    top = tmp_path / "assets" / "parts" / "top.obj"
+    top.unlink()
+    top.symlink_to(tmp_path / "outside.obj")
+    with pytest.raises(SceneRejected, match="leads out of the source folder"):
+        read_source(root, within=tmp_path / "assets")
+    top.rename(tmp_path / "scan.obj")
+    with pytest.raises(SceneRejected, match="--root .* is for MJCF and Gazebo homes"):
+        read_source(tmp_path / "scan.obj", within=tmp_path)
+
+
+def test_models_to_attach_are_read_and_their_number_has_an_end(tmp_path):
+    root = write_room(tmp_path / "home")
+    child = '<mujoco><asset>{}</asset><worldbody><body name="b">{}</body></worldbody></mujoco>'
+    (root / "sub").mkdir()
+    (root / "sub" / "pot.xml").write_text(
+        child.format('<mesh name="pot" file="pot.obj"/>', '<geom type="mesh" mesh="pot"/>')
+    )
+    trimesh.creation.box((0.2, 0.2, 0.4)).export(root / "sub" / "pot.obj")
+    attach = '<attach model="m" body="b" prefix="p_"/><include file="more.xml"/>'
+    change(
+        root,
+        (ASSET, ASSET[:-8] + '<model name="m" file="sub/pot.xml"/></asset>'),
+        ('<include file="more.xml"/>', attach),
+    )
+    assert {"sub/pot.xml", "sub/pot.obj"} <= set(read_mjcf(root).sources)
+    for k in range(12):
+        threefold = "".join(f'<model name="m{i}" file="m{k + 1}.xml"/>' for i in range(3))
+        (root / "sub" / f"m{k}.xml").write_text(child.format(threefold, ""))
+    change(root, ("sub/pot.xml", "sub/m0.xml"))
+    (root / "sub" / "m12.xml").write_text(child.format("", ""))
+    with pytest.raises(SceneRejected, match="more than 1000 MJCF files"):
+        read_mjcf(root)
+
+
+KITCHEN = """
+<body name="floor_backing_room_main" pos="0 0 -0.1"><geom type="box" size="2.1 1.6 0.06"/></body>
+<body name="stool_1_island_group_main" pos="-1.5 -1.2 0"><geom type="box" pos="0 0 0.3" size="0.15 0.15 0.3"/></body>
+<body name="dresser" pos="0.2 -1.2 0"><geom type="box" pos="0 0 0.4" size="0.4 0.2 0.4"/>
+<body name="drawer_box" pos="0 0.2 0.6"><joint type="slide" axis="0 1 0"/><geom type="box" size="0.3 0.02 0.1"/></body>
+<body name="lid_door" pos="0 0 0.82"><joint type="hinge"/>
+<geom type="ellipsoid" size="0.3 0.2 0.02"/></body>
+</body>
+<body name="inner_box" pos="1.8 1.3 0.1"><joint type="slide" axis="0 1 0"/><geom type="box" size="0.1 0.1 0.1"/></body>
+<body name="desk" pos="1.6 -1.2 0.5"><geom type="box" size="0.2 0.2 0.5"/>
+<body name="counters1"><geom size="0.1"/></body>
+<body name="kettle_stand"><geom type="sphere" pos="0 0 0.6" size="0.1"/></body></body>
+<body name="kettle" pos="1.6 -1.2 1.3"><freejoint/><geom type="sphere" size="0.1"/></body>
+<geom type="box" contype="0" conaffinity="0" group="1" pos="-1.9 1.4 1" size="0.05 0.05 0.05"/>
+<light pos="0 0 3"/>"""
+
+
+def test_drawers_lids_and_fitted_furniture_stay_and_it_is_said(tmp_path):
+    root = write_room(tmp_path / "home")
+    change(root, ('<body name="tall_thing"', KITCHEN.strip() + '<body name="tall_thing"'))
+    raw = read_mjcf(root)
+    assert sorted(a.category for a in raw.annotations) == ["chair", "dresser", "stool", "table"]
+    assert raw.floor_height_m == pytest.approx(0.0, abs=1e-6)  # not that of the slab below it, -0.04
+    dresser = raw.cads["dresser"].vertices
+    np.testing.assert_allclose([dresser.min(0), dresser.max(0)], [[-0.4, -0.2, 0], [0.4, 0.22, 0.84]], atol=2e-3)
+    for middle, half in (((1.6, -1.2, 1.1), 0.1), ((1.6, -1.2, 1.3), 0.1), ((1.8, 1.3, 0.1), 0.1)):
+        near = raw.scan.vertices[(np.abs(raw.scan.vertices - middle) <= half + 1e-6).all(1)]
+        assert np.ptp(near[:, :2], axis=0).min() > 1.9 * half  # spheres, and the box that slides, are there
+    told = " ".join(raw.warnings)
+    for words in ("3 x slide joint (fixed", "1 x hinge joint (fixed", "1 x light: dropped", "and stay: kettle"):
+        assert words in told
 
 
 @settings(max_examples=40, deadline=None)

@@ -14,7 +14,7 @@ from converters.geometry.faces import face_areas, face_labels
 from converters.pipeline import ConvertConfig, convert
 from converters.read.homes.parts import category_of
 from converters.read.homes.sdf import read_sdf
-from converters.read.source import READERS, detect_format
+from converters.read.source import READERS, detect_format, read_source
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, WALL
 
@@ -160,6 +160,21 @@ def test_bad_worlds_are_one_line(tmp_path, thing, message):
     with pytest.raises(SceneRejected, match=message) as refusal:
         read_sdf(root)
     assert "\n" not in str(refusal.value)
+
+
+def test_gazebos_own_models_are_passed_over(tmp_path):
+    own = [f"<include><uri>model://{name}</uri></include>" for name in ("sun", "ground_plane")]
+    raw = read_sdf(write_world(tmp_path / "home", [*ROOM, *own]))
+    assert {f"home.world: 1 x model://{name}: dropped" for name in ("sun", "ground_plane")} <= set(raw.warnings)
+    assert np.ptp(raw.scan.vertices[:, 0]) < 5
+
+
+def test_models_of_another_folder_are_read_where_that_may_be(tmp_path):
+    root = write_world(tmp_path / "home", [*ROOM, "<include><uri>model://chair_a</uri></include>"])
+    (root / "models").rename(tmp_path / "models")
+    with pytest.raises(SceneRejected, match="give --root DIR"):
+        read_sdf(root)
+    assert [a.category for a in read_source(root, within=tmp_path).annotations] == ["chair"]
 
 
 def test_empty_and_several_worlds_are_refused(tmp_path):
