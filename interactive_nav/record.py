@@ -90,8 +90,8 @@ class Compositor:
         paint = FloorPaint(replay.goal_xy_w, self._goal_radius_m, _dense(replay.robot_xy_w[: step + 1]))
         behind = self._view.look(camera, OUTSIDE, paint).colour
         side = height // 3
-        colour = self._view.look(robot_camera(self._view, side, side), INSIDE).colour
-        seen = self._view.look(robot_camera(self._view, CAMERA_PIXELS, CAMERA_PIXELS), INSIDE)
+        own = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
+        colour, seen = self._view.look(own[0], INSIDE).colour, self._view.look(own[1], INSIDE)
         small = [depth_picture(seen.depth_m), mask_picture(seen.classes, replay.segmentation_classes)]
         column = [
             colour,

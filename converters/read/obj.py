@@ -134,7 +134,7 @@ def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
     result: dict[str, tuple[tuple[int, int, int], str]] = {}
     name = None
     for line in text.splitlines():
-        word, _, rest = line.strip().partition(" ")
+        word, rest = [*line.split(None, 1), "", ""][:2]
         if word.lower() == "newmtl":
             name = rest.strip()
             result[name] = (GREY, "")

@@ -66,6 +66,8 @@ class Physics(abc.ABC):
     name: str
     nq: int
     nv: int
+    tells_convergence = True
+    """Whether `StepSignals.unconverged` is known."""
 
     @abc.abstractmethod
     def step_batch(

@@ -174,6 +174,7 @@ class JaxPhysics(MjxPhysics):
     """MJX-JAX: it has no contact sensors between bodies, so forces are summed from its contacts instead."""
 
     name = "jax"
+    tells_convergence = False
 
     def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
         super().__init__(world, config, forces)

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import json
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,8 @@ class Replay:
     segmentation_classes: MaskClasses = 4
     """As in `NavConfig`."""
     success_distance_m: float | None = None
+    image_fov_deg: float | None = None
+    """Vertical, of the robot's camera as the episode had it; None: the robot's own."""
     """Of the goal; None, in older files: not known, taken for the robot's width."""
 
     @property
@@ -149,7 +152,7 @@ class Player:
             on_progress: told the number of steps taken, now and then.
         """
         state = self._reset(key[None])
-        policy_key = jax.random.fold_in(key, 0)
+        policy_key = policy_key_of(key)
         first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
         parts, qpos = [], [np.asarray(state.pipeline_state.qpos)]
         ended, step = False, 0
@@ -202,7 +205,13 @@ def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.nd
         objects=tuple(str(Path(folder).absolute()) for folder in env.config.rules.objects),
         segmentation_classes=env.config.sensors.segmentation_classes,
         success_distance_m=env.success_distance_m,
+        image_fov_deg=env.sensors.lens.fov_deg,
     )
+
+
+def policy_key_of(key: jax.Array) -> jax.Array:
+    """The key of a policy's chances in an episode drawn from `key`: none that the environment draws from."""
+    return jax.random.fold_in(key, zlib.crc32(b"policy"))
 
 
 def _play_chunk(env: InteractiveNav, policy: Any, state: Any, key: jax.Array, step: jax.Array) -> Any:

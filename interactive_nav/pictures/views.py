@@ -143,14 +143,14 @@ class SceneView(SceneModel):
         return sky + 0.38 * facing * np.where(lit, 1.0, 0.15)
 
 
-def robot_camera(view: SceneView, rows: int, columns: int) -> Camera:
-    """The robot's own camera, at the pose that its body has been placed at."""
+def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> Camera:
+    """The robot's own camera, at the pose that its body has been placed at; `fov_deg` for another field of view."""
     mount = view.robot.camera
     body = mujoco.mj_name2id(view.model, mujoco.mjtObj.mjOBJ_BODY, mount.body)
     axes = view.data.xmat[body].reshape(3, 3)
     forward = axes @ [math.cos(mount.pitch_rad), 0.0, -math.sin(mount.pitch_rad)]
     pos = view.data.xpos[body] + axes @ np.asarray(mount.pos_m)
-    return Camera(pos, forward, math.radians(mount.fov_deg), rows, columns)
+    return Camera(pos, forward, math.radians(fov_deg or mount.fov_deg), rows, columns)
 
 
 def chase_camera(robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6) -> Camera:

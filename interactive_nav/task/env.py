@@ -259,6 +259,8 @@ class InteractiveNav(Env):
         done = (success | timed_out | lifted | broken | lost).astype(jnp.float32)
         values = episode_scores(nav, self.config.rules, self.tables, self.score_mass_kg, success, broken)
         values = {name: done * value for name, value in values.items()}
+        if not self.physics.tells_convergence:
+            values["unconverged_steps"] = jnp.where(done > 0, jnp.nan, 0.0)
         values |= {f"reward/{name}": term for name, term in terms.items()}
         truncated = timed_out | lost if self.config.rules.bootstrap_at_time_limit else lost
         told = {"truncation": truncated.astype(jnp.float32), "time_out": timed_out.astype(jnp.float32)}

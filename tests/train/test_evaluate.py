@@ -242,6 +242,9 @@ def test_mistakes_are_one_line_and_exit_2(run, capsys, words, message):
 def test_no_run_folder(tmp_path, capsys):
     assert evaluate.main([str(tmp_path)], build_env=build_toy) == 2
     assert "is no run folder (no config.yaml)" in capsys.readouterr().err
+    (tmp_path / "config.yaml").write_text("\n")
+    assert evaluate.main([str(tmp_path)], build_env=build_toy) == 2
+    assert "config.yaml: is empty, expected the config of a run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

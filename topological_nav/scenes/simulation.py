@@ -44,7 +44,7 @@ class Seen:
     wall: np.ndarray
     """[B] bool: touched a wall in it."""
     broken: np.ndarray
-    """[B] bool: the physics gave up on it, or lost contacts."""
+    """[B] bool: the physics gave up on it, lost contacts, or left out something near (MJX's window was full)."""
 
 
 def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = None) -> InteractiveNav:
@@ -132,7 +132,7 @@ class Simulator:
         """Where the robots are."""
         if self._last is None or self._last[0] is not state:
             nav = state.info["nav"]
-            of = (nav.robot_pos_w, nav.yaw_rad, nav.robot_path_m, nav.touching, nav.overflow_steps)
+            of = (nav.robot_pos_w, nav.yaw_rad, nav.robot_path_m, nav.touching, nav.overflow_steps + nav.left_out_steps)
             told = np.asarray(self._packed(of, state.metrics["nonfinite"])).astype(float)
             xy, (yaw, path), flags = told[:, :2], told[:, 2:4].T, told[:, 4:].T > 0
             self._last = state, Seen(xy, yaw, path, *flags)
@@ -141,8 +141,8 @@ class Simulator:
 
 def _packed(nav: tuple[jax.Array, ...], nonfinite: jax.Array) -> jax.Array:
     """[B, 7] f32: what `Seen` tells, in one array, because every transfer from an accelerator makes it wait."""
-    pos, yaw, path, touching, overflow = nav
-    broken = (nonfinite > 0) | (overflow > 0)
+    pos, yaw, path, touching, lost = nav
+    broken = (nonfinite > 0) | (lost > 0)
     return jnp.concatenate([pos[:, :2], jnp.stack([yaw, path, *touching.T[:2], broken], 1)], 1).astype(jnp.float32)
 
 

@@ -106,11 +106,15 @@ def read(path: Path, template: Any) -> Any:
             leaves = unpacked({name: stored[name] for name in stored.files})
     except Exception as error:  # noqa: BLE001  (zip and npy readers raise many kinds for a damaged file)
         raise CheckpointError(f"{path}: not readable ({' '.join(str(error).split())[:200]})") from None
-    flat = flax.traverse_util.flatten_dict(flax.serialization.to_state_dict(template), sep="/", keep_empty_nodes=True)
+    own = flax.serialization.to_state_dict(template)
+    flat = flax.traverse_util.flatten_dict(own, sep="/", keep_empty_nodes=True)
     unknown = sorted(set(leaves) - set(flat))
     if unknown:
         raise CheckpointError(
             f"{path}: holds {unknown[0]}, which this learner has not; use the config that it was trained with"
         )
+    missing = sorted(set(acting_part(own, "ppo" if "params" in own else "")) - set(leaves))
+    if missing:
+        raise CheckpointError(f"{path}: lacks {missing[0]}, which this learner's policy reads; export the run again")
     nested = flax.traverse_util.unflatten_dict({**flat, **leaves}, sep="/")
     return flax.serialization.from_state_dict(template, nested)

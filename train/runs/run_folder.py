@@ -80,6 +80,8 @@ class RunFolder:
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not a text file"
             raise FileError(f"{self.config}: cannot be read ({reason}); expected the config of a run") from None
+        if not text.strip():
+            raise FileError(f"{self.config}: is empty, expected the config of a run; fetch the run again")
         return from_yaml(text, where=str(self.config))
 
     def open(self, config: TrainConfig) -> bool:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav.pictures.replay import policy_key_of
 from interactive_nav.types import OF_OBJECTS
 from train.scoring.planners import HostPolicy
 from train.scoring.policies import PolicyFn
@@ -160,7 +161,7 @@ class Player:
         """Plays the first `count` of the keys' episodes; the rest fill the batch and are over from the start."""
         size, record = len(keys), min(record, count)
         state = self._begin(keys, starts, scene_index)
-        policy_keys = jax.vmap(functools.partial(jax.random.fold_in, data=0))(keys)
+        policy_keys = jax.vmap(policy_key_of)(keys)
         first = jax.tree.map(np.asarray, state.info["nav"])
         metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
         ends = {name: getattr(first, name).copy() for name in ("object_pos_w", *OF_OBJECTS)}

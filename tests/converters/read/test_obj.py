@@ -56,6 +56,8 @@ def test_damage_is_named(tmp_path, text, words):
 
 def test_mtl_options_and_colours():
     text = "newmtl a\nKd 1 0.5 0\nmap_Kd -s 1 1 1 wood.png\nnewmtl b\nkd 0 nan 2\n newmtl c\nKd x\n"
+    tabs = "newmtl\td e\nKd\t1\t0 0.5\nmap_Kd\twood.png\n"
+    assert parse_mtl(tabs) == {"d e": ((255, 0, 128), "wood.png")}
     assert parse_mtl(text) == {
         "a": ((255, 128, 0), "-s 1 1 1 wood.png"),
         "b": ((0, 0, 255), ""),

@@ -60,7 +60,7 @@ def played(env):
 def test_a_replay_is_what_the_environment_kept_account_of(env, played):
     key = jax.random.PRNGKey(3)
     state = jax.jit(env.reset)(key)
-    step, policy_key = jax.jit(env.step), jax.random.fold_in(key, 0)
+    step, policy_key = jax.jit(env.step), replay.policy_key_of(key)
     robot, objects = [state.info["nav"].robot_pos_w], state.info["nav"].object_pos_w
     for t in range(played.num_steps):
         state = step(state, straight(state.obs, jax.random.fold_in(policy_key, t)))
@@ -203,9 +203,26 @@ def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, 
         assert any(getattr(patch, "radius", 0) == pytest.approx(radius, abs=1e-3) for patch in axis.patches)
 
 
+def test_the_robots_pictures_have_the_episodes_field_of_view(room, env, played):
+    assert played.image_fov_deg == env.sensors.lens.fov_deg == env.robot.camera.fov_deg
+    usual, narrow, old = (
+        record.Compositor(dataclasses.replace(played, image_fov_deg=fov), load_scene(room), height=120).frame(0)
+        for fov in (played.image_fov_deg, 40.0, None)
+    )
+    np.testing.assert_array_equal(old, usual)
+    np.testing.assert_array_equal(narrow[:, :160], usual[:, :160])
+    assert all((narrow[at : at + 40, 160:] != usual[at : at + 40, 160:]).any() for at in (0, 40))
+
+
+def test_a_policy_draws_from_another_key_than_the_environment(env):
+    key = jax.random.PRNGKey(3)
+    own = jax.jit(env.reset)(key).info["rng"]
+    assert (own == jax.random.fold_in(key, 0)).all() and (replay.policy_key_of(key) != own).any()
+
+
 def test_a_replay_of_before_can_be_read(played, tmp_path):
     fields = {f.name: getattr(played, f.name) for f in dataclasses.fields(played)}
-    later = ("small_objects", "segmentation_classes", "success_distance_m")
+    later = ("small_objects", "segmentation_classes", "success_distance_m", "image_fov_deg")
     header = {n: v for n, v in fields.items() if n not in (*replay._ARRAYS, *later)} | {"format": 1}
     arrays = {name: fields[name] for name in replay._ARRAYS}
     np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
@@ -306,6 +323,7 @@ def test_a_map_shows_what_was_moved(played, room, tmp_path):
     """The chair is put 0.5 m further along x at the end: outline before, arrow, filled shape after."""
     scene, b = load_scene(room), played.bodies.index("chair_0")
     pos = played.body_pos_w.copy()
+    pos[1:, played.num_robot_bodies :] = pos[:1, played.num_robot_bodies :]  # and nothing else moves
     pos[:, b], pos[-1, b] = [0.2, 0.0, 0.2], [0.7, 0.0, 0.2]
     for colour_by in topdown.COLOUR_BY:
         figure = topdown.panels([dataclasses.replace(played, body_pos_w=pos)], {str(room): scene}, colour_by)

@@ -12,6 +12,7 @@ from brax.training.agents.ppo import networks
 from brax.training.agents.ppo import train as ppo
 
 import interactive_nav
+from interactive_nav.physics.mjx_batch import JaxPhysics
 from interactive_nav.task.wrappers import AutoResetEnv, wrap_for_brax_training
 from interactive_nav_common.errors import ConfigError
 from tests.toys import write_room
@@ -70,6 +71,13 @@ def test_success_is_paid_once_and_the_end_stays(room):
     # A batch that resets itself begins anew, and is paid anew.
     again = played(AutoResetEnv(env), 3)
     assert all((np.asarray(s.reward) > 9.0).all() and (np.asarray(s.done) == 1).all() for s in again[1:])
+
+
+def test_what_a_backend_does_not_tell_is_nan_at_the_end(env, monkeypatch):
+    assert not JaxPhysics.tells_convergence
+    monkeypatch.setattr(env.physics, "tells_convergence", False)
+    states = played(_Batch(env), LIMIT)
+    assert [np.isnan(s.metrics["unconverged_steps"]).all() for s in states] == [False] * LIMIT + [True]
 
 
 class _Batch(Wrapper):

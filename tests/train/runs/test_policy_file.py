@@ -74,6 +74,12 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
     path = saved(tmp_path / "whole", algorithm, learner)
     checkpoint.keep_policy(path, tmp_path / "kept" / path.name, step=0.03)
     kept, _ = checkpoint.find(tmp_path / "kept", "best")
+    with np.load(kept / policy_file.POLICY) as stored:
+        arrays = dict(stored)
+    lost = next(name for name in arrays if "policy" in name and ":" not in name)
+    np.savez(tmp_path / "less.npz", **{k: v for k, v in arrays.items() if k.partition(":")[0] != lost})
+    with pytest.raises(CheckpointError, match=f"lacks {lost}, which this learner's policy reads"):
+        policy_file.read(tmp_path / "less.npz", ALGORITHMS[algorithm].template(env, config))
     assert not checkpoint.is_whole(kept) and checkpoint.is_whole(path)
     assert sum(p.stat().st_size for p in kept.iterdir()) < 0.5 * sum(p.stat().st_size for p in path.iterdir())
     template = ALGORITHMS[algorithm].template(env, config)
