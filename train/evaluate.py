@@ -179,11 +179,16 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         trained_steps = folder.origin().get("env_steps") if folder else None
         notes = {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)}
         rows, stood = pa.table({}), out.exists()
+        unfinished = out.with_name(f".unfinished-{out.name}")  # which figures and sweeps pass over
         for rows, played in evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch):
             # What is stopped keeps what has been played; whole rows that stood there give way to whole ones only.
-            if len(played) == len(policies) or not stood:
-                write_paths(paths_beside(out), played, player.env)  # first: rows are never without paths as new as they
-                write_parquet(rows, out, notes)
+            place = out if len(played) == len(policies) or not stood else unfinished
+            write_paths(paths_beside(place), played, player.env)  # first: rows are never without paths as new as they
+            write_parquet(rows, place, notes)
+            if place == unfinished:
+                console.print(f"until all have played: {place}; {out} stays as it is", highlight=False, soft_wrap=True)
+        for path in (unfinished, paths_beside(unfinished)):
+            path.unlink(missing_ok=True)
         _tell(console, rows, config, player.env, out)
     return 0
 

@@ -190,6 +190,10 @@ def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monk
         with pytest.raises(KeyboardInterrupt):
             evaluate.main([*words, "--out", str(out)], build_env=build_toy)
     assert out.read_bytes() == whole and pq.read_table(out).num_rows == 6
+    begun = tmp_path / ".unfinished-rows.parquet"
+    assert pq.read_table(begun)["policy"].to_pylist() == ["random"] * 3 and paths_beside(begun).is_file()
+    assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rows.npz", "rows.parquet"]
 
 
 def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
@@ -268,9 +272,11 @@ def test_a_run_folder_with_damaged_files(tmp_path):
     folder.config.write_bytes(bytes(range(256)))
     with pytest.raises(FileError, match=r"config.yaml: cannot be read \(not a text file\)"):
         folder.read_config()
-    (tmp_path / "summary.json").write_text("[]")
-    (tmp_path / "versions.json").write_text("5")
     assert folder.origin()["env_steps"] is None
+    for name in ("versions.json", "summary.json"):
+        (tmp_path / name).write_text("[]")
+        with pytest.raises(FileError, match=rf"{name}: got \[\], expected a mapping"):
+            folder.origin()
     with pytest.raises(UserError, match="name is '..', expected one folder name"):
         RunConfig(name="..")
 

@@ -103,6 +103,8 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         return 0
     if arguments.resume and not (folder.root / "configs").is_dir():
         raise ConfigError(f"--resume: {folder.root} holds no sweep; leave --resume out to begin it")
+    if arguments.only == "evaluate" and not any(folder.state(run).env_steps for run in sweep.runs):
+        raise ConfigError(f"--only evaluate: no run of {folder.root} has trained a step; train first, without --only")
     claim(folder.root)
     folder.prepare()
     launcher = make_launcher(arguments.launcher, arguments.ray_address, sweep)

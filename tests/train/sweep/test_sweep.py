@@ -149,6 +149,15 @@ def test_a_truncated_reason_is_told_with_the_status(tmp_path, capsys):
     assert state.state == "failed" and "not readable as JSON" in state.reason
 
 
+@pytest.mark.parametrize("words", [[], ["--unfinished"]])
+def test_there_is_nothing_to_evaluate_of_a_sweep_that_was_never_trained(tmp_path, capsys, words):
+    path = write_sweep(tmp_path)
+    assert main([str(path), "--only", "evaluate", *words], FAKE) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train.sweep: --only evaluate: no run of ") and "has trained a step; train first" in line
+    assert not (tmp_path / "small").exists()
+
+
 def test_what_a_killed_evaluation_left_goes_at_the_next_start(tmp_path):
     """Paths are written before rows: killed between, or while writing, it leaves them without."""
     path = write_sweep(tmp_path)
