@@ -21,6 +21,7 @@ from rich.console import Console
 from converters.generating import Commands, add_generate, add_generate_scenes, add_launcher, add_models, positive
 from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
+from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
 from scenes_mjcf.schema import CATEGORIES
@@ -285,7 +286,7 @@ def _add_preview(commands: Commands) -> None:
     command = commands.add_parser("preview", help="draw a conversion's stages from above")
     command.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
     command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
-    command.add_argument("--source", type=Path, metavar="SRC", help="raw folder: draws scan and cut too")
+    command.add_argument("--source", type=Path, metavar="SRC", help="raw folder or file: draws scan and cut too")
     command.set_defaults(run=_preview, writes=("{}",))
 
 
@@ -341,6 +342,8 @@ def main(argv: list[str] | None = None) -> int:
         return f"written before: {', '.join(new)}" if new else "nothing was written"
 
     try:
+        if "launcher" in arguments and arguments.launcher != "ray":
+            refuse_unused(arguments, "--ray-address", "without --launcher ray")
         return arguments.run(arguments, console)
     except KeyboardInterrupt:
         print(f"interrupted; {written()}", file=sys.stderr)

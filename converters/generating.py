@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 from rich.console import Console
 
+from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.progress import stage_progress
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -26,7 +27,7 @@ def positive(text: str) -> int:
 def add_launcher(command: argparse.ArgumentParser) -> None:
     """Words that say where."""
     command.add_argument("--launcher", choices=("local", "ray"), default="local", help="where (default: local)")
-    command.add_argument("--ray-address", default="auto", metavar="HOST:PORT", help="of the cluster's head")
+    command.add_argument("--ray-address", metavar="HOST:PORT", help="of the cluster's head (default: auto)")
 
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
@@ -46,8 +47,13 @@ def _generate(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.sets import Wanted, generate_scenes
+    from converters.sets import SEEDS, Wanted, generate_scenes
 
+    if arguments.tier:
+        refuse_unused(arguments, "--recipes", "with --tier, which writes its own")
+        arguments.count, arguments.seed = arguments.count or 10, SEEDS if arguments.seed is None else arguments.seed
+    else:
+        refuse_unused(arguments, "--count --seed", "without --tier")
     wanted = Wanted(**{f.name: getattr(arguments, f.name) for f in dataclasses.fields(Wanted)})
     with stage_progress(console) as report:
         failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
@@ -85,10 +91,8 @@ def add_generate_scenes(commands: Commands) -> None:
     command.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
     command.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
     command.add_argument("--tier", metavar="TIER", help="write OUT/recipes.yaml: sparse, furnished or cluttered homes")
-    command.add_argument("--count", type=positive, default=10, metavar="N", help="how many of a tier (default 10)")
-    command.add_argument(
-        "--seed", type=int, default=100_000, metavar="N", help="of a tier's first home (default 100000)"
-    )
+    command.add_argument("--count", type=positive, metavar="N", help="how many of a tier (default 10)")
+    command.add_argument("--seed", type=int, metavar="N", help="of a tier's first home (default 100000)")
     command.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
     command.add_argument("--overwrite", action="store_true", help="make those again that are there")
     command.add_argument(

@@ -41,13 +41,13 @@ class Wanted:
     out: Path
     recipes: Path | None
     tier: str | None
-    count: int
-    seed: int
+    count: int | None
+    seed: int | None
     only: Sequence[str]
     overwrite: bool
     jobs: int
     launcher: str
-    ray_address: str
+    ray_address: str | None
 
 
 class Runner(Protocol):
@@ -192,9 +192,9 @@ def _command(command: list[str], cwd: str) -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
-def make_runner(launcher: str, address: str, jobs: int, count: int) -> tuple[Runner, int]:
+def make_runner(launcher: str, address: str | None, jobs: int, count: int) -> tuple[Runner, int]:
     """Where `count` commands run, and how many of them side by side."""
-    return (RayRunner(address, 1), max(count, 1)) if launcher == "ray" else (LocalRunner(), jobs)
+    return (RayRunner(address or "auto", 1), max(count, 1)) if launcher == "ray" else (LocalRunner(), jobs)
 
 
 def _last_line(name: str, code: int, printed: str) -> str:
@@ -253,7 +253,7 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
     Raises:
         GenerationError: unknown names, a folder of other recipes, or a single scene that cannot be made.
     """
-    if wanted.tier:
+    if wanted.tier and wanted.count is not None and wanted.seed is not None:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
     path = wanted.recipes or wanted.out / RECIPES
     recipes = load_recipes(path)

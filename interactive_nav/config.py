@@ -104,7 +104,7 @@ class TaskRules(Settings):
     bootstrap_at_time_limit: bool = True
     """The time limit is a truncation, at which learners bootstrap; else it looks like any other end."""
 
-    IDLE = (("small_objects", "num_objects above 0", lambda c: c.num_objects > 0),)
+    IDLE = (("small_objects objects", "num_objects above 0", lambda c: c.num_objects > 0),)
 
     def __post_init__(self) -> None:
         if isinstance(self.objects, (str, Path)):
@@ -229,7 +229,7 @@ class SensorConfig(Settings):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("image_size image_dtype renderer", "depth or segmentation among observations",
+        ("image_size image_fov_deg image_dtype renderer", "depth or segmentation among observations",
          lambda c: any(name in c.observations for name in IMAGES)),
         ("depth_range_m depth_dropout depth_noise", "depth among observations", lambda c: "depth" in c.observations),
         ("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar among observations",

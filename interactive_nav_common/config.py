@@ -289,10 +289,11 @@ def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
     Raises:
         ConfigError: one of them was given.
     """
-    words = {word.partition("=")[0] for word in arguments.settings}
+    words = {word.partition("=")[0] for word in getattr(arguments, "settings", ())}
     for name in names.split():
         option = name.startswith("--")
-        if getattr(arguments, name[2:].replace("-", "_")) if option else name in words:
+        value = getattr(arguments, name[2:].replace("-", "_")) if option else name in words
+        if value or (value == 0 and value is not False):
             raise ConfigError(f"{name} has no effect {why}; leave it out")
 
 

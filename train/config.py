@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any, Literal
 
-from interactive_nav.config import PhysicsConfig, SensorConfig, TaskRules
+from interactive_nav.config import IMAGES, PhysicsConfig, SensorConfig, TaskRules
 from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, flat, replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
@@ -106,6 +106,8 @@ class PPOConfig(Settings):
     """Widths of the policy network, behind its encoder if there are images."""
     value_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of the value network, behind its encoder if there are images."""
+
+    IDLE = (("desired_kl", "learning_rate_schedule adaptive_kl", lambda c: c.learning_rate_schedule == "adaptive_kl"),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,6 +226,8 @@ class RunConfig(Settings):
     wandb_project: str = "interactive-nav"
     """Project there."""
 
+    IDLE = (("wandb_project", "wandb true", lambda c: c.wandb),)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.name:
@@ -316,6 +320,7 @@ def validate(config: TrainConfig) -> None:
     """Raises `ConfigError` where values exclude each other; what is still None is not looked at."""
     if not config.env.scenes:
         raise ConfigError("env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]")
+    _validate_used(config)
     section = getattr(config, config.algorithm)
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps)
@@ -327,6 +332,21 @@ def validate(config: TrainConfig) -> None:
                 f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
                 f"ppo.num_envs ({ppo.num_envs}); change one of the three"
             )
+
+
+def _validate_used(config: TrainConfig) -> None:
+    """Raises `ConfigError` where a setting of a section that is not used was changed."""
+    images = any(name in config.env.observations for name in IMAGES)
+    for name in ("network", *AUTO):
+        section, auto = getattr(config, name), AUTO.get(name, {}).values()
+        if images if name == "network" else name == config.algorithm:
+            continue
+        for field in dataclasses.fields(section):
+            value = getattr(section, field.name)
+            if value not in (field.default, *(sizes.get(field.name) for sizes in auto)):  # `resolve` fills all sections
+                needs = "images among env.observations" if name == "network" else f"algorithm {name}"
+                told = f"{name}.{field.name} is {value!r}, which changes nothing here"
+                raise ConfigError(f"{told}: expected {needs}; or leave it out")
 
 
 def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_all
 from interactive_nav.types import FAILURES
-from interactive_nav_common.config import replace
+from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
 from scenes_mjcf.sets import scene_folders
@@ -24,7 +24,7 @@ from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
 from train.scoring.brought import named
-from train.scoring.evaluation import AUTO_BATCH, LEARNED, add_playing_words, evaluate, write_paths
+from train.scoring.evaluation import AUTO_BATCH, LEARNED, SEED, add_playing_words, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
 from train.scoring.policies import PLANNERS, YARDSTICKS
 from train.scoring.rollout import Player
@@ -88,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
         help="also play what this function of your module, or of path/to/file.py, returns; may be given several times",
     )
     add_playing_words(made)
+    made.set_defaults(seed=None)  # of a file's episodes it decides nothing
     made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
     sizes = ", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items())
     made.add_argument("--batch", type=int, metavar="N", help=f"episodes played at a time (default: {sizes})")
@@ -141,8 +142,13 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
         if value is not None and value < 1:
             raise ConfigError(f"{name} is {value}, expected at least 1")
-    if arguments.record < 0 or not -(2**63) <= arguments.seed < 2**63:
-        raise ConfigError(f"--record {arguments.record} --seed {arguments.seed}: expected 0 or more and 64 bits")
+    seed = SEED if arguments.seed is None else arguments.seed
+    if arguments.record < 0 or not -(2**63) <= seed < 2**63:
+        raise ConfigError(f"--record {arguments.record} --seed {seed}: expected 0 or more and 64 bits")
+    if arguments.episode_file:
+        refuse_unused(arguments, "--balanced --seed", "with --episode-file, whose episodes are fixed")
+    if arguments.dataset:
+        refuse_unused(arguments, "--out", "with --dataset, where each file has its name")
     policies = _policies(arguments)
     for word in arguments.words:
         if "=" in word and not word.startswith("env."):
@@ -164,7 +170,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             scenes=tuple(Path(scene).name for scene in config.env.scenes),
             policies=policies,
             episodes=len(fixed.episodes) if fixed else arguments.episodes or EPISODES,
-            seed=fixed.seed if fixed else arguments.seed,
+            seed=fixed.seed if fixed else seed,
             balanced=arguments.balanced and fixed is None,
             checkpoint=arguments.checkpoint,
             deterministic=not arguments.stochastic,

@@ -260,7 +260,7 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     """Reads the raw folder that a scene was made from.
 
     Args:
-        source: the raw folder.
+        source: the raw folder, or the file of a mesh or a home.
         manifest: of the scene.
         floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
 
@@ -268,10 +268,10 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
         SceneRejected: no known layout, or unusable files.
         SceneError: another building than the scene's.
     """
-    from converters.read.source import READERS, detect_format
+    from converters.read import source as sources
     from converters.read.storeys import split_storeys
 
-    raw = READERS[detect_format(source)][1](source, False)
+    raw = sources.read_source(source)
     expected = manifest.source.get("sha256", {})
     strange = sorted(k for k in raw.sources if k in expected and raw.sources[k] != expected[k])
     if strange or not set(raw.sources) & set(expected):

@@ -55,6 +55,10 @@ def test_a_tiers_recipes_name_seeds_and_splits(tmp_path: Path) -> None:
         (["--tier", "messy"], "tier is 'messy', expected one of sparse, furnished, cluttered"),
         (["--tier", "furnished", "--seed", "-1"], "seed is -1, expected a whole number"),
         ([], "recipes.yaml: no such file"),
+        (["--seed", "0"], "--seed has no effect without --tier; leave it out"),
+        (["--count", "3"], "--count has no effect without --tier; leave it out"),
+        (["--tier", "furnished", "--recipes", "r.yaml"], "--recipes has no effect with --tier, which writes its own"),
+        (["--ray-address", "here:1"], "--ray-address has no effect without --launcher ray; leave it out"),
     ],
 )
 def test_wrong_words_are_one_line_and_leave_nothing(tmp_path: Path, capsys, words: list[str], message: str) -> None:

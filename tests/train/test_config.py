@@ -89,6 +89,12 @@ def test_two_words_that_only_fit_together():
         ("env.segmentation_classes=6", "env.segmentation_classes is 6, expected one of 4, 5, all"),
         ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
         ("algorithm=pop", "algorithm is 'pop', expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
+        (
+            "ppo.desired_kl=0.1",
+            "ppo.desired_kl is 0.1, which changes nothing here: expected learning_rate_schedule adap",
+        ),
+        ("run.wandb_project=x", "run.wandb_project is 'x', which changes nothing here: expected wandb true"),
+        ("env.image_fov_deg=90", "image_fov_deg is 90.0, which changes nothing here: expected depth or segmentation"),
         ("ppo=3", "ppo: got 3 (int), expected a mapping"),
         ("ppo.num_envs", "expected key=value"),
         (
@@ -101,6 +107,26 @@ def test_mistakes_are_named(word, message):
     with pytest.raises(ConfigError) as caught:
         apply_overrides(BASE, [word])
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("sac.tau=0.1", "sac.tau is 0.1, which changes nothing here: expected algorithm sac; or leave it out"),
+        ("ddpg.num_envs=7", "ddpg.num_envs is 7, which changes nothing here: expected algorithm ddpg"),
+        ("network.image_features=64", "network.image_features is 64, .*: expected images among env.observations"),
+    ],
+)
+def test_sections_without_a_use_are_left_out(word, message):
+    config = apply_overrides(BASE, ["env.scenes=x", word])
+    with pytest.raises(ConfigError, match=message):
+        validate(config)
+    used = ["env.observations=[depth]"] if word.startswith("network") else [f"algorithm={word.partition('.')[0]}"]
+    validate(apply_overrides(config, used))
+    for backend in ("native", "warp"):  # whose sizes are written for all sections
+        resolved = resolve(apply_overrides(BASE, ["env.scenes=x"]), backend)
+        assert resolved.sac.num_envs != BASE.sac.num_envs and from_yaml(to_yaml(resolved)) == resolved
+        validate(resolved)
 
 
 def test_minibatches_must_share_the_environments_out():

@@ -33,6 +33,8 @@ from train.scoring.row_files import EvaluationAsked
 from train.scoring.rows import episode_table
 
 LEARNED = "learned"
+SEED = 1_000_000
+"""Of the fixed episodes where none is given."""
 OF_LEARNED = (
     *("algorithm", "seed", "checkpoint_steps", "deterministic"),
     *("train_env_steps", "train_wall_s", "train_device", "train_commit"),
@@ -45,7 +47,7 @@ AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
 def add_playing_words(made: argparse.ArgumentParser) -> None:
     """The words of a command line that say which policy of a run plays which of the fixed episodes where."""
     made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
-    made.add_argument("--seed", type=int, default=1_000_000, help="of the fixed episodes (default 1000000)")
+    made.add_argument("--seed", type=int, default=SEED, help=f"of the fixed episodes (default {SEED})")
     made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
     made.add_argument(
         "--stochastic",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.signals import stop_signals
 from train.runs.policy_file import STEP
@@ -55,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--shard", metavar="I/N", help="only every N-th run, from the I-th: one machine's part")
     made.add_argument("--launcher", choices=("local", "ray"), default="local", help="this machine, or a Ray cluster")
-    made.add_argument("--ray-address", default="auto", metavar="ADDRESS", help="of the cluster (default: auto)")
+    made.add_argument("--ray-address", metavar="ADDRESS", help="of the cluster (default: auto)")
     return made
 
 
@@ -84,6 +85,8 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
     if not 0 < arguments.policy_step <= 4:
         raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")
+    if arguments.launcher != "ray":
+        refuse_unused(arguments, "--ray-address", "without --launcher ray")
     if arguments.unfinished and arguments.only != "evaluate":
         raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
     sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
@@ -107,7 +110,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         raise ConfigError(f"--only evaluate: no run of {folder.root} has trained a step; train first, without --only")
     claim(folder.root)
     folder.prepare()
-    launcher = make_launcher(arguments.launcher, arguments.ray_address, sweep)
+    launcher = make_launcher(arguments.launcher, arguments.ray_address or "auto", sweep)
     stages = (arguments.only,) if arguments.only else STAGES
     try:
         with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -11,9 +12,10 @@ import pytest
 from PIL import Image
 
 from converters.__main__ import main
-from converters.check.preview import preview
+from converters.check.preview import preview, read_source
+from converters.read.source import read_source as read_mesh_or_home
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
-from scenes_mjcf.schema import SceneError
+from scenes_mjcf.schema import SceneError, load_manifest
 
 
 def colours(path) -> np.ndarray:
@@ -43,6 +45,15 @@ def test_the_source_of_another_scene_is_refused(tiny_scene, gibson_raw, tmp_path
     shutil.rmtree(gibson_raw)
     assert main(["preview", str(tiny_scene[0]), "-o", str(tmp_path / "p.png"), "--source", str(gibson_raw)]) == 2
     assert not (tmp_path / "p.png").exists()
+
+
+def test_the_source_may_be_a_file_as_convert_takes_one(tiny_scene, scan2cad_raw, tmp_path):
+    path = tmp_path / "room.ply"
+    shutil.copy(scan2cad_raw / "scan" / "scene_tiny_vh_clean_2.ply", path)
+    made = read_mesh_or_home(path)
+    manifest = dataclasses.replace(load_manifest(tiny_scene[0]), source={"sha256": made.sources})
+    raw = read_source(path, manifest, 0.0)
+    assert raw.source_format == "mesh" and len(raw.scan.vertices) == len(made.scan.vertices)
 
 
 @pytest.fixture

@@ -345,6 +345,7 @@ def test_desks_are_tables_in_the_mask_unless_five_classes_are_asked_for(tmp_path
         ({"observations": ("segmentation",), "depth_noise": 0.1}, "depth_noise is 0.1, .*: expected depth among"),
         ({"lidar_rays": 3}, "lidar_rays is 3, .*: expected lidar among observations; or leave it out"),
         ({"odometry_noise": 0.1}, "odometry_noise is 0.1, .*: expected odometry among observations"),
+        ({"num_objects": 0, "objects": ("a",)}, r"objects is \('a',\), .*: expected num_objects above 0"),
         ({"num_objects": 0, "small_objects": "test"}, "small_objects is 'test', .*: expected num_objects above 0"),
     ],
 )
