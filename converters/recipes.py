@@ -45,7 +45,7 @@ class SceneRecipe:
     """How one scene is made."""
 
     name: str
-    split: str
+    split: Literal["train", "test"]
     seed: int
     building: BuildingConfig | HomeConfig
 

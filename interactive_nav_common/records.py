@@ -145,16 +145,17 @@ class Reader:
                 raise self.error(f"{where} is {shown(value)}, expected {what}; {self.remedy}")
             return value
         kinds, words = KINDS[origin or hint]
+        found: Any = value
         if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
             raise self.error(f"{where} is {shown(value)}, expected {words}; {self.remedy}")
         if origin is dict:
-            return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in value.items()}
+            return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in found.items()}
         if origin is tuple:
-            each = [arguments[0]] * len(value) if arguments[1:] == (...,) else arguments
-            if len(each) != len(value):
+            each = [arguments[0]] * len(found) if arguments[1:] == (...,) else arguments
+            if len(each) != len(found):
                 raise self.error(f"{where} is {shown(value)}, expected a list of {len(each)}; {self.remedy}")
             return tuple(
-                self.typed(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(value, each, strict=True))
+                self.typed(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(found, each, strict=True))
             )
         return value
 
