@@ -31,7 +31,8 @@ TOY = EnvConfig.of(scenes=("toy",), backend="native")
 
 def learner_of(env, algorithm, share):
     network = dataclasses.replace(SMALL, share_encoder=share)
-    config = resolve(TrainConfig(env=TOY, algorithm=algorithm, network=network), "native")
+    config = resolve(TrainConfig(env=TOY, algorithm=algorithm), "native")
+    config = dataclasses.replace(config, network=network)  # the toy shows images that its config does not name
     template = ALGORITHMS[algorithm].template(env, config)
     leaves, structure = jax.tree.flatten(template)
     rng = np.random.default_rng(3)  # what begins as zeros shall not agree by chance
