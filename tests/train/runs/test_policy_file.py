@@ -139,7 +139,7 @@ def test_foreign_and_damaged_files_are_told(tmp_path):
     path = saved(tmp_path / "whole", "sac", learner)
     checkpoint.keep_policy(path, tmp_path / "kept" / path.name)
     kept, _ = checkpoint.find(tmp_path / "kept", "best")
-    other = resolve(TrainConfig(env=TOY, network=config.network), "native")
+    other = dataclasses.replace(resolve(TrainConfig(env=TOY), "native"), network=config.network)
     with pytest.raises(CheckpointError, match="policy_params/.*which this learner has not"):
         checkpoint.load_learner(kept, ALGORITHMS["ppo"].template(ToyPixels(), other))
     files = (path, checkpoint.LEARNER), (kept, policy_file.POLICY)
