@@ -134,11 +134,8 @@ def _wanted(
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 
-@reports_errors("train.evaluate")
-def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
-    """Evaluates; 0 when done, 2 on a user's error."""
-    arguments = parser().parse_intermixed_args(argv)
-    console = Console()
+def _checked_seed(arguments: argparse.Namespace) -> int:
+    """The seed of drawn episodes, once numbers are in range and no word is without effect."""
     for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
         if value is not None and value < 1:
             raise ConfigError(f"{name} is {value}, expected at least 1")
@@ -149,6 +146,15 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         refuse_unused(arguments, "--balanced --seed", "with --episode-file, whose episodes are fixed")
     if arguments.dataset:
         refuse_unused(arguments, "--out", "with --dataset, where each file has its name")
+    return seed
+
+
+@reports_errors("train.evaluate")
+def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
+    """Evaluates; 0 when done, 2 on a user's error."""
+    arguments = parser().parse_intermixed_args(argv)
+    console = Console()
+    seed = _checked_seed(arguments)
     policies = _policies(arguments)
     for word in arguments.words:
         if "=" in word and not word.startswith("env."):
