@@ -23,11 +23,13 @@ import pyarrow.parquet as pq
 
 from converters.clock import STAGES, peak_memory_mib
 from converters.pipeline import ConvertConfig, Converted, convert_building
+from converters.read.source import root_of
 from converters.records.errors import StageFailed
 from converters.sets import Runner, run_side_by_side
 from interactive_nav_common.errors import ConfigError, FileError, UserError
 from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.rows import write_parquet
+from scenes_mjcf.schema import load_manifest
 
 ROWS = "conversions.parquet"
 SCHEMA = pa.schema(
@@ -45,11 +47,21 @@ SCHEMA = pa.schema(
 )
 
 
-def digest_of(source: Path, config: ConvertConfig) -> str:
-    """Of the options that a conversion's result depends on, and of the names, sizes and times of its input files."""
+def digest_of(source: Path, config: ConvertConfig, scenes: Sequence[Path] = ()) -> str:
+    """Of the options that a conversion's result depends on, and of the names, sizes and times of its input files.
+
+    Args:
+        source: folder, or a file.
+        config: choices.
+        scenes: folders that were made from it: what a file names is known once it was read.
+    """
     roots = [root for root in (source, config.library) if root is not None]
     paths = [(root, path) for root in roots for path in (root, *sorted(root.rglob("*"))) if path.is_file()]
-    files = [(str(p.relative_to(root)), p.stat().st_size, p.stat().st_mtime_ns) for root, p in paths]
+    if source.is_file():
+        root, made = root_of(source), [s for s in scenes if (s / "scene.json").is_file()]
+        named = sorted({name for scene in made for name in load_manifest(scene).source["sha256"]})
+        paths += [(root, root / name) for name in named if (root / name).is_file()]
+    files = [(os.path.relpath(p, root), p.stat().st_size, p.stat().st_mtime_ns) for root, p in paths]
     options = {**dataclasses.asdict(config), "jobs": 0, "overwrite": False, "library": config.library is not None}
     return hashlib.sha256(repr((options, files)).encode()).hexdigest()[:16]
 
@@ -84,8 +96,10 @@ def convert_many(
     into.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=into, prefix=".rows-") as folder:
         for name, source in named.items():
-            old, digests[name] = rows.get(name), digest_of(source, config)
-            ours = bool(old and old["scenes"] and all(Path(into, scene).is_dir() for scene in old["scenes"]))
+            old = rows.get(name)
+            made = [Path(into, scene) for scene in (old and old["scenes"]) or ()]
+            ours = bool(made) and all(scene.is_dir() for scene in made)
+            digests[name] = digest_of(source, config, made)
             same = old and ours and old["digest"] == digests[name] and old["exit_code"] in (0, 1)
             if old and same and not config.overwrite:
                 tell(f"{name}: is there, kept")
@@ -101,9 +115,11 @@ def convert_many(
             if not row:
                 told = f"killed by signal {-code}" if code < -1 else f"exit code {code}, {printed[-200:].strip()}"
                 row["error"] = told
-            known = {"name": name, "source": str(named[name]), "digest": digests[name], "exit_code": code}
+            known = {"name": name, "source": str(named[name]), "exit_code": code}
             scenes = (rows.get(name) or {}).get("scenes")  # of before: they still stand
             rows[name] = {"scenes": scenes, **known, **row}
+            made_now = [Path(into, scene) for scene in row.get("scenes") or ()]
+            rows[name]["digest"] = digest_of(named[name], config, made_now) if made_now else digests[name]
             write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
             if "error" in row:
                 return f"{name}: {row['error']}"

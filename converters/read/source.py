@@ -50,6 +50,14 @@ def detect_format(source: Path) -> str:
     )
 
 
+def root_of(source: Path) -> Path:
+    """The folder that names of a source's files are relative to."""
+    if source.is_dir():
+        return source
+    of_home = (root for endings, (root, _) in FILES.items() if source.name.lower().endswith(endings))
+    return next(of_home, lambda path: path.parent)(source)
+
+
 def read_source(
     source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto",
     within: Path | None = None,

@@ -33,18 +33,23 @@ LIMIT_BYTES = 2 * 2**30
 """The oldest entries go beyond this size."""
 KEEP_S = 3600.0
 """What was read or written within this time may be a running conversion's, and stays."""
-PACKAGE = Path(str(importlib.resources.files("converters")))
+_NAMES = ("converters", "scenes_mjcf", "interactive_nav_common")
+PACKAGES = tuple(Path(str(importlib.resources.files(name))) for name in _NAMES)
+    Path(str(importlib.resources.files(p))) for p in ("converters", "scenes_mjcf", "interactive_nav_common")
+)
+"""The converter, and what it is built on: categories and their labels, rotations."""
 NOT_HASHED = {"hashed": False}
 """Metadata of dataclass fields that no stage's result depends on (names, reports)."""
 
 
 @functools.cache
-def fingerprint(package: Path = PACKAGE) -> bytes:
+def fingerprint(packages: tuple[Path, ...] = PACKAGES) -> bytes:
     """Digest of the converter's source files and the computing libraries' versions."""
     digest = hashlib.sha256(repr([(name, version(name)) for name in COMPUTING]).encode())
-    for path in sorted(package.rglob("*.py")):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
+    for package in packages:
+        for path in sorted(package.rglob("*.py")):
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(package.parent).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.digest()
 
 

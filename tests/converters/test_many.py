@@ -22,6 +22,7 @@ from converters.clock import STAGES, peak_memory_mib
 from converters.many import ROWS, convert_many, digest_of
 from converters.pipeline import ConvertConfig
 from scenes_mjcf.schema import load_manifest
+from tests.converters.read.test_single_mesh import tall_room
 
 QUICK = ConvertConfig(jobs=2, structure_texture=64, object_texture=32)
 
@@ -108,6 +109,24 @@ def test_the_digest_is_of_options_and_inputs(gibson_raw):
     assert first != digest_of(gibson_raw, dataclasses.replace(QUICK, seed=1))
     (gibson_raw / "more.txt").write_text("x")
     assert first != digest_of(gibson_raw, QUICK)
+
+
+def test_a_file_that_the_source_names_is_one_of_its_inputs(tmp_path):
+    tall_room().export(tmp_path / "room.obj")
+    text = (tmp_path / "room.obj").read_text()
+    (tmp_path / "room.obj").write_text("mtllib paint.mtl\nusemtl wall\n" + text)
+    (tmp_path / "paint.mtl").write_text("newmtl wall\nKd 0.5 0.5 0.5\n")
+    lines: list[str] = []
+
+    def convert():
+        lines.clear()
+        runner, into = Killing(), tmp_path / "o"
+        assert convert_many([tmp_path / "room.obj"], into, QUICK, runner, 1, lambda *_: None, lines.append) == []
+        return len(runner.tasks)
+
+    assert convert() == 1 and convert() == 0 and lines[0] == "room: is there, kept"
+    (tmp_path / "paint.mtl").write_text("newmtl wall\nKd 0.9 0.1 0.1\n")
+    assert convert() == 1 and convert() == 0
 
 
 def test_of_the_command(tmp_path, monkeypatch, capsys):

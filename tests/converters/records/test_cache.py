@@ -10,7 +10,7 @@ import pytest
 
 from converters.geometry.boxes import Box, Hull
 from converters.records import cache
-from converters.records.cache import KEEP_S, LIMIT_BYTES, StageCache, fingerprint, prune
+from converters.records.cache import KEEP_S, LIMIT_BYTES, PACKAGES, StageCache, fingerprint, prune
 from converters.records.raw import RawScene, ScanMesh
 
 CALLS: list[tuple] = []
@@ -144,14 +144,20 @@ def test_an_entry_that_vanishes_while_it_is_read_is_computed(tmp_path, monkeypat
 def test_the_fingerprint_follows_every_source_file_by_its_place(tmp_path):
     (tmp_path / "mesh").mkdir()
     (tmp_path / "mesh" / "cut.py").write_text("a = 1")
-    digests = [fingerprint(tmp_path)]
+    digests = [fingerprint((tmp_path,))]
     (tmp_path / "mesh" / "cut.py").write_text("a = 2")
     fingerprint.cache_clear()
-    digests.append(fingerprint(tmp_path))
+    digests.append(fingerprint((tmp_path,)))
     (tmp_path / "mesh").rename(tmp_path / "scan")
     fingerprint.cache_clear()
-    digests.append(fingerprint(tmp_path))
+    digests.append(fingerprint((tmp_path,)))
     assert len(set(digests)) == 3
+
+
+def test_the_fingerprint_follows_what_the_converter_is_built_on():
+    """A category's labels decide what is cut: an edited table must not be served old cuts."""
+    assert {p.name for p in PACKAGES} == {"converters", "scenes_mjcf", "interactive_nav_common"}
+    assert any((p / "categories.py").is_file() for p in PACKAGES) and fingerprint() != fingerprint(PACKAGES[:1])
 
 
 def test_what_cannot_be_hashed_is_refused(tmp_path):
