@@ -35,8 +35,6 @@ KEEP_S = 3600.0
 """What was read or written within this time may be a running conversion's, and stays."""
 _NAMES = ("converters", "scenes_mjcf", "interactive_nav_common")
 PACKAGES = tuple(Path(str(importlib.resources.files(name))) for name in _NAMES)
-    Path(str(importlib.resources.files(p))) for p in ("converters", "scenes_mjcf", "interactive_nav_common")
-)
 """The converter, and what it is built on: categories and their labels, rotations."""
 NOT_HASHED = {"hashed": False}
 """Metadata of dataclass fields that no stage's result depends on (names, reports)."""
