@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -121,13 +121,18 @@ def convert_many(
             made_now = [Path(into, scene) for scene in row.get("scenes") or ()]
             rows[name]["digest"] = digest_of(named[name], config, made_now) if made_now else digests[name]
             write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
-            if "error" in row:
-                return f"{name}: {row['error']}"
-            gates = ", ".join(row["gates_failed"])
-            verdict = f"gates that fail: {gates}" if gates else "every gate passes"
-            return f"{name}: {row['area_m2']:.1f} m² traversable in {row['seconds']:.0f} s, {verdict}"
+            return _told(rows[name])
 
         return bad + run_side_by_side(commands, runner, side_by_side, report, tell, ended, "sources")
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    """A conversion's row in one line."""
+    if row.get("error") is not None:
+        return f"{row['name']}: {row['error']}"
+    gates = ", ".join(row["gates_failed"])
+    verdict = f"gates that fail: {gates}" if gates else "every gate passes"
+    return f"{row['name']}: {row['area_m2']:.1f} m² traversable in {row['seconds']:.0f} s, {verdict}"
 
 
 def _named(sources: Sequence[Path]) -> dict[str, Path]:
