@@ -17,8 +17,10 @@ from scipy.sparse.csgraph import connected_components
 
 PACKAGES = (
     *("interactive_nav_common", "scenes_mjcf", "converters", "interactive_nav", "train", "topological_nav"),
-    "benchmarks",
+    *("benchmarks", "docs"),
 )
+UNDRAWN = ("benchmarks", "docs")
+"""Programs that measure: no package imports them."""
 Graph = dict[str, set[str]]
 """Name -> names that it imports."""
 
@@ -106,7 +108,7 @@ def svg(graph: Graph) -> str:
     What a whole package builds on stands in the column's head.
     """
     level = levels(graph)
-    packages = [p for p in PACKAGES if p != "benchmarks" and any(room.partition(".")[0] == p for room in graph)]
+    packages = [p for p in PACKAGES if p not in UNDRAWN and any(room.partition(".")[0] == p for room in graph)]
     columns = {p: sorted((r for r in graph if r.startswith(f"{p}.")), key=lambda r: (level[r], r)) for p in packages}
     wide, high, gap, top = 236, 54, 8, 112
     height = top + (high + gap) * max(len(rooms) for rooms in columns.values()) + gap

@@ -25,7 +25,7 @@ from interactive_nav.config import make_config
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 NOT_RUN = re.compile(r"<!--\s*not run:\s*(.+?)\s*-->", re.DOTALL)
-HOUSE = ("interactive_nav", "train", "converters", "topological_nav", "benchmarks")
+HOUSE = ("interactive_nav", "train", "converters", "topological_nav", "benchmarks", "docs")
 
 
 class Block(NamedTuple):

@@ -1,11 +1,9 @@
-"""`python -m interactive_nav.robots`: the table of robots, their pictures, their evidence.
+"""`python -m interactive_nav.robots`: the table of robots, and their pictures.
 
     python -m interactive_nav.robots                                # the table
     python -m interactive_nav.robots --render pictures/             # and one PNG per robot
-    python -m interactive_nav.robots evidence --backend warp --robots all
-    python -m interactive_nav.robots figure docs/robots.png
 
-Exit status: 0; 1 if a check failed; 2 for a question that cannot be answered, with one line that says why.
+Exit status: 0; 2 for a question that cannot be answered, with one line that says why.
 """
 
 from __future__ import annotations
@@ -53,63 +51,21 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
     console.print(table)
 
 
-def _print_evidence(names: tuple[str, ...], backend: str, console: Console) -> bool:
-    """Prints each robot's checks as it is measured; whether all passed."""
-    from interactive_nav.robot_study.evidence import EVIDENCE, measure
-
-    passed = True
-    for k, name in enumerate(names):
-        kind = get_robot(name).kind
-        if kind not in EVIDENCE:
-            console.print(f"[{k + 1}/{len(names)}] {name}: {kind}, no manoeuvres are defined for its kind")
-            continue
-        own = measure(name, backend)
-        table = Table("check", "value", "limits", "", title=f"[{k + 1}/{len(names)}] {name} on {own.backend}")
-        for check in own.checks:
-            verdict = "ok" if check.passed else "FAILED"
-            table.add_row(check.name, f"{check.value:.4g}", f"{check.low:.3g} .. {check.high:.3g}", verdict)
-        console.print(table)
-        console.file.flush()
-        passed &= own.passed
-    console.print("all passed" if passed else "some checks FAILED")
-    return passed
-
-
-def _draw_figure(names: tuple[str, ...], backend: str, path: Path) -> None:
-    from interactive_nav.robot_study.evidence import EVIDENCE, measure
-    from interactive_nav.robot_study.picture import save_figure
-
-    save_figure({n: measure(n, backend) if get_robot(n).kind in EVIDENCE else None for n in names}, path)
-
-
 @reports_errors("interactive_nav.robots")
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m interactive_nav.robots", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
     parser.add_argument("--render", metavar="DIR", type=Path, help="write one PNG per robot")
     parser.add_argument("--robots", default="all", help="names, comma between them; default all")
-    commands = parser.add_subparsers(dest="command")
-    for name, text in (("evidence", "measure the robots and print the checks"), ("figure", "draw all of it")):
-        sub = commands.add_parser(name, help=text)
-        sub.add_argument("--backend", default="native", choices=("native", "jax", "warp", "auto"))
-        sub.add_argument("--robots", default="all", help="names, comma between them; default all")
-        if name == "figure":
-            sub.add_argument("out", type=Path, help="PNG to write")
     args = parser.parse_args(argv)
     console = Console(width=None if sys.stdout.isatty() else 220)
     try:
         names = _names(args.robots)
         for name in names:
             get_robot(name)
-        if args.command == "evidence":
-            return 0 if _print_evidence(names, args.backend, console) else 1
-        if args.command == "figure":
-            _draw_figure(names, args.backend, args.out)
-            console.print(f"wrote {args.out}")
-            return 0
         _print_table(names, console)
         if args.render:
-            from interactive_nav.robot_study.picture import save_pictures
+            from interactive_nav.pictures.robot import save_pictures
 
             for path in save_pictures(names, args.render):
                 console.print(f"wrote {path}")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.navigation_tables import RADIUS_M, fast_marching, random_points, random_room, reference, scene_tables
+from docs.studies.navigation_tables import RADIUS_M, fast_marching, random_points, random_room, reference, scene_tables
 from interactive_nav import geodesic
 from interactive_nav.navigation import lookup
 from interactive_nav.navigation.tables import navigation_tables

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from benchmarks import supersample
+from docs.studies import supersample
 from interactive_nav.scenes.scene import load_scene
 from tests.topological_nav.conftest import Made
 from topological_nav.learn.pairs import camera_of

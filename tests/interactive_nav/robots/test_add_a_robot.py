@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from docs.studies.robots import evidence
 from interactive_nav import robots
-from interactive_nav.robot_study import evidence
-from interactive_nav.robot_study.picture import stage
+from interactive_nav.pictures.robot import stage
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 

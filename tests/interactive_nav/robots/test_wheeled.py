@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from docs.studies.robots import __main__ as study
+from docs.studies.robots import evidence
+from docs.studies.robots.hall import LOADS, box, hall
 from interactive_nav.config import NavConfig
-from interactive_nav.robot_study import evidence
-from interactive_nav.robot_study.hall import LOADS, box, hall
-from interactive_nav.robot_study.picture import picture, stage
+from interactive_nav.pictures.robot import picture, stage
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav.robots.__main__ import main
 from interactive_nav.robots.build import half_extents
@@ -382,10 +383,11 @@ def test_command_prints_the_table_and_renders(tmp_path, capsys):
 
 
 def test_command_measures_and_answers_an_unknown_name(capsys, monkeypatch):
-    assert main(["evidence", "--robots", "turtlebot"]) == 0
+    assert study.main(["evidence", "--robots", "turtlebot"]) == 0
     assert "all passed" in capsys.readouterr().out
     monkeypatch.setattr(evidence, "PUSH_SPEED_M_S", 0.0)
-    assert main(["evidence", "--robots", "turtlebot"]) == 1
+    assert study.main(["evidence", "--robots", "turtlebot"]) == 1
     assert "FAILED" in capsys.readouterr().out
-    assert main(["--robots", "turtelbot"]) == 2
-    assert "did you mean 'turtlebot'" in capsys.readouterr().err
+    for program in (lambda: main(["--robots", "turtelbot"]), lambda: study.main(["evidence", "--robots", "turtelbot"])):
+        assert program() == 2
+        assert "did you mean 'turtlebot'" in capsys.readouterr().err

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from docs.studies.robots.hall import hall
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robot_study.hall import hall
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Hinge, Movable
 from interactive_nav.scenes.world import build_world

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.episodes_in_batch import REST, Clock, Spent, measure, table
+from docs.studies.episodes_in_batch import REST, Clock, Spent, measure, table
 from tests.topological_nav.conftest import Made
 from topological_nav.config import PASSAGE_POLICY, EvaluationConfig
 from topological_nav.evaluate.contest import Contest

@@ -1,8 +1,8 @@
 """How far physics settings are from a finely resolved reference, over scripted pushes: settings in, rows out.
 
-    python -m benchmarks.fidelity --backend native
-    python -m benchmarks.fidelity --backend warp --only environment
-    python -m benchmarks.fidelity --report
+    python -m docs.studies.fidelity --backend native
+    python -m docs.studies.fidelity --backend warp --only environment
+    python -m docs.studies.fidelity --report
 
 The reference is C MuJoCo at 1/240 s with 100 solver iterations to a tolerance of 1e-12, once with convex hulls and
 once with the boxes that batched scenes collide with. Every scenario is run from many offsets and turns of the object,

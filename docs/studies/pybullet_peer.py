@@ -1,6 +1,6 @@
 """The original's engine on the same scene and cores: settings in, one JSON row with the ratio out.
 
-    python -m benchmarks.pybullet_peer --scene scenes_mjcf/apartment_0
+    python -m docs.studies.pybullet_peer --scene scenes_mjcf/apartment_0
 
 PyBullet steps one environment at a time, as Interactive Gibson did: four substeps of 1/40 s per control step of
 0.1 s, velocity motors without a torque limit, one query of the robot's contacts per substep, new random wheel

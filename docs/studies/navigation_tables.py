@@ -1,8 +1,8 @@
 """Shortest-path tables: accuracy against fast marching, the host's time to build them, bytes, time of a look-up.
 
-`python -m benchmarks.navigation_tables SCENE_DIR ...` tables of these scenes, for a TurtleBot
-`python -m benchmarks.navigation_tables --plans N` of N synthetic plans of 160 m2: sixteen rooms, forty fixed blocks
-`python -m benchmarks.navigation_tables --accuracy ROOMS` errors in random rooms (needs scikit-fmm)
+`python -m docs.studies.navigation_tables SCENE_DIR ...` tables of these scenes, for a TurtleBot
+`python -m docs.studies.navigation_tables --plans N` of N synthetic plans of 160 m2: sixteen rooms, forty fixed blocks
+`python -m docs.studies.navigation_tables --accuracy ROOMS` errors in random rooms (needs scikit-fmm)
 """
 
 from __future__ import annotations

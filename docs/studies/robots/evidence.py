@@ -3,7 +3,7 @@
 All manoeuvres of a robot run as one batch in one hall: a wheeled one stands, drives straight and stops, turns
 on the spot, takes a corner at full speed, and pushes a basket, a table and a sofa; a legged or flying one
 stands, moves over a metre, stops and turns. Limits are those of the tests and of
-`python -m interactive_nav.robots evidence`, which runs without pytest, for instance on a GPU machine.
+`python -m docs.studies.robots evidence`, which runs without pytest, for instance on a GPU machine.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from docs.studies.robots.hall import LOADS, box, hall
 from interactive_nav.config import NavConfig
 from interactive_nav.metrics import GRAVITY
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robot_study.hall import LOADS, box, hall
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import half_extents
 from interactive_nav.robots.spec import RobotSpec

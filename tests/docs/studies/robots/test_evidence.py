@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from interactive_nav.robot_study import evidence
+from docs.studies.robots import evidence
 from interactive_nav.robots import robot_names
 
 pytestmark = [pytest.mark.gpu, pytest.mark.heavy]

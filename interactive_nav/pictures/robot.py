@@ -1,4 +1,4 @@
-"""Robots in, pictures out: one PNG each, and the figure `docs/robots.png` with what was measured of them.
+"""Robots in, pictures out: one PNG each.
 
 Pictures come from MuJoCo's renderer where OpenGL is found (EGL, no display needed), else from rays against the same
 geoms.
@@ -15,7 +15,6 @@ import numpy as np
 from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import trace
 from interactive_nav.pictures.shading import lambert
-from interactive_nav.robot_study.evidence import Evidence
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
@@ -125,52 +124,3 @@ def save_pictures(names: tuple[str, ...], folder: Path) -> list[Path]:
         Image.fromarray(picture(get_robot(name))).save(path)
         paths.append(path)
     return paths
-
-
-def save_figure(evidence: dict[str, Evidence | None], path: Path) -> None:
-    """One row per robot: its picture, the straight drive, the turn on the spot, and its checks.
-
-    Args:
-        evidence: robot -> what was measured; none: a picture only.
-        path: of the PNG.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(17, 2.9 * len(evidence)))
-    axes = figure.subplots(len(evidence), 4, width_ratios=(1, 1.3, 1.3, 2.6), squeeze=False)
-    for (image, straight, turn, table), (name, own) in zip(axes, evidence.items(), strict=True):
-        robot = get_robot(name)
-        image.imshow(picture(robot))
-        image.set_title(f"{name}, {robot.mass_kg:.4g} kg" if robot.mass_kg else name, fontsize=10)
-        for axis in (image, table):
-            axis.set_axis_off()
-        if own is None:
-            straight.set_axis_off()
-            turn.set_axis_off()
-            continue
-        curves = (
-            (straight, own.speed_m_s, own.commanded_m_s, "m/s", "straight, then stop"),
-            (turn, own.turn_rad_s, own.commanded_rad_s, "rad/s", "turn on the spot, then stop"),
-        )
-        for axis, got, asked, unit, title in curves:
-            axis.plot(own.time_s, asked, "--", color="0.5", linewidth=1, label="asked")
-            axis.plot(own.time_s, got, color="tab:blue", linewidth=1.5, label="measured")
-            axis.set_ylabel(unit, fontsize=8)
-            axis.set_title(title, fontsize=8)
-            axis.set_xlabel("s", fontsize=8)
-            axis.tick_params(labelsize=7)
-            axis.legend(fontsize=7, loc="lower left")
-        half = (len(own.checks) + 1) // 2
-        for column, part in enumerate((own.checks[:half], own.checks[half:])):
-            for row, check in enumerate(part):
-                table.text(
-                    0.5 * column,
-                    1.0 - row / half,
-                    f"{check.name}: {check.value:.3g}",
-                    fontsize=8,
-                    color="black" if check.passed else "red",
-                    transform=table.transAxes,
-                    va="top",
-                )
-    figure.tight_layout()
-    figure.savefig(path, dpi=80)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.kernels import busy_share, device_events, part_of, plain_name
+from docs.studies.kernels import busy_share, device_events, part_of, plain_name
 from interactive_nav_common.errors import UserError
 
 

@@ -1,6 +1,6 @@
 """What an environment step spends its time on, kernel by kernel, on a GPU: settings in, a table and JSON rows out.
 
-    python -m benchmarks.kernels --scenes scenes_mjcf/alder scenes_mjcf/birch --num-envs 8192
+    python -m docs.studies.kernels --scenes scenes_mjcf/alder scenes_mjcf/birch --num-envs 8192
 
 Runs `AutoResetEnv.step`, or parts of it, under JAX's profiler, which sees Warp's kernels too, and adds up the device
 time of each kernel. Two parts' difference is what lies between them: `--part simulation` less `observed` is drawing new

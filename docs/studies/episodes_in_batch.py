@@ -1,6 +1,6 @@
 """Where the seconds go when many episodes of the topological navigator are one batch.
 
-    python -m benchmarks.episodes_in_batch scenes_mjcf/cedar --maps R/maps episodes=1000 supersample=2
+    python -m docs.studies.episodes_in_batch scenes_mjcf/cedar --maps R/maps episodes=1000 supersample=2
 
 Plays the first episodes of a scene at once, as `topological_nav evaluate` does with batch=episodes, and adds up what
 draws, looks, drives and simulates; what XLA compiles stands apart, the longest call shows what Warp compiles. Without

@@ -1,6 +1,6 @@
 """What drawing images smaller costs the topological navigator's networks, and what it saves.
 
-    python -m benchmarks.supersample scenes_mjcf/rowan
+    python -m docs.studies.supersample scenes_mjcf/rowan
 
 Draws the same places at the size that the networks learned from and smaller, all averaged to the size that they look
 at, and compares what the networks say with what they say of the largest. Without --localiser and --detector: the
