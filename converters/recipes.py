@@ -7,6 +7,7 @@ which CAD models may be used. The same recipes give the same scenes, byte for by
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +17,9 @@ import yaml
 from converters.check.preview import preview
 from converters.generate import generate_building
 from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
-from converters.generate.homes.config import OPTIONAL, TIERS, HomeConfig, home_config, home_fields
+from converters.generate.homes.config import OPTIONAL, SHARE_TOLERANCE, TIERS, HomeConfig, home_config, home_fields
 from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
-from converters.pipeline import ConvertConfig, convert
+from converters.pipeline import ConvertConfig, Converted, convert
 from interactive_nav_common.config import Natural, nearest
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
@@ -205,15 +206,47 @@ def load_recipes(path: Path) -> Recipes:
     return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 
-def _generate(recipe: SceneRecipe, raw: Path, report: Report) -> None:
-    """The recipe's building; a home whose seed gives no plan that can be furnished so takes the next of its seeds."""
+def missed(building: BuildingConfig | HomeConfig, measures: dict[str, Any]) -> str:
+    """Which share a converted home was asked for and does not have; empty: none.
+
+    Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
+
+    Args:
+        building: as it was asked for.
+        measures: of the scene (`converters/write/measures.py`).
+    """
+    asked = building.must_push if isinstance(building, HomeConfig) else {}
+    for robot, (low, high) in asked.items():
+        share = measures["must_push_share"][robot]
+        if not low - SHARE_TOLERANCE <= share <= high + SHARE_TOLERANCE:
+            return f"must_push_{robot} is {share} once converted: expected {low} to {high}"
+    return ""
+
+
+def _made(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> Converted:
+    """The recipe's building, generated and converted.
+
+    A home takes the next of its seeds where one gives no plan that can be furnished so, or misses what was asked for
+    once it is converted.
+    """
     tries = MOST_SEEDS if isinstance(recipe.building, HomeConfig) else 1
     for k in range(tries):
+        raw, made = work / "raw", work / recipe.name
+        for folder in (raw, made):
+            shutil.rmtree(folder, ignore_errors=True)
         try:
-            return generate_building(raw, recipe.seed + k * NEXT_SEED, report, recipe.building)
-        except GenerationError:
+            generate_building(
+                raw, recipe.seed + k * NEXT_SEED, lambda s, share: report(s, GENERATE * share), recipe.building
+            )
+            result = convert(raw, made, config, lambda s, share: report(s, GENERATE + CONVERT * share))
+            if why := missed(recipe.building, result.manifest.measures):
+                raise GenerationError(why)
+        except GenerationError as error:
             if k == tries - 1:
-                raise
+                raise GenerationError(f"{recipe.name}: none of {tries} seeds: {error}") from error
+        else:
+            return result
+    raise AssertionError("unreachable: the last try returns or raises")
 
 
 def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report) -> list[str]:
@@ -233,10 +266,8 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
         FileError: it cannot be written; an older one is untouched.
     """
     with part_folder(folder, overwrite=True) as work:
-        _generate(recipe, work / "raw", lambda s, share: report(s, GENERATE * share))
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
-        made = work / folder.name
-        result = convert(work / "raw", made, config, lambda s, share: report(s, GENERATE + CONVERT * share))
+        result, made = _made(recipe, config, work, report), work / recipe.name
         report("drawing", GENERATE + CONVERT)
         preview(made, made / "preview.png")
         publish({made: folder})

@@ -110,7 +110,7 @@ def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda l
             digest = scene_digest(out / recipe.name)
             if listed.digest not in ("", digest):
                 tell(f"{recipe.name}: not the scene that {path} lists")
-            elif not listed.digest:
+            else:
                 measures = load_manifest(out / recipe.name).measures
                 listed = dataclasses.replace(listed, digest=digest, measures=measures)
         members[recipe.name] = listed

@@ -21,6 +21,7 @@ from converters.generate.design.furnish import SIDE_WALL_M
 from converters.generate.design.maps import clearance
 from converters.generate.design.space import GRID_M, passes, room_mask, static_grid, without
 from converters.generate.models.cad import HOME_TEST_MODELS, TEST_MODELS, TRAIN_MODELS
+from converters.pipeline import ConvertConfig
 from converters.recipes import chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.errors import FileError
 
@@ -118,25 +119,43 @@ def test_a_name_that_leads_elsewhere_removes_nothing(tmp_path, capsys, name):
     assert digest(tmp_path) == before
 
 
-def test_a_home_without_a_plan_takes_the_next_of_its_seeds(tmp_path, monkeypatch):
+def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(tmp_path, monkeypatch):
     tried: list[int] = []
+    shares: dict[int, float] = {}  # of the pairs for Fetch, by try
 
     def generate(raw, seed, report, building):
         tried.append(seed)
         if len(tried) < given:
             raise GenerationError(f"seed {seed}: no")
 
+    def convert(raw, made, config, report):
+        measures = {"must_push_share": {"turtlebot": 0.05, "fetch": shares.get(len(tried), 0.3)}}
+        return SimpleNamespace(manifest=SimpleNamespace(measures=measures))
+
+    def made(recipe):
+        tried.clear()
+        return recipes._made(recipe, ConvertConfig(), tmp_path, lambda stage, share: None)
+
     monkeypatch.setattr(recipes, "generate_building", generate)
+    monkeypatch.setattr(recipes, "convert", convert)
     (home,) = parse_recipes({"scenes": {"a": {"split": "train", "seed": 3, "tier": "furnished"}}}, "r").scenes
     (plain,) = parse_recipes({"scenes": {"a": {"split": "train", "seed": 3}}}, "r").scenes
     given = 3
-    recipes._generate(home, tmp_path, lambda stage, share: None)
+    made(home)
     assert tried == [3, 1_000_003, 2_000_003]
+    given, shares = 0, {1: 0.7233, 2: 0.421, 3: 0.42}  # asked: at most 0.40, met to within 0.02
+    made(home)
+    assert tried == [3, 1_000_003, 2_000_003]
+    shares = dict.fromkeys(range(9), 0.9)
+    made(plain)  # a sparse building asks for no share
+    with pytest.raises(
+        GenerationError, match="a: none of 5 seeds: must_push_fetch is 0.9 once converted: expected 0.0"
+    ):
+        made(home)
     for recipe, count in ((home, 5), (plain, 1)):
         given = 99
-        tried.clear()
         with pytest.raises(GenerationError, match=f"seed {3 + (count - 1) * 1_000_000}: no"):
-            recipes._generate(recipe, tmp_path, lambda stage, share: None)
+            made(recipe)
         assert len(tried) == count
 
 

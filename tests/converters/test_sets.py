@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from converters import sets
 from converters.__main__ import main
 from converters.generate.design.config import GenerationError
 from converters.recipes import load_recipes
+from scenes_mjcf.schema import load_manifest, save_manifest
 from scenes_mjcf.sets import read_set, scene_digest, scene_folders
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
@@ -103,6 +105,10 @@ def test_a_scene_that_differs_from_the_list_is_told(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "two")
     shutil.copytree(SCENES / "birch", tmp_path / "two")
     assert sets.list_set(recipes, tmp_path, lines.append) == first
+    manifest = load_manifest(tmp_path / "one")  # converted anew: the same scene, seen in more detail
+    measures = manifest.measures | {"specific_surface_1_m": 9.0}
+    save_manifest(dataclasses.replace(manifest, measures=measures), tmp_path / "one")
+    assert sets.list_set(recipes, tmp_path).scenes["one"].measures["specific_surface_1_m"] == 9.0
     assert lines == [f"two: not the scene that {tmp_path / 'set.json'} lists"]
 
 
