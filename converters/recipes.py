@@ -206,18 +206,18 @@ def load_recipes(path: Path) -> Recipes:
     return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 
-def missed(building: BuildingConfig | HomeConfig, measures: dict[str, Any]) -> str:
+def missed(building: BuildingConfig | HomeConfig, made: Converted) -> str:
     """Which share a converted home was asked for and does not have; empty: none.
 
     Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
 
     Args:
         building: as it was asked for.
-        measures: of the scene (`converters/write/measures.py`).
+        made: the scene, measured.
     """
     asked = building.must_push if isinstance(building, HomeConfig) else {}
     for robot, (low, high) in asked.items():
-        share = measures["must_push_share"][robot]
+        share = made.manifest.measures["must_push_share"][robot]
         if not low - SHARE_TOLERANCE <= share <= high + SHARE_TOLERANCE:
             return f"must_push_{robot} is {share} once converted: expected {low} to {high}"
     return ""
@@ -239,7 +239,7 @@ def _made(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report
                 raw, recipe.seed + k * NEXT_SEED, lambda s, share: report(s, GENERATE * share), recipe.building
             )
             result = convert(raw, made, config, lambda s, share: report(s, GENERATE + CONVERT * share))
-            if why := missed(recipe.building, result.manifest.measures):
+            if why := missed(recipe.building, result):
                 raise GenerationError(why)
         except GenerationError as error:
             if k == tries - 1:
