@@ -52,7 +52,7 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
     config = ConvertConfig(
         **{
             word: getattr(arguments, word)
-            for word in ("format", "up", "unit", "root", "split", "jobs", "library", "strict")
+            for word in ("format", "up", "unit", "mirror", "root", "split", "jobs", "library", "strict")
         },
         overwrite=arguments.overwrite,
         auto_align=arguments.auto_align or arguments.library is not None,
@@ -218,6 +218,7 @@ def _add_convert(commands: Commands) -> None:
     add_launcher(command)
     command.add_argument("--up", choices=("auto", *"xyz", "-x", "-y", "-z"), default="auto", help="axis of a mesh file")
     command.add_argument("--unit", choices=("auto", "m", "cm", "mm", "ft", "in"), default="auto", help="of a mesh file")
+    command.add_argument("--mirror", action="store_true", help="take -x for x in a mesh file")
     about = "of an MJCF or Gazebo home that names files outside of its folder: the folder that may be read"
     command.add_argument("--root", type=Path, metavar="DIR", help=about)
     about = "layout of SRC (default: told from its files)"

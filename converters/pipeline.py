@@ -58,6 +58,7 @@ class ConvertConfig:
     up: str = dataclasses.field(default="auto", metadata=NOT_HASHED)
     """Of a mesh file: its axis that points up."""
     unit: str = dataclasses.field(default="auto", metadata=NOT_HASHED)
+    mirror: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
     root: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
     """Of an MJCF or Gazebo home: the folder that may be read; None: its own."""
     split: str = dataclasses.field(default="train", metadata=NOT_HASHED)
@@ -346,7 +347,8 @@ def _convert(
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
-            raw = read_source(source, config.format, config.strict, config.up, config.unit, config.root)
+            about = config.up, config.unit, config.root, config.mirror
+            raw = read_source(source, config.format, config.strict, *about)
             labelled = np.isin(raw.scan.labels, [label for own in CATEGORY_LABELS.values() for label in own]).any()
             unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
             told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit

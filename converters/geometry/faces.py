@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import fast_simplification
 import numpy as np
 import trimesh
 
+from converters.records.limits import SAMPLES, check_count
+
 LEAST_FACES = 24
 """Of a part, however many there are."""
+BLOCK = 2_000_000
+"""Points that are sampled at a time."""
 SMALL_M = 0.6
 """Longest side of a thing that may be drawn as its hull."""
 
@@ -29,21 +35,39 @@ def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> t
 
     Returns:
         points (k, 3) m, face (k,) the face each lies on.
+
+    Raises:
+        SceneRejected: more than `SAMPLES`.
     """
     if len(faces) == 0:
         return np.zeros((0, 3)), np.zeros(0, np.int64)
-    corners = vertices[faces]
-    longest = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
-    steps = np.maximum(np.ceil(longest / spacing_m).astype(int), 1)
-    points, index = [], []
+    count = float((_steps(vertices, faces, spacing_m).astype(float) ** 2).sum() / 2)
+    check_count(
+        "a surface", count, SAMPLES, f"points at {spacing_m:g} m", "remove long thin faces, or split the source"
+    )
+    points, index = zip(*sampled(vertices, faces, spacing_m), strict=True)
+    return np.concatenate(points), np.concatenate(index)
+
+
+def sampled(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The points of `sample_faces` and their faces, in blocks that fit the memory however large the faces are."""
+    corners, steps = vertices[faces], _steps(vertices, faces, spacing_m)
     for n in np.unique(steps):
         chosen = np.flatnonzero(steps == n)
-        i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-        u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n
-        weights = np.stack([1 - u - v, u, v], axis=1)
-        points.append(np.einsum("kw,fwd->fkd", weights, corners[chosen]).reshape(-1, 3))
-        index.append(np.repeat(chosen, len(weights)))
-    return np.concatenate(points), np.concatenate(index)
+        rows = max(BLOCK // int(n), 1)
+        for first in range(0, n, rows):
+            i, j = np.meshgrid(np.arange(first, min(first + rows, n)), np.arange(n), indexing="ij")
+            u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n
+            weights = np.stack([1 - u - v, u, v], axis=1)
+            for part in np.array_split(chosen, -(-len(chosen) * len(weights) // BLOCK)):
+                points = np.einsum("kw,fwd->fkd", weights, corners[part]).reshape(-1, 3)
+                yield points, np.repeat(part, len(weights))
+
+
+def _steps(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> np.ndarray:
+    corners = vertices[faces]
+    longest = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
+    return np.maximum(np.ceil(longest / spacing_m).astype(int), 1)
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -19,6 +19,8 @@ SMALLER = 0.85
 """A storey is lower than this share of its shorter side; else its extents do not tell its height."""
 EDGE_SHARE = 0.12
 """Of the height: what lies this near to the lowest or highest level may be floor or ceiling."""
+BIN_M, MAIN_SHARE, SLAB_M = 0.05, 0.5, 1.0
+"""Of level surface: height of a bin, share of the largest that counts as floor or ceiling, thickest slab."""
 SURE = 1.25
 """Ratio of evidence for one sense over the other."""
 
@@ -116,6 +118,30 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
     return np.array(
         [[1 - x * x / (1 + z), -x * y / (1 + z), -x], [-x * y / (1 + z), 1 - y * y / (1 + z), -y], [x, y, z]]
     )
+
+
+def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """True where a room's floor faces down, or its ceiling up: it is mirrored, or the order of its faces is wrong.
+
+    The outer sides of slabs do so too, but have another side near them that does not.
+
+    Args:
+        vertices: (n, 3) m, z up or down.
+        faces: (m, 3).
+    """
+    normal, area = _vectors(vertices, faces)
+    height = vertices[faces, 2].mean(axis=1)
+    middle = np.mean(_extent(height, area))
+    level = np.abs(normal[:, 2]) > ALONG
+    bins, index = np.unique(np.round(height[level] / BIN_M), return_inverse=True)
+    total = np.bincount(index, area[level])
+    for z in BIN_M * bins[total >= MAIN_SHARE * total.max(initial=0.0)]:
+        inwards = 1.0 if z < middle else -1.0
+        from_m = (height - z) * inwards
+        away = area[level & (normal[:, 2] * inwards < 0) & (np.abs(from_m) < 2 * BIN_M)].sum()
+        if away > 2 * area[level & (normal[:, 2] * inwards > 0) & (from_m > -2 * BIN_M) & (from_m < SLAB_M)].sum():
+            return True
+    return False
 
 
 def find_unit(vertices: np.ndarray, faces: np.ndarray, where: str) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from converters.geometry.rotations import Y_UP_TO_Z_UP
@@ -20,6 +21,7 @@ from interactive_nav_common.files import check_name
 
 OUTSIDE_M = 0.5
 """An object this far from everything scanned stands outside the scan."""
+TURNS = 20
 
 
 def trs_matrix(trs: dict[str, Any]) -> np.ndarray:
@@ -113,12 +115,25 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
     return str(data[0].get("id_scan", path.parent.name)), tuple(records)
 
 
-def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, scan_vertices: np.ndarray) -> float:
-    """Distance from an object's upright bounding box to the nearest vertex of the scan, m; 0 where one is inside."""
+def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Distance from an object's upright bounding box to the scan's surface, m; 0 where it reaches into the box.
+
+    The box and each triangle are convex: projecting from one to the other by turns leads to their nearest points.
+    """
     placed = _apply(annotation.pose, cad_vertices)
     low, high = placed.min(axis=0), placed.max(axis=0)
-    outside = np.maximum(np.maximum(low - scan_vertices, scan_vertices - high), 0.0)
-    return float(np.sqrt((outside**2).sum(axis=1).min()))
+    gap = float(np.linalg.norm(vertices - vertices.clip(low, high), axis=1).min())
+    if gap <= OUTSIDE_M:
+        return gap
+    corners = vertices[faces]
+    base, top = corners.min(axis=1), corners.max(axis=1)
+    corners = corners[np.linalg.norm(np.maximum(np.maximum(low - top, base - high), 0.0), axis=1) < gap]
+    point = np.tile((low + high) / 2, (len(corners), 1))
+    for _ in range(TURNS if len(corners) else 0):
+        on = trimesh.triangles.closest_point(corners, point)
+        point = on.clip(low, high)
+        gap = min(gap, float(np.linalg.norm(on - point, axis=1).min()))
+    return gap
 
 
 def inside_scan(
@@ -126,7 +141,8 @@ def inside_scan(
     where: str,
     annotations: tuple[Annotation, ...],
     cads: dict[str, CadModel],
-    scan_vertices: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray,
 ) -> tuple[Annotation, ...]:
     """The annotations whose objects stand in the scan; the others are left out with a warning each.
 
@@ -134,7 +150,7 @@ def inside_scan(
         SceneRejected: most objects stand outside (the annotation belongs to another scan), or the folder is read
             strictly.
     """
-    gaps = [gap_to_scan(a, cads[a.cad_id].vertices, scan_vertices) for a in annotations]
+    gaps = [gap_to_scan(a, cads[a.cad_id].vertices, vertices, faces) for a in annotations]
     outside = [i for i, gap in enumerate(gaps) if gap > OUTSIDE_M]
     if 2 * len(outside) > len(annotations):
         raise SceneRejected(

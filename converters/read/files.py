@@ -30,6 +30,8 @@ class SourceFolder:
         self.remedy = remedy
         self.sha256: dict[str, str] = {}
         self.warnings: list[str] = []
+        self.surfaces: dict[str, Any] = {}
+        """Path -> what `read_surface` made of it."""
 
     def has(self, relative: str) -> bool:
         """True when the file exists."""

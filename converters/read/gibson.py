@@ -15,7 +15,7 @@ from converters.read.cad import read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_npz
 from converters.read.obj import GREY, TexturedMesh, read_scan_obj
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_upright, densified
+from converters.read.surfaces import check_upright, with_own_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, GivenMap, RawScene, ScanMesh, Storey
 
@@ -59,16 +59,16 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
                 "expected one for each 'v' line; label the same mesh again"
             )
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, labels, heights[0])
-    mesh, labels = densified(mesh, labels)
     if labels is None:
         source.note(f"{LABELS} is absent: floor, walls and ceiling are told by shape")
+        mesh = with_own_corners(mesh)
         labels = label_storeys(mesh.vertices, mesh.faces, heights)
     cads, annotations = {}, ()
     if source.has(ALIGNMENTS):
         path = source.use(ALIGNMENTS, "")
         _, records = parse_annotations(read_json(path), path)
         cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
-        annotations = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh.vertices)
+        annotations = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh.vertices, mesh.faces)
         cads = {a.cad_id: cads[a.cad_id] for a in annotations}
     else:
         source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")

@@ -23,7 +23,7 @@ from converters.read.gibson import building, read_floors, read_traversable
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_upright, densified
+from converters.read.surfaces import check_extent, check_upright, with_own_corners
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, Hinge, RawScene
@@ -36,6 +36,8 @@ CLASSES = SYNSETS | {"00000001": "door"}
 DOOR_BAND_M = (0.3, 1.8)
 """Heights above the door's foot at which walls stop a leaf."""
 DOOR_MOST_RAD = math.radians(120)
+SHOWN_M = 0.2
+"""Between the points of a surface that stop a leaf; small faces have one."""
 NEAR_HINGE_M = 0.15
 """A wall this close to the hinge carries the leaf and does not stop it."""
 PLANE_CELL_M = 0.1
@@ -66,20 +68,20 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     mesh = read_scan_obj(source, MESH, "expected the scan without its furniture")
     heights = read_floors(source)
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, None, heights[0])
-    mesh, _ = densified(mesh, None)
+    mesh = with_own_corners(mesh)
     labels = label_storeys(mesh.vertices, mesh.faces, heights)
     for k, height in enumerate(heights):
         mesh, labels = _with_plane(source, k, height, mesh, labels)
-    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    points, _ = sample_faces(mesh.vertices, mesh.faces, SHOWN_M)
     pairs = [_furniture(source, path) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
     pairs = [
-        (dataclasses.replace(a, hinge=assume_hinge(c.vertices, a.pose, middle)) if a.category == "door" else a, c)
+        (dataclasses.replace(a, hinge=assume_hinge(c.vertices, a.pose, points)) if a.category == "door" else a, c)
         for a, c in pairs
     ]
     cads = {a.cad_id: c for a, c in pairs}
     annotations = _without_doubles(source, tuple(a for a, _ in pairs), cads)
     if annotations:
-        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh.vertices)
+        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh.vertices, mesh.faces)
     cads = {a.cad_id: cads[a.cad_id] for a in annotations}
     return building(source, "interactive-gibson", mesh, labels, heights, cads, annotations)
 
@@ -238,9 +240,7 @@ def plane_patch(
     Returns:
         The squares with the plane's texture, or None where none is needed.
     """
-    extent = np.ptp(plane.vertices[:, :2], axis=0)
-    if extent.max() > 1000.0:
-        raise SceneRejected(f"a floor plane is {extent.max():.0f} m long, expected a building's floor in metres")
+    check_extent("a floor plane", plane.vertices)
     points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
     cell, first = np.unique(_cells(points), axis=0, return_index=True)
     middle = (cell + 0.5) * PLANE_CELL_M

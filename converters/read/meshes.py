@@ -19,13 +19,15 @@ from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals
 
 from converters.geometry.rotations import Y_UP_TO_Z_UP
-from converters.geometry.upright import AXES, UNITS_M, find_unit, find_up, turn_upright
+from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
 from converters.read.files import SourceFolder, check_mesh
 from converters.read.obj import GREY, TexturedMesh, join_meshes, read_scan_obj, read_texture, texels, use_found
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import densified, floor_level
+from converters.read.surfaces import check_extent, floor_level, with_own_corners
 from converters.records.errors import SceneRejected
+from converters.records.limits import NUMBERS, check_count
 from converters.records.raw import RawScene, ScanMesh
+from interactive_nav_common.records import Reader
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
 """Of files that may be a scan."""
@@ -80,16 +82,36 @@ class SourceResolver(Resolver):
 
 
 def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
-    """Reads a mesh file of any kind that trimesh knows, with its textures or colours.
+    """Reads a mesh file of any kind that trimesh knows, with its textures or colours, once for every source.
 
     Raises:
-        SceneRejected: missing, damaged or empty, or it names a file by a link that leads out of the source.
+        SceneRejected: missing, damaged, empty or too large, or it names a file by a link that leads out of the source.
     """
+    if relative not in source.surfaces:
+        source.surfaces[relative] = _read_surface(source, relative, remedy)
+    return source.surfaces[relative]
+
+
+def _check_gltf(path: Path) -> None:
+    """Refuses accessors without data: they are zeros, as many as they say."""
+    content = path.read_bytes()
+    if content[:4] == b"glTF":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    tree = Reader(SceneRejected, "export it again").decoded(content, "JSON", str(path))
+    accessors = tree.get("accessors", []) if isinstance(tree, dict) else []
+    counts = [a.get("count") for a in accessors if isinstance(a, dict) and "bufferView" not in a]
+    numbers = sum(abs(count) for count in counts if isinstance(count, int | float))
+    check_count(path, numbers, NUMBERS, "elements in accessors without a bufferView", "export it again")
+
+
+def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
     if relative.lower().endswith(".obj"):
         return read_scan_obj(source, relative, remedy)
     path = source.use(relative, remedy)
     resolver = SourceResolver(source, path)
     try:
+        if path.suffix.lower() in (".glb", ".gltf"):
+            _check_gltf(path)
         with path.open("rb") as file:
             loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
         assert isinstance(loaded, trimesh.Scene)
@@ -106,13 +128,12 @@ def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMe
         raise resolver.refusal
     if not parts:
         raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
-    surface = _painted(path, parts[0], turn)
-    for part in parts[1:]:
-        surface = join_meshes(surface, _painted(path, part, turn))
-    return surface
+    return join_meshes(*(_painted(path, part, turn) for part in parts))
 
 
-def read_single_mesh(path: Path, strict: bool = False, up: str = "auto", unit: str = "auto") -> RawScene:
+def read_single_mesh(
+    path: Path, strict: bool = False, up: str = "auto", unit: str = "auto", mirror: bool = False
+) -> RawScene:
     """Reads a scan that is one mesh file: floor, walls and ceiling are told by shape, all furniture stays part of it.
 
     Args:
@@ -120,12 +141,14 @@ def read_single_mesh(path: Path, strict: bool = False, up: str = "auto", unit: s
         strict: refuse what would be repaired with a warning.
         up: word of `AXES`, or `auto`: found.
         unit: word of `UNITS_M`, or `auto`: told by the height.
+        mirror: take -x for x.
 
     Raises:
-        SceneRejected: missing or damaged, or neither its axes nor its unit can be told.
+        SceneRejected: missing or damaged, mirrored, or neither its axes nor its unit can be told.
     """
     source = SourceFolder(path.parent, strict)
     mesh = read_surface(source, source.inside(path), "give a mesh file")
+    mesh = dataclasses.replace(mesh, vertices=mesh.vertices * [-1.0 if mirror else 1.0, 1.0, 1.0])
     axis = find_up(mesh.vertices, mesh.faces, str(path)) if up == "auto" else AXES[up]
     vertices = mesh.vertices @ turn_upright(axis).T
     word = find_unit(vertices, mesh.faces, str(path)) if unit == "auto" else unit
@@ -135,8 +158,14 @@ def read_single_mesh(path: Path, strict: bool = False, up: str = "auto", unit: s
     if word != "m" and unit == "auto":
         source.note(f"{path.name}: taken to be in {word}; --unit says otherwise")
     mesh = dataclasses.replace(mesh, vertices=vertices * UNITS_M[word])
+    check_extent(str(path), mesh.vertices)
+    if faces_away(mesh.vertices, mesh.faces):
+        raise SceneRejected(
+            f"{path}: its floor faces down: the mesh is mirrored or inside out; give --mirror, which mirrors x, or "
+            "turn the order of each face's corners if only that is wrong"
+        )
     floor_m = floor_level(mesh.vertices, mesh.faces, str(path))
-    mesh, _ = densified(mesh, None)
+    mesh = with_own_corners(mesh)
     source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, furniture is part of them")
     grey = np.full((len(mesh.vertices), 3), GREY[0], np.uint8) if mesh.texture is None else None
     return RawScene(

@@ -16,11 +16,14 @@ from PIL import Image
 
 from converters.read.files import ObjMesh, SourceFolder, read_image, read_obj
 from converters.records.errors import SceneRejected
+from converters.records.limits import PIXELS
 
 GREY = (170, 170, 170)
 """Colour of what has none."""
 MAX_TEXTURE_PX = 8192
 """Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
+SMALL_IMAGE = 10_000
+"""Numbers in an image that is compared with others to be kept once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,15 +221,21 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
         return corner_uv, images[0]
     # A plain colour needs a few pixels, so that rounding does not reach a neighbour.
     tiles = [np.tile(i, (4, 4, 1)) if i.shape[:2] == (1, 1) else i for i in images]
-    tiles = [at_most(t, MAX_TEXTURE_PX) for t in tiles]
-    width, height = max(t.shape[1] for t in tiles), sum(t.shape[0] for t in tiles)
+    side = 2 * MAX_TEXTURE_PX
+    width = height = PIXELS
+    while width * height > PIXELS:
+        side //= 2
+        tiles = [at_most(t, side) for t in tiles]
+        width, height = max(t.shape[1] for t in tiles), sum(t.shape[0] for t in tiles)
+    order = np.argsort(number, kind="stable")
+    ends = np.searchsorted(number[order], np.arange(len(tiles) + 1))
     joint = np.zeros((height, width, 3), np.uint8)
     result = np.empty_like(corner_uv)
     top = 0
     for k, tile in enumerate(tiles):
         h, w = tile.shape[:2]
         joint[top : top + h, :w] = tile
-        of = number == k
+        of = order[ends[k] : ends[k + 1]]
         uv = corner_uv[of]
         # Repeats end at a face: it is moved to the first copy as a whole and cut off at the image's edge.
         uv = np.clip(uv - np.floor(uv.min(axis=1, keepdims=True) + 1e-9), 0.0, 1.0)
@@ -247,14 +256,22 @@ def at_most(image: np.ndarray, side: int) -> np.ndarray:
     return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
 
 
-def join_meshes(one: TexturedMesh, other: TexturedMesh) -> TexturedMesh:
-    """Both meshes as one, the second's vertices and faces after the first's."""
-    faces = np.vstack([one.faces, other.faces + len(one.vertices)])
-    vertices = np.vstack([one.vertices, other.vertices])
-    if one.texture is None and other.texture is None:
+def join_meshes(*meshes: TexturedMesh) -> TexturedMesh:
+    """All meshes as one, in their order; images that are alike are kept once."""
+    if len(meshes) == 1:
+        return meshes[0]
+    first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+    faces = np.vstack([m.faces + k for m, k in zip(meshes, first, strict=False)])
+    vertices = np.vstack([m.vertices for m in meshes])
+    if all(m.texture is None for m in meshes):
         return TexturedMesh(vertices, faces, None, None)
     grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
-    uv = np.vstack([m.corner_uv if m.corner_uv is not None else np.zeros((len(m.faces), 3, 2)) for m in (one, other)])
-    images = [m.texture if m.texture is not None else grey for m in (one, other)]
-    number = np.repeat([0, 1], [len(one.faces), len(other.faces)])
-    return TexturedMesh(vertices, faces, *join_textures(uv, number, images))
+    uv = np.vstack([m.corner_uv if m.corner_uv is not None else np.zeros((len(m.faces), 3, 2)) for m in meshes])
+    images: dict[object, np.ndarray] = {}
+    names = []
+    for image in (m.texture if m.texture is not None else grey for m in meshes):
+        names.append((image.shape, image.tobytes()) if image.size < SMALL_IMAGE else id(image))
+        images[names[-1]] = image
+    place = {name: k for k, name in enumerate(images)}
+    number = np.repeat([place[name] for name in names], [len(m.faces) for m in meshes])
+    return TexturedMesh(vertices, faces, *join_textures(uv, number, list(images.values())))

@@ -51,7 +51,7 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     check_upright(f"{root / stem}.ply", vertices, faces, labels, None)
     cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
-    annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, vertices)
+    annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, vertices, faces)
     return RawScene(
         name=scan_id,
         source_format="scan2cad",

@@ -60,7 +60,7 @@ def root_of(source: Path) -> Path:
 
 def read_source(
     source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto",
-    within: Path | None = None,
+    within: Path | None = None, mirror: bool = False,
 ) -> RawScene:  # fmt: skip
     """Reads a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh.
 
@@ -71,13 +71,15 @@ def read_source(
         up: of a mesh file: its axis that points up, or `auto`.
         unit: of a mesh file: its unit, or `auto`.
         within: of an MJCF or Gazebo home: the folder that may be read; default its own.
+        mirror: of a mesh file: take -x for x.
 
     Raises:
         SceneRejected: no known layout, or bad input.
     """
+    about_mesh = (up, unit, mirror) != ("auto", "auto", False)
     if source.is_file() and layout == "auto":
         for endings, (root_of, read) in FILES.items():
-            if source.name.lower().endswith(endings) and (up, unit) == ("auto", "auto"):
+            if source.name.lower().endswith(endings) and not about_mesh:
                 raw = _read(read, root_of(source), strict, source, within=within)
                 return dataclasses.replace(raw, name=source.name.partition(".")[0])
         if source.suffix.lower() not in meshes.SUFFIXES:
@@ -86,9 +88,11 @@ def read_source(
                 f"{source}: is no mesh file; expected one of {', '.join(meshes.SUFFIXES)}, of a home's ({homes}), or a "
                 "folder"
             )
-        return _read(meshes.read_single_mesh, source, strict, up, unit, within=within)
-    if (up, unit) != ("auto", "auto"):
-        raise SceneRejected(f"{source}: --up and --unit are for a single mesh file; a folder's layout says both")
+        return _read(meshes.read_single_mesh, source, strict, up, unit, mirror, within=within)
+    if about_mesh:
+        raise SceneRejected(
+            f"{source}: --up, --unit and --mirror are for a single mesh file; a folder's layout says all"
+        )
     return _read(READERS[layout if layout != "auto" else detect_format(source)][1], source, strict, within=within)
 
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from converters.read.surfaces import structure_labels
+from converters.read.surfaces import long_faces, structure_labels
 from converters.records.raw import RawScene
 
 BELOW_FLOOR_M = 0.25
@@ -24,6 +24,8 @@ def label_storeys(vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[floa
     """(n,) labels by shape (`structure_labels`) of a building, each storey by its own floor."""
     of_vertex = storey_of(vertices[:, 2], heights_m)
     of_face = storey_of(vertices[faces, 2].mean(axis=1), heights_m)
+    long = long_faces(vertices, faces)
+    of_vertex[faces[long]] = of_face[long, None]
     labels = np.zeros(len(vertices), np.int64)
     for k, height in enumerate(heights_m):
         mine = of_vertex == k
@@ -34,18 +36,21 @@ def label_storeys(vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[floa
 def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
     """One scene a floor, from the lowest up; a building with one floor as it is.
 
-    A face belongs to the storey that its middle lies in, an object to the highest floor that its base is not
-    half a metre below. Frames stay the building's own.
+    A face belongs to the storey that its middle lies in, a long one to all that it reaches into, an object to the
+    highest floor that its base is not half a metre below. Frames stay the building's own.
     """
     if len(raw.storeys) < 2:
         return (raw,)
     heights = tuple(s.height_m for s in raw.storeys)
-    of_face = storey_of(raw.scan.vertices[raw.scan.faces, 2].mean(axis=1), heights)
+    height = raw.scan.vertices[raw.scan.faces, 2]
+    of_face = storey_of(height.mean(axis=1), heights)
+    low, high = storey_of(height.min(axis=1), heights), storey_of(height.max(axis=1), heights)
+    tall = long_faces(raw.scan.vertices, raw.scan.faces)
     base = [_base_m(raw, i) for i in range(len(raw.annotations))]
     of_object = storey_of(np.array(base), heights, STANDS_ABOVE_M)
     scenes = []
     for k, storey in enumerate(raw.storeys):
-        mine = np.flatnonzero(of_face == k)
+        mine = np.flatnonzero((of_face == k) | (tall & (low <= k) & (k <= high)))
         used, faces = np.unique(raw.scan.faces[mine], return_inverse=True)
         scan = dataclasses.replace(
             raw.scan,

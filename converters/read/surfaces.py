@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import trimesh
 
+from converters.geometry.faces import sample_faces
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
+from converters.records.limits import EXTENT_M
 from converters.records.raw import CEILING, FLOOR, UNLABELLED, WALL
 
 NEAR_FLOOR_M = 0.15
@@ -22,10 +23,8 @@ CEILING_FROM_M = 1.8
 FLOOR_SHARE = 0.05
 """Least share of the scan's footprint that must lie level at the floor's height."""
 FLOOR_BIN_M, LEVEL_SHARE = 0.05, 0.2
-LONG_M, FINE_M = 0.8, 0.2
-"""Faces with longer edges than the first are cut until none is longer than the second: with edges of 0.8 m every
-point of a surface is within half a metre of a vertex, as objects must be."""
-TINY = 1e-9
+LONG_M, FINE_M = 0.5, 0.1
+"""A face with an edge longer than the first is wall or not as a whole, by points so far apart on it as the second."""
 
 
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -34,50 +33,46 @@ def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a) / 2
 
 
-def densified(
-    mesh: TexturedMesh, labels: np.ndarray | None, long_m: float = LONG_M
-) -> tuple[TexturedMesh, np.ndarray | None]:
-    """The mesh with faces of long edges cut into smaller ones: the stages take a scan's vertices for its surface.
+def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m,) bool: faces with an edge longer than `LONG_M`. Scans have none, rooms that were modelled do."""
+    corners = vertices[faces]
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > LONG_M
 
-    Scans are fine everywhere; rooms that were modelled are not. Faces whose edges are all up to `long_m` stay.
 
-    Args:
-        mesh: m.
-        labels: (n,) of the vertices, or None; a new vertex takes that of its face's first corner.
-        long_m: longest edge that may stay.
+def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
+    """The mesh with corners of their own for long faces, after its vertices.
+
+    Labels stand at vertices, and the corners of a modelled room belong to its floor and to two walls.
     """
-    corners = mesh.vertices[mesh.faces]
-    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    long = np.flatnonzero(edge > long_m)
-    if not len(long):
-        return mesh, labels
-    # Texture coordinates ride along as further columns, too small to count as length.
-    uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
-    rows = np.concatenate([corners[long], TINY * uv[long]], axis=2).reshape(-1, 5)
-    cut = trimesh.remesh.subdivide_to_size(
-        rows, np.arange(len(rows)).reshape(-1, 3), FINE_M, max_iter=16, return_index=True
+    long = np.flatnonzero(long_faces(mesh.vertices, mesh.faces))
+    faces = mesh.faces.copy()
+    faces[long] = len(mesh.vertices) + np.arange(3 * len(long)).reshape(-1, 3)
+    return dataclasses.replace(
+        mesh, vertices=np.vstack([mesh.vertices, mesh.vertices[mesh.faces[long]].reshape(-1, 3)]), faces=faces
     )
-    fine, faces, of = cut[0], cut[1], cut[-1]
-    stay = np.delete(np.arange(len(mesh.faces)), long)
-    whole = dataclasses.replace(
-        mesh,
-        vertices=np.vstack([mesh.vertices, fine[:, :3]]),
-        faces=np.vstack([mesh.faces[stay], faces + len(mesh.vertices)]),
-        corner_uv=None if mesh.corner_uv is None else np.concatenate([uv[stay], fine[faces, 3:] / TINY]),
-    )
-    if labels is None:
-        return whole, None
-    own = np.zeros(len(fine), np.int64)
-    own[faces] = labels[mesh.faces[long[of], 0]][:, None]
-    return whole, np.concatenate([labels, own])
+
+
+def check_extent(where: str, vertices: np.ndarray) -> None:
+    """Refuses scans of several buildings, in another unit, or with stray vertices.
+
+    Raises:
+        SceneRejected: longer than `EXTENT_M`.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if not (high - low).max() <= EXTENT_M:
+        raise SceneRejected(
+            f"{where}: reaches from {np.round(low, 1).tolist()} to {np.round(high, 1).tolist()} m, expected a building "
+            f"of at most {EXTENT_M:g} m; remove stray vertices, check the unit, or split it"
+        )
 
 
 def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
     """Height of the lowest level that has a fifth of the largest level's area, m; faces that look up count.
 
     Raises:
-        SceneRejected: nothing is level.
+        SceneRejected: nothing is level, or it is too large.
     """
+    check_extent(where, vertices)
     area = face_vectors(vertices, faces)
     level = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
     height, size = vertices[faces[level], 2].mean(axis=1), area[level, 2]
@@ -96,7 +91,8 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
     """NYU40 labels by shape, for scans that come without: floor, wall, ceiling; everything else stays unlabelled.
 
     Floor is level, faces up and lies at the floor's height; ceiling faces down, 1.8 m above it or more; wall is
-    steep in a column that shows steep surface over most of 0.2 to 1.8 m (furniture is lower).
+    steep in a column that shows steep surface over most of 0.2 to 1.8 m (furniture is lower). A long face, whose
+    corners must be its own (`with_own_corners`), is wall if most of it is.
 
     Args:
         vertices: (n, 3) m, z up.
@@ -118,7 +114,15 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
     labels[(up > 0.8) & (np.abs(z) < NEAR_FLOOR_M)] = FLOOR
     labels[(up < -0.7) & (z > CEILING_FROM_M)] = CEILING
     steep = (length > 0) & (np.abs(up) < 0.35)
-    labels[steep & _in_wall_columns(vertices, z, steep)] = WALL
+    long = long_faces(vertices, faces)
+    long = faces[long & (np.abs(area[:, 2]) < 0.35 * np.linalg.norm(area, axis=1))]
+    points, of = sample_faces(vertices, long, FINE_M)
+    upright = np.concatenate([steep, np.ones(len(points), bool)])
+    wall = _in_wall_columns(np.vstack([vertices, points]), np.concatenate([z, points[:, 2] - floor_height_m]), upright)
+    labels[steep & wall[: len(z)]] = WALL
+    share = np.bincount(of, wall[len(z) :]) / np.bincount(of)
+    mostly = long[share > 0.5].ravel()
+    labels[mostly[labels[mostly] == UNLABELLED]] = WALL
     return labels
 
 
@@ -129,8 +133,6 @@ def _in_wall_columns(vertices: np.ndarray, z: np.ndarray, steep: np.ndarray) -> 
     cell = np.floor((vertices[:, :2] - vertices[:, :2].min(axis=0)) / WALL_CELL_M).astype(np.int64)
     columns = int(cell[:, 0].max(initial=0)) + 3
     rows = int(cell[:, 1].max(initial=0)) + 3
-    if columns * rows > 50_000_000:  # a scan of square kilometres: stray vertices, no building
-        return np.zeros(len(vertices), bool)
     flat = (cell[:, 1] + 1) * columns + cell[:, 0] + 1
     level = np.floor((z - low) / 0.2).astype(np.int64)
     chosen = steep & (level >= 0) & (level < bins)
@@ -158,8 +160,9 @@ def check_upright(
         height_m: of the floor; needed without labels.
 
     Raises:
-        SceneRejected: no floor faces up.
+        SceneRejected: no floor faces up, or it is too large.
     """
+    check_extent(where, vertices)
     area = face_vectors(vertices, faces)
     if labels is not None:
         is_floor = (labels[faces] == FLOOR).all(axis=1)

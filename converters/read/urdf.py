@@ -205,9 +205,4 @@ def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
 
 def joined(meshes: list[TexturedMesh]) -> TexturedMesh | None:
     """All meshes as one; None of none."""
-    if not meshes:
-        return None
-    result = meshes[0]
-    for other in meshes[1:]:
-        result = join_meshes(result, other)
-    return result
+    return join_meshes(*meshes) if meshes else None

@@ -15,7 +15,7 @@ from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import face_labels, sample_faces
+from converters.geometry.faces import face_labels, sampled
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 from interactive_nav_common.rotations import yaw_matrix
@@ -35,6 +35,10 @@ MAX_CORNER_M2 = 0.5
 """Of unseen regions between floor and wall."""
 MIN_OBSTACLE_CELLS = 3
 MIN_FREE_M2 = 0.25
+AWAY_SHARE = 0.4
+"""Of what stands around a piece of floor, if so much faces away, it is the inside of a solid."""
+MIN_APART_M2 = 1.0
+"""Of a piece of floor that is not the largest: no way leads into less, it is a cabinet's inside."""
 PAD_M = 0.4
 HEIGHT_STEP_M = 0.1
 """Heights of low static furniture are rounded up to this: few boxes."""
@@ -179,6 +183,24 @@ def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) ->
     return result
 
 
+def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np.ndarray:
+    """The pieces of floor that one may stand on: the largest, and others that are no insides of closed solids.
+
+    What stands around a room faces it; the sides of a solid face away from its inside.
+    """
+    pieces, count = label_pieces(free, np.ones((3, 3)))
+    size = np.bincount(pieces.ravel(), minlength=count + 1) * resolution_m**2
+    size[0] = 0.0
+    facing, around = np.zeros((2, count + 1))
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        beside = np.where(free, 0, np.roll(pieces, -step, axis)).ravel()  # the grid's margin is never free
+        facing += np.bincount(beside, step * shown.facing[axis].ravel(), count + 1)
+        around += np.bincount(beside, shown.solid.ravel(), count + 1)
+    keep = (size >= MIN_APART_M2) & (facing >= -AWAY_SHARE * around)
+    keep[np.argmax(size)] = bool(free.any())
+    return keep[pieces]
+
+
 def _grid_around(points_w: np.ndarray, yaw: float, resolution_m: float) -> Grid:
     """The grid of whole cells over (n, 3) points, with a margin."""
     used = points_w @ yaw_matrix(yaw)
@@ -212,13 +234,9 @@ def make_floor_plan(
         SceneRejected: no traversable cell.
     """
     grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
-    points, face = sample_faces(vertices_w, faces, resolution_m / 3)
-    label, z = face_labels(labels, faces)[face], points[:, 2]
-    floor_points = ((label == FLOOR) & (np.abs(z) < 0.2)) | ((label == UNLABELLED) & (np.abs(z) < NOISE_M))
-    floor_count = grid.count(points[floor_points])
-    floor_seen = floor_count >= 2
-    solid = (z > max(NOISE_M, BAND_M[0])) & (z < BAND_M[1]) & ~np.isin(label, (FLOOR, CEILING))
-    occupied = _drop_small(grid.count(points[solid]) >= 3, MIN_OBSTACLE_CELLS)
+    shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))
+    floor_seen = shown.floor >= 2
+    occupied = _drop_small(shown.solid >= 3, MIN_OBSTACLE_CELLS)
     # Reconstruction holes in walls: join along rows and columns only, so that doorways stay open.
     for line in (np.ones((1, 4)), np.ones((4, 1))):
         occupied |= ndimage.binary_closing(occupied, line)
@@ -229,8 +247,7 @@ def make_floor_plan(
         if placed.hinge is not None:
             swept |= swept_by_door(grid, placed)
     # What is left of the door's scan in its sweep goes, walls stay.
-    walls = np.isin(label, STRUCTURE_LABELS) & (label != DOOR)
-    occupied &= ~swept | (grid.count(points[solid & walls]) >= 3)
+    occupied &= ~swept | (shown.solid_wall >= 3)
     leaf = occupied & swept
     closed = ndimage.binary_closing(floor_seen, iterations=CLOSE_CELLS) | under | floor_seen
     if given is not None:
@@ -240,38 +257,76 @@ def make_floor_plan(
     floor = np.asarray(ndimage.binary_propagation(floor_seen & ~occupied, mask=closed & ~occupied), bool)
     floor = _fill_holes(floor, occupied, resolution_m)
     traversable = _drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2))
+    traversable = _without_insides(traversable, shown, resolution_m)
     if not traversable.any():
         raise SceneRejected(
             "scan: no traversable floor is left (no floor label below 1.2 m of free height); "
             "check the floor's labels and height"
         )
-    tall = _wall_height(points, label)
-    height = _heights(grid, points, label, occupied, tall)
-    return FloorPlan(grid, floor, floor_seen, floor_count >= WHOLE_POINTS, occupied, traversable, tall, leaf, height)
+    height = _heights(shown, occupied)
+    return FloorPlan(
+        grid, floor, floor_seen, shown.floor >= WHOLE_POINTS, occupied, traversable, shown.wall_height_m, leaf, height
+    )
 
 
-def _wall_height(points: np.ndarray, label: np.ndarray) -> float:
-    """m, of the tallest structure but a few stray points."""
-    heights = points[np.isin(label, STRUCTURE_LABELS) & (label != FLOOR) & (label != CEILING), 2]
-    tall = float(np.clip(np.percentile(heights, 98), BAND_M[1], 2.5)) if len(heights) else BAND_M[1]
-    return round(tall, 3)
+@dataclasses.dataclass(frozen=True)
+class _Shown:
+    """What points on the scan show in each cell: (rows, columns) counts of them, and heights in m."""
+
+    floor: np.ndarray
+    solid: np.ndarray
+    """Neither floor nor ceiling, in the robot's band."""
+    solid_wall: np.ndarray
+    """Of those, walls and the like, no doors."""
+    structure: np.ndarray
+    """Walls, doors and the like, in the band."""
+    top_m: np.ndarray
+    """Of the highest that is no structure."""
+    facing: np.ndarray
+    """(2, rows, columns) along rows and columns: sum of the normals of what is solid."""
+    wall_height_m: float
+    """Of the tallest structure but a few stray points."""
 
 
-def _heights(grid: Grid, points: np.ndarray, label: np.ndarray, occupied: np.ndarray, tall_m: float) -> np.ndarray:
+def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> _Shown:
+    counts, top, heights = np.zeros((4, *grid.shape), np.int64), np.zeros(grid.shape), [np.zeros(0)]
+    facing, turn = np.zeros((2, *grid.shape)), yaw_matrix(grid.yaw)[:2, 1::-1]
+    # In blocks: the points on a large hall do not fit the memory.
+    kept = np.flatnonzero(of_face != CEILING)
+    a, b, c = (vertices_w[faces[:, k]] for k in range(3))
+    unit = np.cross(b - a, c - a)
+    unit = unit[:, :2] / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+    for points, face in sampled(vertices_w, faces[kept], grid.resolution_m / 3):
+        label, z = of_face[kept][face], points[:, 2]
+        is_floor, structural = label == FLOOR, np.isin(label, STRUCTURE_LABELS)
+        high = (z > NOISE_M) & ~is_floor
+        solid = high & (z < BAND_M[1])
+        level = (is_floor & (np.abs(z) < 0.2)) | ((label == UNLABELLED) & (np.abs(z) < NOISE_M))
+        for count, chosen in zip(
+            counts, (level, solid, solid & structural & (label != DOOR), solid & structural), strict=True
+        ):
+            count += grid.count(points[chosen])
+        row, column, inside = grid.cells(points[solid])
+        normal = unit[kept][face[solid][inside]] @ turn
+        for axis in range(2):
+            np.add.at(facing[axis], (row[inside], column[inside]), normal[:, axis])
+        row, column, inside = grid.cells(points[high & ~structural])
+        np.maximum.at(top, (row[inside], column[inside]), z[high & ~structural][inside])
+        heights.append(z[structural & ~is_floor])
+    walls = np.concatenate(heights)
+    tall = float(np.clip(np.percentile(walls, 98), BAND_M[1], 2.5)) if len(walls) else BAND_M[1]
+    return _Shown(counts[0], counts[1], counts[2], counts[3], top, facing, round(tall, 3))
+
+
+def _heights(shown: _Shown, occupied: np.ndarray) -> np.ndarray:
     """(rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
 
     A cell is low where no wall, window or the like is labelled in the robot's band and the highest point lies
     within it; the highest of its neighbours counts, so that a ragged edge does not lower a cabinet.
     """
-    z = points[:, 2]
-    solid = (z > NOISE_M) & ~np.isin(label, (FLOOR, CEILING))
-    structural = np.isin(label, STRUCTURE_LABELS)
-    wall = grid.count(points[solid & structural & (z < BAND_M[1])]) >= 3
-    row, column, inside = grid.cells(points[solid & ~structural])
-    top = np.zeros(grid.shape)
-    np.maximum.at(top, (row[inside], column[inside]), z[solid & ~structural][inside])
-    low = occupied & ~wall & (top < BAND_M[1])
-    around = ndimage.maximum_filter(np.where(low, top, 0.0), 5)
+    tall_m = shown.wall_height_m
+    low = occupied & (shown.structure < 3) & (shown.top_m < BAND_M[1])
+    around = ndimage.maximum_filter(np.where(low, shown.top_m, 0.0), 5)
     low &= around > 0
     rounded = np.ceil(around / HEIGHT_STEP_M - 1e-9) * HEIGHT_STEP_M
     return np.where(low, np.minimum(rounded, tall_m), tall_m).round(3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import trimesh
 import xatlas
@@ -10,6 +12,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.geometry.faces import sample_faces, simplify
+from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, VisualMesh
 
@@ -48,6 +51,7 @@ def colour_cloud(
             np.add.at(summed, chosen[:, k], normal)
         used = np.unique(chosen)
         return ColourCloud(vertices_w[used], _unit(summed[used]), scan.vertex_colours[used].astype(float))
+    spacing_m = max(spacing_m, math.sqrt(np.linalg.norm(normal, axis=1).sum() / CLOUD))
     points, index = sample_faces(vertices_w, chosen, spacing_m)
     middle = sample_faces(
         scan.corner_uv[face_index].reshape(-1, 2) @ np.eye(2, 3),

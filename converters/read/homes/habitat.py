@@ -23,6 +23,7 @@ from converters.read.meshes import SUFFIXES, read_surface
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import placed, read_urdf
 from converters.records.errors import SceneRejected
+from converters.records.limits import PARTS, check_count
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import matrix_from_quat
 
@@ -30,7 +31,6 @@ SCENE, STAGE, OBJECT, ARTICULATED = (
     f".{kind}.json" for kind in ("scene_instance", "stage_config", "object_config", "ao_config")
 )
 LEXICON = "semantic_lexicon.json"
-MOST_PARTS = 20_000
 DEFAULT_MASS_KG = 1.0
 """Habitat's own for what says nothing."""
 
@@ -108,8 +108,7 @@ class _Reader:
             if not isinstance(found, list) or not all(isinstance(i, dict) for i in found):
                 raise SceneRejected(f"{path}: {key} is {_short(found)}, expected a list of objects")
             instances += [(instance, kind) for instance in found]
-        if len(instances) > MOST_PARTS:
-            raise SceneRejected(f"{path}: has {len(instances)} instances, expected a home of at most {MOST_PARTS}")
+        check_count(path, len(instances), PARTS, "instances")
         for key in ("default_lighting", "navmesh_instance", "semantic_scene_instance", "default_pbr_shader_config"):
             if scene.get(key):
                 self.dropped[f"{key} (not read)"] += 1

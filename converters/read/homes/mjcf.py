@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 import os
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -23,13 +25,12 @@ from converters.read.meshes import textured_by_face
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
+from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_image
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import CATEGORIES, Category
 
-MOST_FILES = 1_000
-"""MJCF files of one home: includes, and models that it attaches."""
-MOST_GEOMS = 100_000
+NUMBER = re.compile(r"\+?\d+\.?\d*(e\+?\d+)?", re.IGNORECASE)
 FARTHEST_M = 1e4
 REMEDY = "put a copy of the file there, or give --root DIR, a folder that holds both"
 UNREAD = {
@@ -81,8 +82,6 @@ def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, with
         model = mujoco.MjSpec.from_string(files.whole(mains[0]), include=files.models).compile()
     except (ValueError, RuntimeError) as error:  # RecursionError among them
         raise SceneRejected(f"{mains[0]}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
-    if model.ngeom > MOST_GEOMS:
-        raise SceneRejected(f"{mains[0]}: has {model.ngeom} geoms, expected a home of at most {MOST_GEOMS}")
     return home(source, "mjcf", _parts(model, source, mains[0]))
 
 
@@ -94,6 +93,8 @@ class _Files:
     models: dict[str, bytes] = dataclasses.field(default_factory=dict)
     """Name that stands in the MJCF -> a model to attach, as whole as the home itself."""
     parsed: int = 0
+    heaviest: float = 0.0
+    """Elements of the largest model to attach."""
 
     def whole(self, path: Path) -> str:
         """The text of an MJCF with its includes. Names mean what they mean to MuJoCo (its `xml_native_reader.cc`).
@@ -136,9 +137,25 @@ class _Files:
                     place = _reduced(
                         main.parent / used.get("texturedir" if element.tag == "texture" else "meshdir", "") / name
                     )
-                    self.source.use(self.source.inside(place), f"{path.name} names it")
+                    check_image(self.source.use(self.source.inside(place), f"{path.name} names it"))
                 element.set(key, str(place))
+        self._check_size(root, path)
         return ElementTree.tostring(root, encoding="unicode")
+
+    def _check_size(self, root: ElementTree.Element, path: Path) -> None:
+        """Refuses what would be too much to compile: images and height fields, and elements with their copies."""
+        left, total = [(root, 1.0)], 0.0
+        while left:
+            element, times = left.pop()
+            told = {key: _first(element, key) for key in ("width", "height", "nrow", "ncol")}
+            cube = 6 * told["width"] ** 2 if element.tag == "texture" and element.get("type") != "2d" else 0.0
+            pixels = max(told["width"] * told["height"], told["nrow"] * told["ncol"], cube)
+            check_count(path, pixels, PIXELS, f"pixels in a <{element.tag}>", "make it smaller")
+            copies = _first(element, "count", "params")
+            total += times * copies + (self.heaviest if element.tag == "attach" else 0.0) * times
+            left += [(child, times * copies if element.tag == "replicate" else times) for child in element]
+        check_count(path, total, GEOMS, "elements with their copies")
+        self.heaviest = max(self.heaviest, total)
 
     def _include(
         self, root: ElementTree.Element, at: Path, main: Path, seen: set[Path], folder: dict[ElementTree.Element, Path]
@@ -161,13 +178,18 @@ class _Files:
 
     def _parse(self, path: Path) -> ElementTree.Element:
         self.parsed += 1
-        if self.parsed > MOST_FILES:
-            raise SceneRejected(f"{path}: more than {MOST_FILES} MJCF files, expected a home")
+        check_count(path, self.parsed, FILES, "MJCF files")
         checked = self.source.use(self.source.inside(path), "an MJCF names it")
         try:
             return ElementTree.parse(checked).getroot()
         except (ElementTree.ParseError, ValueError, LookupError) as error:
             raise SceneRejected(f"{path}: not readable as MJCF ({error}); fetch the file again") from error
+
+
+def _first(element: ElementTree.Element, *keys: str) -> float:
+    """Product of an attribute's numbers that are larger than 1; 1 where it has none."""
+    words = " ".join(element.get(key, "") for key in keys).split()
+    return math.prod(float(word) for word in words if NUMBER.fullmatch(word) and float(word) > 1)
 
 
 def _reduced(path: Path) -> Path:

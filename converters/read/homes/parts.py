@@ -13,18 +13,19 @@ from typing import Any
 import numpy as np
 import shapely
 
-from converters.geometry.faces import merge_vertices
+from converters.geometry.faces import merge_vertices, sample_faces
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_licence
-from converters.read.interactive_gibson import assume_hinge, leaf_turn
+from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import densified, face_vectors, floor_level
+from converters.read.surfaces import face_vectors, floor_level, with_own_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
+from converters.records.limits import MOVABLES, check_count
 from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh
 from scenes_mjcf.categories import CATEGORIES, Category
 
@@ -53,8 +54,6 @@ KNOWN = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not i
 KNOWN |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
 OTHER_STRUCTURE = 38
 """NYU40's word for what is built in and nothing else."""
-LONG_M = 0.5
-"""Edges of modelled structure up to this may stay: whether a part is wall is told by its vertices."""
 TEXTURE_PX = 512
 STANDS_M = 0.15
 """Of its base above the floor: what is higher stands on something else, or hangs."""
@@ -116,6 +115,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
         raise SceneRejected(f"{source.root}: holds no part; expected a floor")
     floor_m = floor_level(whole.vertices, _shown(whole.vertices, whole.faces), str(source.root))
     moves = [_moves(part, low, high, floor_m) for part, (low, high) in zip(parts, bounds, strict=True)]
+    check_count(source.root, sum(moves), MOVABLES, "pieces of furniture on its floor")
     carried = _carriers(bounds, moves, floor_m)
     structure = [p for p, moving, by in zip(parts, moves, carried, strict=True) if not moving and by is None]
     if not structure:
@@ -123,12 +123,12 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
     shells = [placed(_small(p.surface), p.pose) for p in structure]
     mesh = joined(shells)
     assert mesh is not None
-    mesh, _ = densified(mesh, None, LONG_M)
+    mesh = with_own_corners(mesh)
     labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
     labels[labels == UNLABELLED] = OTHER_STRUCTURE
-    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    points, _ = sample_faces(mesh.vertices, mesh.faces, SHOWN_M)
     pairs = [
-        _furniture(source, part, [parts[k] for k, by in enumerate(carried) if by == i], middle)
+        _furniture(source, part, [parts[k] for k, by in enumerate(carried) if by == i], points)
         for i, (part, moving) in enumerate(zip(parts, moves, strict=True))
         if moving
     ]
@@ -198,14 +198,17 @@ def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> boo
 def _carriers(bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], floor_m: float) -> list[int | None]:
     """For each part the number of the movable one that it stands on, or lies in, if any."""
     carried: list[int | None] = [None] * len(bounds)
+    movers = np.flatnonzero(moves)
+    base, top = np.array([bounds[k] for k in movers]).reshape(-1, 2, 3).transpose(1, 0, 2) + [
+        [[0.0] * 3],
+        [[0, 0, RESTS_M]],
+    ]
     for i, (low, high) in enumerate(bounds):
         if moves[i] or low[2] - floor_m < RAISED_M:
             continue
-        x, y = (low + high)[:2] / 2
-        for k, (base, top) in enumerate(bounds):
-            over = base[0] < x < top[0] and base[1] < y < top[1]
-            if moves[k] and over and base[2] < low[2] < top[2] + RESTS_M:
-                carried[i] = k
+        foot = np.array([*(low + high)[:2] / 2, low[2]])
+        under = movers[((base < foot) & (foot < top)).all(axis=1)]
+        carried[i] = int(under[-1]) if len(under) else None
     return carried
 
 
@@ -213,11 +216,10 @@ def _furniture(
     source: SourceFolder, part: Part, riders: list[Part], structure: np.ndarray
 ) -> tuple[Annotation, CadModel]:
     """One movable part with what stands on it."""
-    surface, pieces = _small(part.surface), _pieces(part, np.eye(4))
-    for rider in riders:
-        by = np.linalg.inv(part.pose) @ rider.pose
-        surface, more = join_meshes(surface, placed(_small(rider.surface), by)), _pieces(rider, by)
-        pieces = None if pieces is None or more is None else pieces + more
+    own = [(part, np.eye(4)), *((rider, np.linalg.inv(part.pose) @ rider.pose) for rider in riders)]
+    surface = join_meshes(*(placed(_small(p.surface), by) for p, by in own))
+    every = [_pieces(p, by) for p, by in own]
+    pieces = None if None in every else tuple(piece for some in every for piece in some or ())
     pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     vertices, faces, colours = clean_surface(source, part.name, vertices, faces, colours_of_faces(surface)[keep])

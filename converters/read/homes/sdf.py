@@ -22,9 +22,9 @@ from converters.read.meshes import read_surface, textured_by_face
 from converters.read.obj import GREY, TexturedMesh, find_file
 from converters.read.urdf import joined, numbers, placed, primitive
 from converters.records.errors import SceneRejected
+from converters.records.limits import PARTS, check_count
 from converters.records.raw import RawScene
 
-MOST_PARTS = 20_000
 DEEPEST = 8
 """Models within models."""
 DROPPED = ("actor", "light", "plugin", "population", "road", "sensor", "heightmap", "polyline", "frame")
@@ -139,8 +139,7 @@ class _Reader:
     ) -> Iterator[Part]:
         static = static or _yes(model)
         self.read += 1
-        if self.read > MOST_PARTS:
-            raise SceneRejected(f"{path}: more than {MOST_PARTS} models, expected a home")
+        check_count(path, self.read, PARTS, "models")
         for joint in model.findall("joint"):
             if joint.get("type") != "fixed":
                 self.dropped[f"{joint.get('type')} joint (its links are one part)"] += 1

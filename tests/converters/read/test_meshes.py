@@ -90,6 +90,7 @@ def test_a_gltfs_texture_outside_of_the_source_is_not_read(tmp_path):
     (tmp_path / "inner/models/link.png").symlink_to(tmp_path / "secret.png")
     path = tmp_path / "inner/models/model.gltf"
     path.write_text(path.read_text().replace("../../secret.png", "link.png"))
+    source = SourceFolder(tmp_path / "inner")
     with pytest.raises(SceneRejected, match="link.png: leads out of the source folder"):
         read_surface(source, "models/model.gltf", "")
 

@@ -76,7 +76,7 @@ def test_a_tilted_scan_in_centimetres_becomes_the_scene_of_the_right_one(room, t
         (["empty.ply"], "not readable as a mesh"),
         (["flat.ply"], "shows one direction of surface only; say which axis points up with --up"),
         (["absent.ply"], "no such folder"),
-        (["folder", "--up", "y"], "--up and --unit are for a single mesh file"),
+        (["folder", "--up", "y"], "--up, --unit and --mirror are for a single mesh file"),
     ],
 )
 def test_what_cannot_be_read_is_one_line(tmp_path, capsys, arguments, message):
@@ -105,3 +105,28 @@ def test_damaged_files_end_in_one_line_or_a_scan(room, tmp_path_factory, data):
         assert "\n" not in str(refusal)
     else:
         assert np.isfinite(raw.scan.vertices).all()
+
+
+@pytest.mark.parametrize("ceiling", [False, True])
+@pytest.mark.parametrize("up", ["auto", "z"])
+def test_a_mirrored_or_inside_out_mesh_is_refused_and_mirrors_back(tmp_path, ceiling, up):
+    right = tall_room()
+    if ceiling:
+        lid = [[0, 0, 2.3], [3.0, 0, 2.3], [3.0, 2.5, 2.3], [0, 2.5, 2.3]]
+        right = trimesh.util.concatenate([right, trimesh.Trimesh(lid, [[0, 2, 1], [0, 3, 2]], process=False)])
+    right.export(tmp_path / "right.ply")
+    expected = read_source(tmp_path / "right.ply", up="z")
+    assert expected.floor_height_m == pytest.approx(tiny_raw.FLOOR_M, abs=0.01)
+    mirrored, inside_out = right.copy(), right.copy()
+    mirrored.vertices = right.vertices * [-1, 1, 1]  # trimesh's own transform would turn the faces along
+    inside_out.faces = right.faces[:, ::-1]
+    for name, wrong in (("mirrored", mirrored), ("inside_out", inside_out)):
+        path = tmp_path / f"{name}.ply"
+        wrong.export(path)
+        with pytest.raises(SceneRejected, match="its floor faces down: .*--mirror, which mirrors x"):
+            read_source(path, up=up)
+    back = read_source(tmp_path / "mirrored.ply", up="z", mirror=True)
+    np.testing.assert_allclose(back.scan.vertices, expected.scan.vertices, atol=1e-6)
+    assert back.floor_height_m == expected.floor_height_m
+    with pytest.raises(SceneRejected, match="--mirror are for a single mesh file"):
+        read_source(tmp_path, mirror=True)

@@ -7,11 +7,12 @@ import pytest
 import trimesh
 
 from converters.geometry.faces import face_areas, face_labels
+from converters.read.annotations import gap_to_scan
 from converters.read.gibson import read_gibson
 from converters.read.obj import TexturedMesh
-from converters.read.surfaces import FINE_M, check_upright, densified, floor_level, structure_labels
+from converters.read.surfaces import check_upright, floor_level, structure_labels, with_own_corners
 from converters.records.errors import SceneRejected
-from converters.records.raw import FLOOR, WALL
+from converters.records.raw import CEILING, FLOOR, WALL, Annotation
 from tests.converters import tiny_raw
 
 
@@ -68,7 +69,7 @@ def test_a_floor_at_another_height_or_unit(room):
     with pytest.raises(SceneRejected, match="0.00 m2 lie level at the floor's height of 1.2 m"):
         check_upright("scan", vertices, faces, None, 1.2)
     with pytest.raises(SceneRejected, match="check floors.txt, the mesh's axes"):
-        check_upright("scan", vertices * 100, faces, None, tiny_raw.FLOOR_M)
+        check_upright("scan", vertices * 10, faces, None, tiny_raw.FLOOR_M)
 
 
 def large_room(size=(6.0, 5.0, 2.6)) -> TexturedMesh:
@@ -79,21 +80,30 @@ def large_room(size=(6.0, 5.0, 2.6)) -> TexturedMesh:
     return TexturedMesh(vertices, faces, uv, np.zeros((8, 8, 3), np.uint8))
 
 
-def test_large_faces_are_cut_and_nothing_else_changes():
+def test_large_faces_are_floor_or_wall_as_a_whole():
     mesh = large_room()
-    fine, labels = densified(mesh, np.full(8, 7))
-    assert fine.corner_uv is not None and labels is not None and (labels == 7).all()
-    corners = fine.vertices[fine.faces]
-    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= FINE_M
-    assert face_areas(fine.vertices, fine.faces).sum() == pytest.approx(face_areas(mesh.vertices, mesh.faces).sum())
-    np.testing.assert_allclose(fine.corner_uv, corners[..., :2] / 10 + 0.5, atol=1e-6)
-    again, _ = densified(fine, None)
-    assert again is fine
-    found = face_labels(structure_labels(fine.vertices, fine.faces, 0.0), fine.faces)
-    area = face_areas(fine.vertices, fine.faces)
-    assert area[found == FLOOR].sum() == pytest.approx(30.0, rel=0.02)
-    assert area[found == WALL].sum() > 0.85 * 2 * (6 + 5) * 2.6
-    assert floor_level(fine.vertices, fine.faces, "scan") == 0.0
+    own = with_own_corners(mesh)
+    assert len(own.vertices) == 8 + 36 and own.corner_uv is mesh.corner_uv
+    np.testing.assert_array_equal(own.vertices[own.faces], mesh.vertices[mesh.faces])
+    found = face_labels(structure_labels(own.vertices, own.faces, 0.0), own.faces)
+    area = face_areas(own.vertices, own.faces)
+    assert area[found == FLOOR].sum() == area[found == CEILING].sum() == pytest.approx(30.0)
+    assert area[found == WALL].sum() == pytest.approx(2 * (6 + 5) * 2.6)
+    assert floor_level(own.vertices, own.faces, "scan") == 0.0
+    low = trimesh.creation.box((2.0, 1.0, 1.0)).apply_translation((0, 0, 0.5))  # no wall
+    table = with_own_corners(TexturedMesh(np.asarray(low.vertices), np.asarray(low.faces), None, None))
+    assert WALL not in structure_labels(table.vertices, table.faces, 0.0)
+
+
+def test_the_gap_to_a_scan_is_to_its_surface():
+    none = np.zeros((0, 3))
+    box = Annotation("table", "t", np.eye(4), "", none, none)
+    cad = np.asarray(trimesh.creation.box((1.0, 1.0, 1.0)).vertices)
+    far = 20.0 * np.array([(-1, -1, 0), (1, -1, 0), (0, 2, 0)], float)
+    for height, gap in ((0.3, 0.0), (1.5, 1.0), (-4.5, 4.0)):
+        assert gap_to_scan(box, cad, far + [0, 0, height], np.array([[0, 1, 2]])) == pytest.approx(gap)
+    wall = np.array([(2, 1.5, -5), (2, 30, -5), (2, 1.5, 40)], float)  # its edge stands askew of the box
+    assert gap_to_scan(box, cad, wall, np.array([[0, 1, 2]])) == pytest.approx(np.hypot(1.5, 1.0))
 
 
 def test_objects_in_the_middle_of_large_faces_stand_in_the_scan(tmp_path):

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -13,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from converters.bodies.objects import BodyHinge, PlacedObject
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import sample_faces
-from converters.records.raw import GivenMap
+from converters.records.raw import FLOOR, GivenMap
 from converters.structure.maps import Grid, main_direction, make_floor_plan, resample
 from converters.structure.walls import border_cells, cover_rectangles, wall_boxes
 from interactive_nav_common.rotations import yaw_matrix
@@ -117,6 +118,35 @@ def test_low_furniture_keeps_its_height_and_walls_theirs():
     for box in tall:
         assert 2 * box.half[2] == pytest.approx(plan.wall_height_m)
         assert np.linalg.norm(box.centre[:2] - basket.position[:2]) > 0.3
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.3])
+def test_the_inside_of_a_closed_solid_is_not_free_and_a_room_of_its_own_is(yaw):
+    """Floor runs on below all of them: a pillar (whose faces look away from it), a housing of panels, a closed room."""
+
+    def box(size, at):
+        return trimesh.creation.box(size).apply_translation([*at, size[2] / 2])
+
+    floor = trimesh.creation.box((10.0, 6.0, 0.02)).apply_translation((0, 0, -0.01))
+    pillar = box((1.6, 1.6, 2.4), (-3.0, 0.0))
+    housing = [box((0.7, 0.02, 1.8), (0, y)) for y in (-0.35, 0.35)] + [
+        box((0.02, 0.7, 1.8), (x, 0)) for x in (-0.35, 0.35)
+    ]
+    room = [box((2.0, 0.1, 2.4), (3.5, y)) for y in (-1, 1)] + [box((0.1, 2.0, 2.4), (3.5 + x, 0)) for x in (-1, 1)]
+    parts = [floor, pillar, *housing, *room]
+    whole = trimesh.util.concatenate(parts)
+    labels = np.full(len(whole.vertices), 38)
+    labels[:8] = FLOOR
+    plan = make_floor_plan(whole.vertices @ yaw_matrix(yaw).T, np.asarray(whole.faces), labels, (), None, yaw)
+
+    def free(x, y):
+        row, column, inside = plan.grid.cells(np.array([[x, y, 0.0]]) @ yaw_matrix(yaw).T)
+        assert inside.all()
+        return bool(plan.traversable[row[0], column[0]])
+
+    assert not free(-3.0, 0.0) and not free(-2.5, 0.5)  # 2.6 m2
+    assert not free(0.0, 0.0)  # 0.5 m2
+    assert free(3.5, 0.0) and free(-4.5, 2.5) and free(1.5, 0.0)
 
 
 def test_the_sources_map_adds_floor_that_the_scan_missed():

@@ -235,7 +235,7 @@ def test_models_to_attach_are_read_and_their_number_has_an_end(tmp_path):
         (root / "sub" / f"m{k}.xml").write_text(child.format(threefold, ""))
     change(root, ("sub/pot.xml", "sub/m0.xml"))
     (root / "sub" / "m12.xml").write_text(child.format("", ""))
-    with pytest.raises(SceneRejected, match="more than 1000 MJCF files"):
+    with pytest.raises(SceneRejected, match="1,001 MJCF files, expected at most 1,000"):
         read_mjcf(root)
 
 

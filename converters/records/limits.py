@@ -1,0 +1,46 @@
+"""What a source may hold at most: the one table of limits, checked before the work that they bound."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+
+from converters.records.errors import SceneRejected
+
+EXTENT_M = 150.0  # longest side of a building, or of a floor plane
+SAMPLES = 30_000_000  # points that are held at a time of a sampled surface
+CLOUD = 5_000_000  # coloured points of a textured scan, from which on they stand further apart
+PIXELS = 2 * 8192 * 8192  # of one image or height field, or of a joint texture, which is scaled down
+FILES = 1_000  # MJCF files of a home: includes, and models that it attaches
+PARTS = 20_000  # models or instances of a home
+GEOMS = 100_000  # elements of an MJCF home, replicas and attached models counted
+MOVABLES = 500  # pieces of furniture that stand on a home's floor
+NUMBERS = 10_000_000  # that a glTF file may ask for without giving them
+
+Image.MAX_IMAGE_PIXELS = PIXELS // 2  # Pillow warns from here on, and refuses twice as many
+
+
+def check_count(where: object, count: float, most: float, what: str, remedy: str = "split the source") -> None:
+    """Refuses more of `what` than there may be, naming the file and the remedy.
+
+    Raises:
+        SceneRejected: too many, or their number is none.
+    """
+    if not count <= most:
+        raise SceneRejected(f"{where}: has {count:,.0f} {what}, expected at most {most:,.0f}; {remedy}")
+
+
+def check_image(path: Path) -> None:
+    """Refuses a file whose header tells of too large an image; what is no image passes.
+
+    Raises:
+        SceneRejected: more than `PIXELS`.
+    """
+    try:
+        with Image.open(path):
+            pass
+    except Image.DecompressionBombError as error:
+        raise SceneRejected(f"{path}: {error}; scale the image down") from error
+    except (OSError, ValueError, SyntaxError):
+        return
