@@ -59,6 +59,8 @@ class SceneTables:
     """[S, q, 2] f32 middles of fine cells all over which the largest small object lies clear."""
     num_clutter: jax.Array
     """[S] i32."""
+    known_pairs_xy_w: jax.Array
+    """[S, k, 2, 2] f32 starts and goals (middles of fine cells) as far apart as asked, for where drawing finds none."""
     cell_m: float = flax.struct.field(pytree_node=False, default=0.1)
     """Side of a navigation cell."""
     fine_m: float = flax.struct.field(pytree_node=False, default=0.05)

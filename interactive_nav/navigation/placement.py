@@ -1,8 +1,8 @@
 """Random keys and scene tables in, an episode's start, goal and clutter out, inside jit.
 
 Each draw is uniform over tabulated free places and judged from a bounded number of candidates, so nothing
-retries for ever; a small object that finds no place is parked outside, and counted, as is an episode without a pair
-of start and goal at the distances that were asked for.
+retries for ever; a small object that finds no place is parked outside, and counted. Where no pair of start and goal is
+drawn at the distances that were asked for, one that is known to be takes its place.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PAIR_CANDIDATES = 64
 WIDER_CANDIDATES = 1024
 """Pairs drawn in each round: the straight line is cheap to measure, the way round is not."""
 MAX_ROUNDS = 64
-"""Rounds that follow where no pair qualifies; without one after all, the nearest to it is taken, and counted."""
+"""Rounds that follow where no pair qualifies; without one after all, one of the scene's known pairs is taken."""
 DISTANCE_TOLERANCE_M = 1e-3
 """Rounding of distances that are measured again."""
 CLUTTER_CANDIDATES = 16
@@ -51,7 +51,7 @@ def miss_m(
 def _draw_pair(
     key_start: jax.Array, key_goal: jax.Array, tables: SceneTables, scene: jax.Array, least_m: float, largest_m: float
 ) -> tuple[jax.Array, jax.Array]:
-    """The first of uniform pairs of start and goal that is as far apart as asked; else the nearest to it."""
+    """The first of uniform pairs of start and goal that is as far apart as asked; else one of the known pairs."""
 
     start_places = tables.start_xy_w[scene], tables.num_starts[scene], tables.fine_m
     goal_places = tables.goal_xy_w[scene], tables.num_goals[scene], tables.fine_m
@@ -80,8 +80,9 @@ def _draw_pair(
     # By name, not by a small number, which would be one of the keys that `candidates` splits off.
     wider = [jax.random.fold_in(key, zlib.crc32(b"wider")) for key in (key_start, key_goal)]
     first = best(*candidates(key_start, key_goal, PAIR_CANDIDATES))
-    _, (start, goal, _) = jax.lax.while_loop(unmet, again, (jnp.zeros((), jnp.int32), first))
-    return start, goal
+    _, (start, goal, miss) = jax.lax.while_loop(unmet, again, (jnp.zeros((), jnp.int32), first))
+    known = jax.random.choice(jax.random.fold_in(wider[0], MAX_ROUNDS), tables.known_pairs_xy_w[scene])
+    return jnp.where(miss > 0, known[0], start), jnp.where(miss > 0, known[1], goal)
 
 
 def _place_small(
@@ -129,8 +130,8 @@ def draw_episode(
     """Draws scene, start, goal and small objects uniformly (paper section IV).
 
     Start and goal are the first of independent uniform pairs that are as far apart as asked, so uniform among
-    such pairs; each small object lies at the first of `CLUTTER_CANDIDATES` uniform places that
-    is clear of what lies already.
+    such pairs; in `MAX_ROUNDS` without one, it is one of `tables.known_pairs_xy_w`, of the same distances. Each
+    small object lies at the first of `CLUTTER_CANDIDATES` uniform places that is clear of what lies already.
 
     Args:
         key: consumed.

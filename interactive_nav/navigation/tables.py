@@ -23,8 +23,8 @@ from scenes_mjcf.schema import SceneError
 
 FINE_CELLS = 2
 """Fine cells along the side of a navigation cell: corners and places are 0.05 m fine, nodes 0.1 m apart."""
-GOALS_TRIED = 256
-"""Goals of each scene that `check_distances` looks from."""
+GOALS_TRIED, GOALS_KEPT, PAIRS_KEPT = 256, 32, 256
+"""Goals of each scene that are held against every start; those with a fitting start, and pairs, that are enough."""
 SIGHT_STEP_CELLS = 2.0
 """Fine cells between samples of a line of sight inside jit. What is blocked for the robot's centre is at least a
 robot wide, so nothing is stepped over; a corner clipped between two samples is cut by centimetres at most."""
@@ -99,56 +99,60 @@ def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGra
     # Unless the option says otherwise the robot must fit at the goal too, or one under a sofa could never be reached.
     goals = starts if rules.goal_clear else centres(graph.free & (room(False) >= needed))
     clutter = centres(furnished >= largest + CLEARANCE_M)
-    far = len(starts) and len(goals) and _farthest(starts, goals) >= rules.min_goal_distance_m
-    if not far:
-        raise SceneError(
-            f"{scene.path}: no room for a start and a goal {rules.min_goal_distance_m} m apart for robot "
-            f"'{robot.name}'; lower min_goal_distance_m or use a larger scene"
-        )
     return graph, starts, goals, clutter
 
 
-def check_distances(world: World, tables: SceneTables, rules: TaskRules) -> None:
-    """Refuses scenes without a start and a goal at the distances that are asked for.
-
-    The planar distance alone is settled with the places. Here a sample of goals is held against every start: where
-    none has one, drawing pairs at random would find none either.
+def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndarray:
+    """[S, PAIRS_KEPT, 2, 2] f32 starts and goals at middles of cells, as far apart as asked: some of each scene's.
 
     Raises:
         SceneError: a scene with no such pair.
     """
-    if not math.isfinite(rules.max_goal_distance_m):
-        return
-
-    # Places are anywhere in their cells: two of them may be nearer or farther than the middles by this.
-    slack_m = math.sqrt(2) * tables.fine_m
+    least_m, largest_m = rules.min_goal_distance_m, rules.max_goal_distance_m
 
     @jax.jit
-    def some_fit(scene: jax.Array, goal: jax.Array) -> jax.Array:
-        starts = tables.start_xy_w[scene]
-        field = goal_field(tables, scene, goal)
-        way_m = jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(starts)
-        far = jnp.linalg.norm(starts - goal[None], axis=-1) >= rules.min_goal_distance_m - slack_m
-        fits = far & (way_m <= rules.max_goal_distance_m + slack_m)
-        return (fits & (jnp.arange(len(starts)) < tables.num_starts[scene])).any()
+    def ways_m(scene: int, goal: jax.Array) -> jax.Array:
+        field = goal_field(tables, scene, goal)  # type: ignore[arg-type]
+        return jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(tables.start_xy_w[scene])  # type: ignore[arg-type]
 
+    known, rng = [], np.random.default_rng(0)
     for i, scene in enumerate(world.scenes):
-        goals = tables.goal_xy_w[i]
-        sample = np.unique(np.linspace(0, int(tables.num_goals[i]) - 1, GOALS_TRIED).astype(int))
-        if not any(bool(some_fit(jnp.asarray(i), goals[k])) for k in sample):
+        starts = np.asarray(tables.start_xy_w[i, : tables.num_starts[i]])
+        goals = np.asarray(tables.goal_xy_w[i, : tables.num_goals[i]])
+        farthest_m = _farthest(starts, goals)
+        most_m = farthest_m.max(initial=0.0)
+        if not len(farthest_m) or most_m < least_m:
             raise SceneError(
-                f"{scene.path}: no start and goal of robot '{world.robot.name}' are at least "
-                f"{rules.min_goal_distance_m} m apart and at most {rules.max_goal_distance_m} m by the way; "
-                "raise max_goal_distance_m or lower min_goal_distance_m"
+                f"{scene.path}: no room for a start and a goal {least_m} m apart for robot '{world.robot.name}', the "
+                f"farthest are {most_m:.2f} m apart; lower min_goal_distance_m or use a larger scene"
             )
+        fits, shortest_m = [], np.inf
+        for goal in rng.permutation(goals[farthest_m >= least_m])[:GOALS_TRIED]:
+            far = np.linalg.norm(starts - goal, axis=-1) >= least_m
+            way_m = np.asarray(ways_m(i, goal))[: len(starts)] if math.isfinite(largest_m) else np.zeros(len(starts))
+            shortest_m = min(shortest_m, way_m[far].min())
+            near = starts[far & (way_m <= largest_m)]
+            fits += [np.stack([near, np.broadcast_to(goal, near.shape)], 1)] if len(near) else []
+            if len(fits) == GOALS_KEPT:
+                break
+        if not fits:
+            raise SceneError(
+                f"{scene.path}: no start and goal of robot '{world.robot.name}' are at least {least_m} m apart and at "
+                f"most {largest_m} m by the way, the shortest way so far is {shortest_m:.2f} m; raise "
+                "max_goal_distance_m or lower min_goal_distance_m"
+            )
+        pairs = np.concatenate(fits)
+        known.append(pairs[np.linspace(0, len(pairs) - 1, PAIRS_KEPT).astype(int)])
+    return np.stack(known)
 
 
-def _farthest(a: np.ndarray, b: np.ndarray) -> float:
-    """Largest distance between points [p, 2] and [g, 2], to within 4 %: by their extent along 16 directions."""
-    angle = np.arange(16) * np.pi / 16
-    along = np.stack([np.cos(angle), np.sin(angle)])
-    first, second = a @ along, b @ along
-    return float(np.maximum(first.max(0) - second.min(0), second.max(0) - first.min(0)).max())
+def _farthest(starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """[g] m: how far the farthest of the starts [p, 2] is from each goal [g, 2], to within 0.2 %."""
+    if not len(starts):
+        return np.zeros(0)
+    angle = np.arange(64) * np.pi / 32
+    outermost = starts[np.unique((starts @ np.stack([np.cos(angle), np.sin(angle)])).argmax(0))]
+    return np.linalg.norm(goals[:, None] - outermost[None], axis=-1).max(1)
 
 
 def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
@@ -219,6 +223,6 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         num_goals=i32([len(p[2]) for p in places]),
         clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
         num_clutter=i32([len(p[3]) for p in places]),
+        known_pairs_xy_w=jnp.zeros((len(places), 1, 2, 2)),
     )
-    check_distances(world, tables, rules)
-    return tables
+    return tables.replace(known_pairs_xy_w=f32(_known_pairs(world, tables, rules)))

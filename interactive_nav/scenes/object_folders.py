@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.scenes.objects import Box, SmallObject, pick
-from interactive_nav.scenes.scene import Movable, read_movable
+from interactive_nav.scenes.scene import Movable, hull_sources, read_movable, task_parts
 from interactive_nav_common.config import Positive
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
@@ -40,6 +40,12 @@ class ConvertedObject(SmallObject):
     """Of object.xml and the hulls."""
     movable: Movable = dataclasses.field(repr=False, compare=False)
     """Its body in the same frame: mass properties and hulls as converted."""
+    hull_sources: list = dataclasses.field(repr=False, compare=False)
+    """What its hulls are made from."""
+
+    @property
+    def task_parts(self) -> tuple:
+        return *super().task_parts, task_parts(self.movable, self.hull_sources)
 
 
 def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple[SmallObject, ...]:
@@ -86,8 +92,9 @@ def load_object(folder: str | Path) -> ConvertedObject:
         Box(_numbers(row[:3]), _numbers(row[7:10]), _numbers(row[3:7]))  # type: ignore[arg-type]
         for row in movable.boxes
     )
+    about_physics = movable, hull_sources(xml).get(name, [])
     return ConvertedObject(
-        name, category, class_id(category), movable.mass_kg, friction, boxes, RGBA, (), sha256, movable
+        name, category, class_id(category), movable.mass_kg, friction, boxes, RGBA, (), sha256, *about_physics
     )
 
 

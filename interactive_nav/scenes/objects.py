@@ -86,6 +86,12 @@ class SmallObject:
         return class_id(self.category, classes) if classes == "all" else self.segmentation_id
 
     @property
+    def task_parts(self) -> tuple:
+        """What of it decides a task, to be hashed: its looks are not in it."""
+        boxes = [dataclasses.astuple(box) for box in self.boxes]
+        return self.category, self.segmentation_id, self.mass_kg, self.friction, boxes
+
+    @property
     def radius_m(self) -> float:
         """Radius of the disc about the origin that holds the object's footprint."""
         return max(math.hypot(x, y) for b in self.boxes for x, y, _ in b.corners_m)

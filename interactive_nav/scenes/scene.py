@@ -80,14 +80,9 @@ class Scene:
         maps = self.maps
         parts = [maps.traversable.shape, np.packbits(maps.traversable).tobytes().hex()]
         parts += [_rounded([maps.resolution_m, *maps.origin_w]), _rounded(self.walls)]
-        hulls = _hull_sources(self) if any(m.hulls for m in self.movables) else {}
+        hulls = hull_sources(self.path / "scene.xml") if any(m.hulls for m in self.movables) else {}
         for movable in self.movables:
-            numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
-            for name in ("name", "hulls", "hinge", "category"):
-                del numbers[name]
-            hinge = movable.hinge and [_rounded(v) for v in dataclasses.astuple(movable.hinge) if v is not None]
-            parts += [movable.category, {name: _rounded(value) for name, value in numbers.items()}, hinge]
-            parts.append(hulls.get(movable.name, []))
+            parts += task_parts(movable, hulls.get(movable.name, []))
         return TASK_DIGEST + hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
@@ -96,14 +91,23 @@ def _rounded(value: object) -> list:
     return (np.round(np.asarray(value, float), _DECIMALS) + 0.0).tolist()
 
 
-def _hull_sources(scene: Scene) -> dict[str, list]:
+def task_parts(movable: Movable, hulls: list) -> list:
+    """What of a body decides a task, to be hashed: all but its name; its hulls as `hull_sources` has them."""
+    numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
+    for name in ("name", "hulls", "hinge", "category"):
+        del numbers[name]
+    hinge = movable.hinge and [_rounded(v) for v in dataclasses.astuple(movable.hinge) if v is not None]
+    return [movable.category, {name: _rounded(value) for name, value in numbers.items()}, hinge, hulls]
+
+
+def hull_sources(xml: Path) -> dict[str, list]:
     """Body name -> what its colliding meshes are made from: MuJoCo turns and centres the vertices themselves."""
-    spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
+    spec = mujoco.MjSpec.from_file(str(xml))
     found: dict[str, list] = {}
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (geom.contype or geom.conaffinity):
             mesh = spec.mesh(geom.meshname)
-            path = scene.path / spec.meshdir / mesh.file
+            path = xml.parent / spec.meshdir / mesh.file
             content = path.read_bytes() if mesh.file else np.asarray(mesh.uservert).tobytes()
             numbers = [_rounded(v) for v in (geom.pos, geom.quat, mesh.scale, mesh.refpos, mesh.refquat)]
             found.setdefault(geom.parent.name, []).append([hashlib.sha256(content).hexdigest(), numbers])

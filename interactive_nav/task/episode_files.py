@@ -49,8 +49,8 @@ class EpisodeFile:
     objects: tuple[str, ...]
     """Categories of the small objects, in order."""
     objects_digest: str
-    """`TASK_DIGEST` and SHA-256 of the small objects' boxes, masses, friction and categories; in old files without it,
-    and of their looks too."""
+    """`TASK_DIGEST` and SHA-256 of the small objects' boxes, masses, friction and categories, of those from folders
+    of inertia, centre of mass and hulls too; in old files without it, also of their looks."""
     episodes: tuple[dict[str, Any], ...]
     """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
     that found no place), shortest_path_m, and, in newer files, push_needed: whether there is no way round everything
@@ -138,9 +138,7 @@ def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart
 def _objects_digests(env: InteractiveNav) -> tuple[str, str]:
     """Of what decides the task, and as old files have it."""
     small = env.world.small_objects
-    task = [
-        (o.category, o.segmentation_id, o.mass_kg, o.friction, [dataclasses.astuple(b) for b in o.boxes]) for o in small
-    ]
+    task = [o.task_parts for o in small]
     new, old = (hashlib.sha256(repr(content).encode()).hexdigest() for content in (task, small))
     return TASK_DIGEST + new, old
 

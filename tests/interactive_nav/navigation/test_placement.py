@@ -203,18 +203,33 @@ def test_rare_distances_are_met_too_and_uniformly(built):
     assert stats.binomtest(int((starts[:, 0] > goals[:, 0]).sum()), 300).pvalue > 1e-3
 
 
-def test_what_cannot_be_met_is_taken_for_nearest_and_told(built):
-    _, tables = built
-    starts, goals, miss = draw_pairs(tables, 3, 20.0, np.inf)
-    np.testing.assert_allclose(miss, 20.0 - np.linalg.norm(starts - goals, axis=-1), atol=1e-4)
-
-
-def test_distances_that_no_pair_has_are_refused(two_rooms):
-    # From corner to corner the straight line would be 5.6 m, but the partition's gap is a way round of 5.8 m.
-    config = NavConfig.of(num_objects=0, min_goal_distance_m=5.6, max_goal_distance_m=5.62)
+@pytest.mark.parametrize("largest_m", [np.inf, 5.85])
+def test_distances_that_next_to_no_pair_has_are_met(two_rooms, largest_m):
+    """From one corner of the room to the other: drawing mostly finds none, so known pairs are taken."""
+    config = NavConfig.of(num_objects=0, min_goal_distance_m=5.5, max_goal_distance_m=largest_m)
     world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), config)
-    with pytest.raises(SceneError, match="no start and goal of robot 'turtlebot' are at least 5.6 m apart and at most"):
-        build_tables(world, config.rules)
+    tables = build_tables(world, config.rules)
+    starts, goals, miss = draw_pairs(tables, 100, 5.5, largest_m)
+    assert miss.max() < 1e-5 and len(np.unique(starts, axis=0)) > 8
+    assert np.linalg.norm(starts - goals, axis=-1).min() > 5.5 - 1e-5
+    known = np.asarray(tables.known_pairs_xy_w[0]).reshape(-1, 4)
+    drawn = np.concatenate([starts, goals], -1)
+    assert (np.abs(drawn[:, None] - known[None]).max(-1).min(1) < 1e-6).sum() > 20
+
+
+def test_distances_that_no_pair_has_are_refused_with_those_that_there_are(two_rooms):
+    def refusal(least_m, largest_m):
+        config = NavConfig.of(num_objects=0, min_goal_distance_m=least_m, max_goal_distance_m=largest_m)
+        world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), config)
+        with pytest.raises(SceneError) as refused:
+            build_tables(world, config.rules)
+        return str(refused.value)
+
+    # From corner to corner the straight line would be 5.6 m, but the partition's gap is a way round of 5.8 m.
+    text = refusal(5.6, 5.62)
+    assert "no start and goal of robot 'turtlebot' are at least 5.6 m apart and at most 5.62 m by the way" in text
+    assert "the shortest way so far is 5.96 m; raise max_goal_distance_m or lower" in text
+    assert "9.0 m apart for robot 'turtlebot', the farthest are 5.63 m apart; lower" in refusal(9.0, np.inf)
 
 
 def test_an_episode_off_its_distances_is_counted(room):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import shutil
 
 import jax
 import numpy as np
@@ -65,6 +67,8 @@ def test_a_turned_box_has_turned_corners_and_a_digest_of_its_own():
 def test_the_built_in_objects_keep_the_digest_of_stored_episodes():
     assert hashlib.sha256(repr(pick(10)).encode()).hexdigest()[:16] == "2fa0fa1c34d5d7d1"
     assert hashlib.sha256(repr(pick(10, "test")).encode()).hexdigest()[:16] == "863ea109041efa8c"
+    task = [hashlib.sha256(repr([o.task_parts for o in pick(n)]).encode()).hexdigest() for n in (10, 4)]
+    assert [digest[:16] for digest in task] == ["e49911a1f2003b44", "82affa07f96cfa3a"]
 
 
 def test_they_rest_where_an_episode_puts_them(env):
@@ -93,6 +97,28 @@ def test_episodes_know_the_objects(env, room, folders):
         strange = interactive_nav.make("turtlebot", [room], backend="native", num_objects=3, **other)
         with pytest.raises(episodes.EpisodeFileError, match="or other models; set num_objects=3 and the same objects"):
             episodes.starts_of(file, strange)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after", "same"),
+    [
+        ("object.xml", r'<inertial pos="0 0 [^"]*"', '<inertial pos="0 0 0.07"', False),
+        ("object.xml", r'diaginertia="[^"]*"', 'diaginertia="8 16 21"', False),
+        ("assets/toy_crate_hull_0.obj", r"\nv \S+ ", "\nv -0.31 ", False),
+        ("object.xml", r'rgba="0.3 0.6 0.9 0.5"', 'rgba="1 0 0 1"', True),
+    ],
+)
+def test_episodes_know_how_an_object_moves_and_not_how_it_looks(room, folders, tmp_path, name, before, after, same):
+    def digest(folder):
+        env = interactive_nav.make("turtlebot", [room], backend="native", objects=[str(folder)], num_objects=1)
+        return episodes.draw(env, 1, 0).objects_digest
+
+    shutil.copytree(folders[0], tmp_path / "toy_crate")
+    text = (tmp_path / "toy_crate" / name).read_text()
+    changed = re.sub(before, after, text, count=1)
+    assert changed != text
+    (tmp_path / "toy_crate" / name).write_text(changed)
+    assert (digest(tmp_path / "toy_crate") == digest(folders[0])) is same
 
 
 def test_replays_draw_the_objects(env, tmp_path):
