@@ -72,7 +72,7 @@ PYTEST = $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worke
 
 test: sync .venv/.oracles
 	$(say) "Tests (two workers; the slow ones compile MJX on the CPU)"
-	@$(PYTEST) -m "not heavy" --durations=15
+	@$(PYTEST) -m "not heavy or changed" --durations=15
 
 test-all: sync .venv/.oracles
 	$(say) "All tests, the heavy ones too"

@@ -37,6 +37,7 @@ from filelock import FileLock
 from hypothesis import settings
 
 import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
+from tests.changed import changed_files, chosen
 from tests.toys import write_room
 
 # The same examples in every run, so that a red run shows what was changed; `HYPOTHESIS_PROFILE=explore` draws new ones.
@@ -45,8 +46,26 @@ settings.register_profile("explore", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first, then those with many: what comes last is small, and both workers end together."""
+CHANGED = "INTERACTIVE_NAV_CHANGED_FILES"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Asks Git once, before workers start: all of them must collect the same tests."""
+    if "changed" in config.option.markexpr and CHANGED not in os.environ:
+        os.environ[CHANGED] = "\n".join(sorted(changed_files(Path(__file__).parents[1])))
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest looks at marks
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Files with slow tests first, then those with many: what comes last is small, and both workers end together.
+
+    With `-m "not heavy or changed"`, marks the heavy tests of what changed."""
+    if "changed" in config.option.markexpr:
+        heavy = [i for i in items if i.get_closest_marker("heavy") and not i.get_closest_marker("gpu")]
+        names = set(chosen((i.nodeid for i in heavy), set(os.environ[CHANGED].splitlines())))
+        for item in heavy:
+            if item.nodeid in names:
+                item.add_marker("changed")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     count = collections.Counter(item.path for item in items)
     items.sort(key=lambda item: (item.path not in slow, -count[item.path]))

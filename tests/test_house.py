@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,8 @@ MAY_IMPORT = {
     "benchmarks": set(PACKAGES) - {"benchmarks", "docs"},
     "docs": set(PACKAGES),
 }
+CHECKOUT_KIB = 34_816
+"""Most that tracked files may take."""
 MODULES_A_FOLDER, LINES_A_FILE, LINES_A_FUNCTION = 12, 400, 60
 
 
@@ -97,6 +100,14 @@ def test_no_function_is_long(sources):
 def test_the_drawn_map_is_that_of_the_imports(sources):
     drawn = (ROOT / "docs" / "packages.svg").read_text(encoding="utf-8")
     assert drawn == svg(room_graph(sources)), "python docs/package_map.py draws it anew"
+
+
+def test_the_checkout_is_small():
+    listed = subprocess.run(("git", "ls-files", "-z"), cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a Git checkout")
+    sizes = {name: (ROOT / name).lstat().st_size for name in listed.stdout.split("\0") if (ROOT / name).is_file()}
+    assert sum(sizes.values()) <= CHECKOUT_KIB * 1024, sorted(sizes, key=sizes.__getitem__)[-10:]
 
 
 def test_the_gates_fail_where_they_should(tmp_path):

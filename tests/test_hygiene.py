@@ -9,6 +9,7 @@ import functools
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -56,6 +57,14 @@ def test_an_array_that_gains_an_axis_is_refused():
         jnp.add(jnp.zeros((2, 3)), jnp.zeros(3))
     started = subprocess.run([sys.executable, "-c", PROMOTES], capture_output=True, text=True)
     assert started.returncode == 1 and "jax_numpy_rank_promotion='raise'" in started.stderr
+
+
+def test_programs_that_tests_start_compile_as_the_tests_do():
+    """Who sets XLA's flags adds to those of `tests/conftest.py`: other flags give other last digits."""
+    texts = {path.name: path.read_text("utf-8") for path in Path(__file__).parent.rglob("*.py")}
+    sets = {name for name, text in texts.items() if '"XLA_FLAGS":' in text}
+    assert {"test_sharding.py", "test_brax_compat.py"} <= sets
+    assert [name for name in sets if "environ['XLA_FLAGS']}" not in texts[name]] == []
 
 
 def test_a_nan_and_a_leaked_tracer_are_refused():

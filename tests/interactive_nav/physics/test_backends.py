@@ -173,7 +173,7 @@ def test_the_force_on_a_pushed_block_on_native(world, native):
     assert_options_order_as_they_must(world, native)
 
 
-@pytest.mark.heavy
+@pytest.mark.slow
 def test_the_force_on_a_pushed_block_on_jax(world, mjx_jax):
     assert_force_is_what_pushing_takes(world, mjx_jax)
     assert_options_order_as_they_must(world, mjx_jax)
@@ -190,8 +190,8 @@ def test_the_force_on_a_pushed_block_on_warp(world, mjx_warp):
     "backend",
     [
         "native",
-        pytest.param("jax", marks=pytest.mark.heavy),
-        pytest.param("warp", marks=[pytest.mark.heavy, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
+        pytest.param("jax", marks=pytest.mark.slow),
+        pytest.param("warp", marks=[pytest.mark.slow, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
     ],
 )
 def test_the_chosen_force_is_what_the_signals_hold(world, native, backend):

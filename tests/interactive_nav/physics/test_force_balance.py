@@ -203,13 +203,11 @@ def test_small_steps_and_round_cones_give_coulombs_friction(tmp_path):
 FEW = [1, 6, 10]
 
 
-@pytest.mark.heavy
 @pytest.mark.slow
 def test_pushes_balance_on_jax(tmp_path):
     assert_balanced(run(*make_world(tmp_path), "jax", FEW))
 
 
-@pytest.mark.heavy
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_WARP, reason="the package warp-lang (extra 'warp') is not installed")
 def test_pushes_balance_on_warp(tmp_path):

@@ -126,7 +126,6 @@ def test_enter_and_leave_are_inverse(world):
         assert not changed[world.layout.slot_qpos[slot] : world.layout.slot_qpos[slot] + 7].any()
 
 
-@pytest.mark.heavy
 def test_a_push_in_a_window_is_that_of_the_whole_building(world):
     """The robot pushes one chair into the next for 1.5 s: C MuJoCo with everything, MJX-JAX with two of four."""
 

@@ -242,7 +242,6 @@ def test_wheels_and_casters_are_exempt_where_the_original_exempts_them(pushed):
     assert len(named) == 4 and all("wheel" in name or "caster" in name for name in named)
 
 
-@pytest.mark.heavy
 def test_robot_mass_variants_and_gravity(pushed, paper):
     base = 2.473
     for which, mass in (("total", 2.673), ("base", base), ("links", 2.673)):
@@ -289,7 +288,6 @@ def test_grid_waypoints_in_the_observation(pushed):
     np.testing.assert_allclose(ahead[:, 0], 0.2 * np.arange(1, 11), atol=1e-4)
 
 
-@pytest.mark.heavy
 def test_a_quantised_potential_moves_in_steps_of_a_cell(pushed, paper):
     smooth = np.diff(value(paper, "geodesic_m"))[2:9]
     steps = np.diff(value(play(make(pushed, potential="quantised"), [AHEAD] * 12), "geodesic_m"))[2:]

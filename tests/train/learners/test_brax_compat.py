@@ -33,7 +33,7 @@ def test_two_devices_hold_a_copy_each():
         "assert [s.data.tolist() for s in out.addressable_shards] == [[[1., 2.]], [[1., 2.]]]\n"
         "assert {s.device for s in out.addressable_shards} == set(jax.local_devices())\n"
     )
-    flags = "--xla_force_host_platform_device_count=2"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     done = subprocess.run(
         [sys.executable, "-c", program],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": ":".join(filter(None, sys.path))},
