@@ -12,8 +12,8 @@ from converters.records.limits import SAMPLES, check_count
 
 LEAST_FACES = 24
 """Of a part, however many there are."""
-BLOCK = 2_000_000
-"""Points that are sampled at a time."""
+BLOCK, LARGE = 1_000_000, 10_000
+"""Points that are sampled at a time; points on a face from which on it is a large one."""
 SMALL_M = 0.6
 """Longest side of a thing that may be drawn as its hull."""
 
@@ -60,8 +60,9 @@ def sampled(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> Iterat
             u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n
             weights = np.stack([1 - u - v, u, v], axis=1)
             for part in np.array_split(chosen, -(-len(chosen) * len(weights) // BLOCK)):
-                points = np.einsum("kw,fwd->fkd", weights, corners[part]).reshape(-1, 3)
-                yield points, np.repeat(part, len(weights))
+                large = len(weights) > LARGE  # matmul is faster there, and rounds otherwise
+                points = weights @ corners[part] if large else np.einsum("kw,fwd->fkd", weights, corners[part])
+                yield points.reshape(-1, 3), np.repeat(part, len(weights))
 
 
 def _steps(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from PIL import Image
 
 from converters.records.errors import SceneRejected
 
-EXTENT_M = 150.0  # longest side of a building, or of a floor plane
+EXTENT_M = 100.0  # longest side of a building, or of a floor plane
 SAMPLES = 30_000_000  # points that are held at a time of a sampled surface
 CLOUD = 5_000_000  # coloured points of a textured scan, from which on they stand further apart
 PIXELS = 2 * 8192 * 8192  # of one image or height field, or of a joint texture, which is scaled down

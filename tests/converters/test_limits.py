@@ -170,7 +170,7 @@ def nested(k: int) -> str:
 
 PIXELS = "expected at most 134,217,728; make it smaller|exceeds limit of 134217728 pixels"
 COPIES = "elements with their copies, expected at most 100,000"
-EXTENT = "reaches from .* expected a building of at most 150 m; remove stray vertices"
+EXTENT = "reaches from .* expected a building of at most 100 m; remove stray vertices"
 READ = ""
 COPY = '<replicate count="1000"><replicate count="1000"><geom size="0.1"/></replicate></replicate>'
 STILL = "<static>1</static>"
