@@ -71,7 +71,7 @@ class HomeConfig:
         self.shell.validate()
         if not 0.0 <= self.furniture_share <= MOST_SHARE:
             raise GenerationError(
-                f"furniture_share is {self.furniture_share}: expected 0 to {MOST_SHARE}, more leaves no way to go"
+                f"furniture_share is {self.furniture_share}: expected 0 to {MOST_SHARE}, no home takes more"
             )
         low, high = self.clutter_per_10_m2
         if not 0 <= low <= high:
@@ -82,8 +82,8 @@ class HomeConfig:
         return self
 
 
-MOST_SHARE = 0.5
-"""Largest `furniture_share` that is tried."""
+MOST_SHARE = 0.42
+"""Largest `furniture_share`: what the fullest of homes of four rooms and more took."""
 TIERS: dict[str, dict[str, Any]] = {
     "furnished": {},
     "cluttered": {

@@ -11,12 +11,14 @@ from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import rooms_joined, static_grid
 from converters.generate.homes.config import HomeConfig
-from converters.generate.homes.furnish import WIDE_M, furnish_home
+from converters.generate.homes.furnish import WIDE_M, Full, furnish_home
 from converters.generate.homes.passages import adjust
 from converters.generate.homes.rooms import home_plan
 
 MOST_PLANS = 5
 """Plans furnished before giving up."""
+MOST_FULL, LARGE_M2 = 2, 150.0
+"""Of these, plans into which less fits than asked for: one is enough where it is so large, for each takes its time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +53,7 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Furnished:
     """
     cfg.validate()
     refused: GenerationError | None = None
+    full = 0
     for _ in range(MOST_PLANS):
         plan, uses = home_plan(cfg.shell, rng)
         try:
@@ -58,6 +61,9 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Furnished:
             shares = adjust(home)
         except GenerationError as error:
             refused = error
+            full += isinstance(error, Full)
+            if full == (1 if sum(r.area_m2 for r in plan.rooms) > LARGE_M2 else MOST_FULL):
+                break
             continue
         standing = home.floor.standing
         plan = dataclasses.replace(plan, built_in=tuple(s.item for s in standing if s.built_in))

@@ -29,6 +29,10 @@ WIDE_M = max(disc.radius_m for disc in ROBOTS.values()) + 0.02
 """Disc that gets past what a room's use asks for; past what is added, the disc of the settings does."""
 
 
+class Full(GenerationError):
+    """Less furniture than asked for fits into a plan."""
+
+
 @dataclasses.dataclass
 class Home:
     """A home while it is furnished. Mutable, private to one attempt."""
@@ -101,7 +105,7 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
         best = possible[np.argsort(-liking, kind="stable")[:LOOKS]]
         ranked += [(liking[possible == i][0], way, places.origin[i], int(places.side[i]), fits[i]) for i in best]
     ranked.sort(key=lambda r: -r[0])
-    joined, stranded_m2 = floor.reach(room, radius_m)
+    joined, stranded_m2 = floor.reach(room, radius_m) if ranked else (True, 0.0)
     for _, way, origin, side, fits in ranked[:LOOKS]:
         boxes = _boxes(way, fits, origin, side)
         still, cut_off_m2 = floor.reach(room, radius_m, boxes)
@@ -206,7 +210,7 @@ def grow(home: Home) -> None:
     """Adds furniture to the rooms that are emptiest for their use until the share is met.
 
     Raises:
-        GenerationError: nothing more fits.
+        Full: nothing more fits.
     """
     rng, cfg, floor = home.rng, home.cfg, home.floor
     tired: set[tuple[int, str]] = set()
@@ -233,10 +237,11 @@ def grow(home: Home) -> None:
             break
     if abs(floor.share - cfg.furniture_share) > SHARE_TOLERANCE:
         fullest = min(range(len(home.uses)), key=lambda k: floor.room_share(k) / ROOM_SETS[home.uses[k]].appetite)
-        raise GenerationError(
+        without = ", ".join(sorted(name for room, name in tired if room == fullest)) or "anything"
+        raise Full(
             f"furniture_share is {cfg.furniture_share}: nothing more fits at {floor.share:.2f} (the emptiest room, "
-            f"{home.uses[fullest]} of {home.plan.rooms[fullest].area_m2:.1f} m2, at {floor.room_share(fullest):.2f}); "
-            "ask for less, or for more area or fewer rooms"
+            f"{home.uses[fullest]} of {home.plan.rooms[fullest].area_m2:.1f} m2, at {floor.room_share(fullest):.2f}, "
+            f"has no place for: {without}); ask for less, or for other rooms"
         )
 
 

@@ -184,8 +184,15 @@ def adjust(home: Home) -> dict[str, float]:
     told = must_push_shares(floor.inside & ~floor.fixed, {robot: floor.free(robot) for robot in ROBOTS}, CELL_M)
     if passages.miss() < LEAST_GAIN and all(low <= told[robot] <= high for robot, (low, high) in wanted.items()):
         return told
-    got = ", ".join(f"must_push_{robot} is {list(wanted[robot])}, got {told[robot]:.2f}" for robot in wanted)
-    raise GenerationError(f"{got} after up to {MOST_MOVES} moves: ask for a wider range or another furniture_share")
+    missed = [robot for robot in wanted if passages.shares[robot].miss(wanted[robot]) >= LEAST_GAIN] or list(wanted)
+    got = ", ".join(
+        f"must_push_{k} is {list(wanted[k])}, got {passages.shares[k].least:.3f} to {passages.shares[k].most:.3f}"
+        for k in missed
+    )
+    raise GenerationError(
+        f"{got} (for discs 2 cm smaller to 8 cm larger than the robot) after up to {MOST_MOVES} moves: "
+        "ask for a wider range or another furniture_share"
+    )
 
 
 def _narrow(home: Home, passages: Passages) -> None:
