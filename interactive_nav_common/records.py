@@ -208,7 +208,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     for text in everything.decode(errors="replace").splitlines():
         try:
             line = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             break
         if not isinstance(line, dict):
             break

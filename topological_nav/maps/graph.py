@@ -248,6 +248,7 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
         with np.load(path, allow_pickle=False) as stored:
             header = json.loads(stored["header"].tobytes())
             arrays = {name: stored[name] for name in _ARRAYS}
+        arrays["embeddings"] = arrays["embeddings"].astype(np.float32)  # exported maps hold them in half precision
         version, scene, own, about = (header[k] for k in ("format", "scene", "digest", "about"))
     if version != FORMAT:
         raise MapError(f"{path}: format {version}, expected {FORMAT}; build the map again")
@@ -256,5 +257,4 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
             f"{path}: made in scene '{scene}' with digest {own[:12]}, the scene here has {digest[:12]}; "
             "build the map of this scene"
         )
-    arrays["embeddings"] = arrays["embeddings"].astype(np.float32)  # exported maps hold them in half precision
     return TopologicalMap(scene, own, **arrays, about=about)

@@ -187,9 +187,9 @@ def _tail(path: Path) -> list[str]:
 def last_line(path: Path) -> dict[str, Any]:
     """The last whole line of a file of JSON lines; empty where there is none."""
     for line in reversed(_tail(path)):
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, RecursionError):
             found = json.loads(line)
-            if isinstance(found, dict):
+            if isinstance(found, dict) and isinstance(found.get("env_steps", 0), int):
                 return found
     return {}
 
