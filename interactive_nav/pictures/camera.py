@@ -31,19 +31,20 @@ ENGINES = ("auto", "gl", "warp", "rays")
 class Camera:
     """Takes pictures of one environment."""
 
-    def __init__(self, env: Any, engine: str = "auto"):
+    def __init__(self, env: Any, engine: str = "auto", fov_deg: float | None = None):
         """Prepares nothing that is not asked for.
 
         Args:
             env: an `InteractiveNav`.
             engine: of RGB: gl, warp, rays, or auto: gl where it works, else warp on an NVIDIA GPU, else rays.
+            fov_deg: vertical field of view of the robot's camera; None: that of its observations.
 
         Raises:
             ConfigError: unknown engine.
         """
         if engine not in ENGINES:
             raise ConfigError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
-        self._env, self._engine = env, engine
+        self._env, self._engine, self._fov_deg = env, engine, fov_deg or env.sensors.lens.fov_deg
         self._models: dict[int, _PictureModel] = {}
         self._painters: dict[tuple, Any] = {}
 
@@ -109,7 +110,7 @@ class Camera:
         env = self._env
         if view == "robot":
             pose = env.sensors.mount.pose(np.asarray(qpos, np.float32))
-            return CameraPose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), env.sensors.lens.fov_deg
+            return CameraPose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), self._fov_deg
         if view == "top":
             maps, fov = env.scenes[scene].maps, 40.0
             rows, columns = maps.traversable.shape

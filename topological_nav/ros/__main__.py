@@ -109,7 +109,7 @@ def _add_journey(sub: argparse.ArgumentParser) -> None:
         "--policy", metavar="RUN", help="drives along edges; or passage (default: as the networks, if none is named)"
     )
     group.add_argument("--goal", type=Path, action="append", default=[], metavar="PICTURE", help="taken at the goal")
-    group.add_argument("--goal-heading", type=float, default=0.0, metavar="RAD", help="along which the first was")
+    group.add_argument("--goal-heading", type=float, metavar="RAD", help="along which the first was (default 0)")
 
 
 def _journey(arguments: argparse.Namespace) -> Any:
@@ -126,7 +126,7 @@ def _journey(arguments: argparse.Namespace) -> Any:
         chosen.localiser,
         chosen.detector,
         tuple(arguments.goal),
-        arguments.goal_heading,
+        arguments.goal_heading or 0.0,
         chosen.policy,
     )
 

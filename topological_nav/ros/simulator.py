@@ -87,7 +87,6 @@ class Simulator:
             lidar_range_m=config.lidar_range_m,
             lidar_noise=config.lidar_noise,
             odometry_noise=config.odometry_noise,
-            image_fov_deg=config.fov_deg,
             num_waypoints=1,
         )
         twist = self._env.robot.twist
@@ -95,7 +94,7 @@ class Simulator:
         self.max_linear_mps, self.max_angular_radps = twist.max_linear_m_s, twist.max_angular_rad_s
         self.dt_s = self._env.dt
         self.lens = Lens(config.width, config.height, config.fov_deg)
-        self._camera = Camera(self._env, config.engine)
+        self._camera = Camera(self._env, config.engine, config.fov_deg)
         self._step = jax.jit(self._env.step)
         key = jax.random.PRNGKey(config.seed)
         start = self._env.draw_start(key)

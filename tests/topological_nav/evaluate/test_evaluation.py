@@ -361,11 +361,12 @@ def test_one_array_tells_what_the_state_holds():
         "robot_path_m": rng.uniform(0, 90, 3),
         "touching": np.array([[True, False, True], [False, True, False], [False, False, True]]),
         "overflow_steps": np.array([0, 2, 0], np.int32),
+        "left_out_steps": np.array([0, 0, 1], np.int32),
     }
     nav = {
         name: jnp.asarray(value, value.dtype if value.dtype != float else jnp.float32) for name, value in nav.items()
     }
-    state = SimpleNamespace(info={"nav": SimpleNamespace(**nav)}, metrics={"nonfinite": jnp.asarray([0.0, 0.0, 1.0])})
+    state = SimpleNamespace(info={"nav": SimpleNamespace(**nav)}, metrics={"nonfinite": jnp.zeros(3)})
     simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step"), abs)))
     seen = simulator.seen(state)
     assert (seen.xy_w == np.asarray(nav["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float

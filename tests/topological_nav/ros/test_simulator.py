@@ -1,5 +1,6 @@
 """The simulator in a bare toy room of 6 x 4 m with one cube: distances, odometry and touches by hand."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -64,6 +65,12 @@ def test_it_turns_as_fast_as_it_is_told_and_pictures_change(simulator):
     assert math.remainder(after.odometry[2] - after.heading_rad, math.tau) == pytest.approx(0.0, abs=1e-4)
     assert after.angular_b[2] == pytest.approx(0.5, abs=0.25)  # tyres that scrub sideways do it in jerks
     assert np.abs(after.rgb.astype(float) - before.rgb).mean() > 2
+
+
+def test_pictures_span_the_field_of_view_that_is_asked_for(room):
+    narrow = Simulator(room, dataclasses.replace(CONFIG, fov_deg=40.0)).sense().rgb
+    wide = Simulator(room, CONFIG).sense().rgb
+    assert np.abs(narrow.astype(float) - wide).mean() > 2
 
 
 def test_a_blocked_start_is_refused(room):
