@@ -104,7 +104,7 @@ class DataConfig(CameraConfig):
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainConfig(Settings):
+class NetworkTrainConfig(Settings):
     """A network and how it learns. Defaults: the report's room classifier, from scratch."""
 
     seed: Seed = 0
@@ -137,14 +137,14 @@ class TrainConfig(Settings):
     """Adam's, of them."""
 
 
-def room_config() -> TrainConfig:
+def room_config() -> NetworkTrainConfig:
     """The report's room classifier."""
-    return TrainConfig()
+    return NetworkTrainConfig()
 
 
-def passage_config() -> TrainConfig:
+def passage_config() -> NetworkTrainConfig:
     """The report's passage detector."""
-    return TrainConfig(batch=32, epochs=20)
+    return NetworkTrainConfig(batch=32, epochs=20)
 
 
 @dataclasses.dataclass(frozen=True)

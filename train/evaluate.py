@@ -27,7 +27,7 @@ from train.scoring.brought import named
 from train.scoring.evaluation import AUTO_BATCH, LEARNED, SEED, add_playing_words, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
 from train.scoring.policies import PLANNERS, YARDSTICKS
-from train.scoring.rollout import Player
+from train.scoring.rollout import BatchPlayer
 from train.scoring.row_files import EvaluationAsked, paths_beside
 from train.scoring.rows import score_table
 
@@ -187,7 +187,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         claim(out.parent)
         if player is None or kinds[i] != built:
             player = None  # the old one's memory goes before the new one's comes
-            player, built = Player(build_env(config.env)), kinds[i]
+            player, built = BatchPlayer(build_env(config.env)), kinds[i]
         trained_steps = folder.origin().get("env_steps") if folder else None
         notes = {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)}
         rows, stood = pa.table({}), out.exists()

@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     made = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
     for name, (policy, meta) in made.items():
         label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
-        player = replay.Player(env, policy, name, label)
+        player = replay.EpisodePlayer(env, policy, name, label)
         for episode in episodes:
             with console.status(f"{name}, episode {episode}: compiling") as status:
                 played = player.play(

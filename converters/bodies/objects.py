@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from converters.bodies.alignment import Alignment
-from converters.geometry.boxes import Box, Hull, convex_hull, fit_box
+from converters.geometry.boxes import Hull, OrientedBox, convex_hull, fit_box
 from converters.records.raw import Annotation, CadModel
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
 
@@ -40,7 +40,7 @@ class PlacedObject:
     faces: np.ndarray
     face_colours: np.ndarray
     hulls_b: tuple[Hull, ...]
-    boxes_b: tuple[Box, ...]
+    boxes_b: tuple[OrientedBox, ...]
     """The oriented box of each hull, same order."""
     position_w: np.ndarray
     """(3,) m."""

@@ -40,7 +40,7 @@ LIMITS: dict[str, Limit] = {
     "rim_without_wall": Limit("share", most=0.02, meaning="of the free floor's rim, what no wall bounds"),
     "walls_in_floor": Limit("share", most=0.01, meaning="of the free floor, what lies within walls"),
     "manifest_differs": Limit("count", most=0, meaning="masses and frictions that scene.xml and scene.json differ in"),
-    "mass_ratio": Limit("ratio", most=4.0, meaning="of a mass to the nearer end of its category's usual range"),
+    "mass_ratio": Limit("ratio", most=10.0, meaning="of a mass to the nearer end of its category's usual range"),
     "least_friction": Limit("ratio", least=0.05, meaning="smallest sliding coefficient of a movable"),
     "physics_changed": Limit("count", most=0, meaning="gravity, air, floor or flags other than every scene's"),
     "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),

@@ -48,7 +48,7 @@ class Hull:
 
 
 @dataclasses.dataclass(frozen=True)
-class Box:
+class OrientedBox:
     """An oriented box."""
 
     centre: np.ndarray
@@ -82,7 +82,7 @@ def convex_hull(points: np.ndarray) -> Hull:
     return Hull(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64))
 
 
-def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> Box:
+def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> OrientedBox:
     """Smallest box with a vertical axis around (n, 3) points.
 
     Round things have no smallest direction: where the box along `prefer_yaw` is at most `PREFER_SLACK`
@@ -104,7 +104,7 @@ def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float =
     rotation = yaw_matrix(float(angles[best]))
     turned = points @ rotation
     low, high = turned.min(axis=0), turned.max(axis=0)
-    return Box(rotation @ ((low + high) / 2), rotation, (high - low) / 2)
+    return OrientedBox(rotation @ ((low + high) / 2), rotation, (high - low) / 2)
 
 
 def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +121,7 @@ def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, n
     return best, np.abs(best.T @ rotation) @ along
 
 
-def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> Box:
+def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> OrientedBox:
     """Oriented box that stands for a hull where collisions are boxes, at least `MIN_THICKNESS_M` thick.
 
     The general smallest box of a slanted leg reaches below the leg's own foot and would lift the object off
@@ -143,7 +143,7 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: fl
     upright = dataclasses.replace(box, half=box.half * [draw_in, draw_in, 1.0])
     to_origin, size = trimesh.bounds.oriented_bounds(hull.vertices, angle_digits=2)
     centre = -to_origin[:3, :3].T @ to_origin[:3, 3]
-    tilted = Box(centre, *least_turned(to_origin[:3, :3].T, np.asarray(size) / 2))
+    tilted = OrientedBox(centre, *least_turned(to_origin[:3, :3].T, np.asarray(size) / 2))
     foot = tilted.centre[2] - np.abs(tilted.rotation[2]) @ tilted.half
     better = np.prod(tilted.half) < 0.9 * np.prod(upright.half) and foot >= lowest_m + 0.002
     chosen = tilted if better else upright

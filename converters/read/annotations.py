@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder
 from converters.records.errors import SceneRejected
-from converters.records.raw import SYNSETS, Annotation, CadModel, Hinge
+from converters.records.raw import SYNSETS, Annotation, CadModel, ScannedHinge
 from interactive_nav_common.files import check_name
 
 OUTSIDE_M = 0.5
@@ -46,7 +46,7 @@ def _keypoints(model: dict[str, Any], key: str) -> np.ndarray:
     return flat.reshape(-1, 3)
 
 
-def _hinge(model: dict[str, Any], where: str) -> Hinge | None:
+def _hinge(model: dict[str, Any], where: str) -> ScannedHinge | None:
     raw = model.get("articulation")
     if raw is None:
         return None
@@ -59,7 +59,7 @@ def _hinge(model: dict[str, Any], where: str) -> Hinge | None:
     origin = Y_UP_TO_Z_UP @ np.asarray(raw["origin"], float)
     if not np.isfinite([low, high, *origin]).all():
         raise SceneRejected(f"{where}: the articulation has numbers that are not finite")
-    return Hinge(origin, float(np.sign(axis[2])), (low, high))
+    return ScannedHinge(origin, float(np.sign(axis[2])), (low, high))
 
 
 def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:

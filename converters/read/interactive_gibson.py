@@ -26,7 +26,7 @@ from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_extent, check_upright, with_own_corners
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
-from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, Hinge, RawScene
+from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, RawScene, ScannedHinge
 from interactive_nav_common.rotations import yaw_matrix
 
 MESH = "mesh_z_up_cleaned.obj"
@@ -119,7 +119,7 @@ def leaf_turn(leaf: np.ndarray) -> np.ndarray:
     return yaw_matrix(yaw + math.pi / 2 if box.half[1] > box.half[0] else yaw)
 
 
-def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> Hinge:
+def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> ScannedHinge:
     """The upright hinge of a door that came without one.
 
     Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
@@ -153,7 +153,7 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> H
         span = (-right, left) if inward > 0 else (-left, right)
         choices.append((int((radius < NEAR_HINGE_M + half).sum()), left + right, (end, span)))
     end, span = max(choices, key=lambda c: c[:2])[2]
-    return Hinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
+    return ScannedHinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
 
 
 def _position(source: SourceFolder, urdf: str) -> np.ndarray:

@@ -67,7 +67,7 @@ class CadModel:
 
 
 @dataclasses.dataclass(frozen=True)
-class Hinge:
+class ScannedHinge:
     """A door's vertical hinge in the CAD frame; angle 0 is the pose as scanned."""
 
     origin: np.ndarray
@@ -93,7 +93,7 @@ class Annotation:
     """(k, 3) CAD frame."""
     keypoints_scan: np.ndarray
     """(k, 3) scan frame, m."""
-    hinge: Hinge | None = None
+    hinge: ScannedHinge | None = None
 
 
 @dataclasses.dataclass(frozen=True)

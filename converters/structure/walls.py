@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from converters.geometry.boxes import Box
+from converters.geometry.boxes import OrientedBox
 from converters.structure.maps import FloorPlan
 from interactive_nav_common.rotations import yaw_matrix
 
@@ -85,7 +85,7 @@ def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[i
     return (r0 + int(rows[0]), r0 + int(rows[-1]) + 1, c0 + int(columns[0]), c0 + int(columns[-1]) + 1)
 
 
-def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
+def wall_boxes(plan: FloorPlan) -> tuple[OrientedBox, ...]:
     """Boxes from the floor up around everything traversable, each as high as what stands there.
 
     No box stands where a door's leaf turns. A box may reach over what is higher than itself (that has boxes of its
@@ -105,5 +105,5 @@ def wall_boxes(plan: FloorPlan) -> tuple[Box, ...]:
             middle = np.array([(c0 + c1) / 2, (r0 + r1) / 2, 0.0]) * side + [*plan.grid.origin, 0.0]
             centre = turn @ middle
             centre[2] = level / 2
-            boxes.append(Box(centre, turn, np.array([(c1 - c0) * side, (r1 - r0) * side, level]) / 2))
+            boxes.append(OrientedBox(centre, turn, np.array([(c1 - c0) * side, (r1 - r0) * side, level]) / 2))
     return tuple(boxes)

@@ -13,7 +13,7 @@ import numpy as np
 
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
-from converters.geometry.boxes import Box, Hull, least_turned
+from converters.geometry.boxes import Hull, OrientedBox, least_turned
 from converters.records.visual import VisualMesh
 from converters.write.texture import quantise
 
@@ -31,7 +31,7 @@ class SceneParts:
     name: str
     objects: tuple[PlacedObject, ...]
     physical: tuple[Physical, ...]
-    walls: tuple[Box, ...]
+    walls: tuple[OrientedBox, ...]
     structure_visual: VisualMesh | None = None
     object_visuals: tuple[VisualMesh, ...] = ()
     """Body frame, one an object; empty: no visuals (the settling model)."""
@@ -165,7 +165,7 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[Box, ...]) -> None:
+def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...]) -> None:
     """Floor, and a light above the middle of the walls."""
     spec.worldbody.add_geom(
         name="floor",

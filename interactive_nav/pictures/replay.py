@@ -111,7 +111,7 @@ class Replay:
         return self.body_pos_w[:, 0, :2]
 
 
-class Player:
+class EpisodePlayer:
     """Plays episodes of one environment with one policy, compiled once."""
 
     def __init__(
@@ -175,7 +175,9 @@ class Player:
         return _replay_of(self, episode, first, joined, np.concatenate(qpos))
 
 
-def _replay_of(player: Player, episode: int, first: Any, joined: dict[str, np.ndarray], qpos: np.ndarray) -> Replay:
+def _replay_of(
+    player: EpisodePlayer, episode: int, first: Any, joined: dict[str, np.ndarray], qpos: np.ndarray
+) -> Replay:
     env = player.env
     scene = int(first.scene_index)
     bodies, num_robot, pos, quat = world_poses(env.world, scene, qpos)

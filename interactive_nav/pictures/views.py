@@ -41,7 +41,7 @@ INSIDE = SCENE
 
 
 @dataclasses.dataclass(frozen=True)
-class Camera:
+class Viewpoint:
     """A pinhole camera without roll."""
 
     pos_w: np.ndarray
@@ -103,7 +103,7 @@ class SceneView(SceneModel):
         for g in np.flatnonzero((self.model.geom_group == THINGS) & ~self._floor):
             self._colour[g] = _varied(self._colour[g], int(self.model.geom_bodyid[g]))
 
-    def look(self, camera: Camera, groups: tuple[int, ...] = OUTSIDE, paint: FloorPaint | None = None) -> Image:
+    def look(self, camera: Viewpoint, groups: tuple[int, ...] = OUTSIDE, paint: FloorPaint | None = None) -> Image:
         """Renders.
 
         Args:
@@ -143,23 +143,25 @@ class SceneView(SceneModel):
         return sky + 0.38 * facing * np.where(lit, 1.0, 0.15)
 
 
-def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> Camera:
+def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> Viewpoint:
     """The robot's own camera, at the pose that its body has been placed at; `fov_deg` for another field of view."""
     mount = view.robot.camera
     body = mujoco.mj_name2id(view.model, mujoco.mjtObj.mjOBJ_BODY, mount.body)
     axes = view.data.xmat[body].reshape(3, 3)
     forward = axes @ [math.cos(mount.pitch_rad), 0.0, -math.sin(mount.pitch_rad)]
     pos = view.data.xpos[body] + axes @ np.asarray(mount.pos_m)
-    return Camera(pos, forward, math.radians(fov_deg or mount.fov_deg), rows, columns)
+    return Viewpoint(pos, forward, math.radians(fov_deg or mount.fov_deg), rows, columns)
 
 
-def chase_camera(robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6) -> Camera:
+def chase_camera(
+    robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6
+) -> Viewpoint:
     """A camera behind and above the robot, 40 degrees down."""
     pitch = math.radians(40)
     ahead = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
     forward = math.cos(pitch) * ahead - np.array([0.0, 0.0, math.sin(pitch)])
     target = np.array([robot_pos_w[0], robot_pos_w[1], 0.15]) + 0.45 * ahead
-    return Camera(target - distance_m * forward, forward, math.radians(48), rows, columns)
+    return Viewpoint(target - distance_m * forward, forward, math.radians(48), rows, columns)
 
 
 class ThirdPerson:

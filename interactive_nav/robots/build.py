@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, check_mode, set_servo, wheel_twist
+from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo, wheel_twist
 from interactive_nav_common.errors import ConfigError
 
 FOLDER = Path(__file__).parent / "mjcf"
@@ -328,7 +328,7 @@ def wheeled_robot(
     prepare: Callable[[mujoco.MjSpec], None] | None = None,
     *,
     base_body: str = "base",
-    camera: Camera,
+    camera: RobotCamera,
     rolling: tuple[str, ...] = (),
     **figures: Any,
 ) -> RobotSpec:

@@ -17,7 +17,7 @@ import numpy as np
 
 from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, read_file, stand, wheeled_robot
 from interactive_nav.robots.repair import Facts, Wheel, complete, find, strip
-from interactive_nav.robots.spec import Camera, RobotSpec
+from interactive_nav.robots.spec import RobotCamera, RobotSpec
 from interactive_nav_common.errors import ConfigError
 
 _GEOM = mujoco.mjtGeom
@@ -130,7 +130,7 @@ def _factory(
     base_body: str,
     casters: tuple[str, ...],
     change: Callable[[mujoco.MjSpec], None],
-    camera: Camera | None,
+    camera: RobotCamera | None,
     body_width_m: float | None,
 ) -> Callable[[str], RobotSpec]:
     """Control mode -> spec, with the figures that its outline gives; `change` warns here, and then no more."""
@@ -150,12 +150,17 @@ def _factory(
         rolling=(*(w.body for w in facts.wheels), *casters),
         spawn_height_m=-facts.bottom_m,
     )
-    figures = {"body_width_m": 0.0, "footprint_radius_m": 0.0, "height_m": 0.0, "camera": Camera(base_body, (0, 0, 0))}
+    figures = {
+        "body_width_m": 0.0,
+        "footprint_radius_m": 0.0,
+        "height_m": 0.0,
+        "camera": RobotCamera(base_body, (0, 0, 0)),
+    }
     low, high, reach, mass = _outline(build("native", **figures))  # type: ignore[arg-type]
     size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
     build = functools.partial(
         build,
-        camera=camera or Camera(base_body, (0.0, 0.0, float(high[2]) + facts.bottom_m + 0.02)),
+        camera=camera or RobotCamera(base_body, (0.0, 0.0, float(high[2]) + facts.bottom_m + 0.02)),
         body_width_m=body_width_m or size[1],
         footprint_radius_m=reach,
         height_m=size[2],
@@ -180,7 +185,7 @@ def from_file(
     joints: Mapping[str, float] | None = None,
     home: Mapping[str, float] | None = None,
     torque_limits: Mapping[str, float] | None = None,
-    camera: Camera | None = None,
+    camera: RobotCamera | None = None,
     body_width_m: float | None = None,
     track_m: float | None = None,
     max_linear_m_s: float | None = None,

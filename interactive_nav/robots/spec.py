@@ -28,7 +28,7 @@ ControlLaw = Callable[[Any, RobotState, Any], Any]
 
 
 @dataclasses.dataclass(frozen=True)
-class Camera:
+class RobotCamera:
     """The camera that images are rendered from; it looks along the body's x axis, world z kept up."""
 
     body: str
@@ -105,7 +105,7 @@ class RobotSpec:
     """Top of the body above the floor."""
     spawn_height_m: float
     """Height of the base frame above the floor when the robot stands."""
-    camera: Camera
+    camera: RobotCamera
     action_names: tuple[str, ...] = ()
     """What each action commands, with its unit; by default the actuators."""
     home_qpos: tuple[tuple[str, float], ...] = ()

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.spec import Camera
+from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.sensing.base import CameraPose, look_along
 from interactive_nav.sensing.boxes import compose, rotate, swing
 from interactive_nav_common.config import nearest
@@ -64,7 +64,7 @@ class Mount:
         return look_along(where, rotate(axes, constant(self.forward_b)))
 
 
-def make_mount(model: mujoco.MjModel, base_body: str, camera: Camera) -> Mount:
+def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera) -> Mount:
     """Finds the chain of bodies from a robot's base to its camera.
 
     Args:

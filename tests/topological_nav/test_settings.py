@@ -4,11 +4,11 @@ import pytest
 
 from interactive_nav_common.config import overlay, overridden, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
-from topological_nav.config import DataConfig, TrainConfig, passage_config, room_config
+from topological_nav.config import DataConfig, NetworkTrainConfig, passage_config, room_config
 
 
 def test_words_are_read_by_the_types_of_the_settings():
-    config = overridden(TrainConfig(), ["learning_rate=1e-4", "epochs=3", "augment=false", "init=7"])
+    config = overridden(NetworkTrainConfig(), ["learning_rate=1e-4", "epochs=3", "augment=false", "init=7"])
     assert (config.learning_rate, config.epochs, config.augment, config.init) == (1e-4, 3, False, "7")
     data = overridden(DataConfig(), ["fov_deg=60", "num_rooms=auto"])
     assert (data.fov_deg, data.num_rooms) == (60.0, None)
@@ -28,7 +28,7 @@ def test_words_are_read_by_the_types_of_the_settings():
 )
 def test_wrong_words_are_refused(word, told):
     with pytest.raises(ConfigError, match=told.replace("?", r"\?")):
-        overridden(TrainConfig(), [word])
+        overridden(NetworkTrainConfig(), [word])
 
 
 def test_headings_must_leave_every_third_for_testing():
@@ -53,6 +53,6 @@ def test_defaults_are_the_reports():
 
 
 def test_help_names_every_setting_with_its_meaning():
-    text = settings_help(TrainConfig())
+    text = settings_help(NetworkTrainConfig())
     assert "network=resnet18" in text and "[resnet18 | alexnet]" in text
-    assert len(text.splitlines()) == len(to_dict(TrainConfig()))
+    assert len(text.splitlines()) == len(to_dict(NetworkTrainConfig()))

@@ -169,7 +169,7 @@ def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
 def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monkeypatch):
     """Ctrl-C in the second policy: the first one's rows are there; whole rows of before are not given up for them."""
     out, words = tmp_path / "rows.parquet", [str(run.path), "--episodes", "3", "--policies", "random,follower"]
-    played = rollout.Player.play
+    played = rollout.BatchPlayer.play
     count = []
 
     def stopped(self, *arguments):
@@ -179,14 +179,14 @@ def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monk
         return played(self, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(rollout.Player, "play", stopped)
+        patch.setattr(rollout.BatchPlayer, "play", stopped)
         with pytest.raises(KeyboardInterrupt):
             evaluate.main([*words, "--out", str(out)], build_env=build_toy)
     assert pq.read_table(out)["policy"].to_pylist() == ["random"] * 3
     assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 0
     whole = out.read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(rollout.Player, "play", stopped)
+        patch.setattr(rollout.BatchPlayer, "play", stopped)
         with pytest.raises(KeyboardInterrupt):
             evaluate.main([*words, "--out", str(out)], build_env=build_toy)
     assert out.read_bytes() == whole and pq.read_table(out).num_rows == 6

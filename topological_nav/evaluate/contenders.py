@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from topological_nav.config import EvaluationConfig, NavigatorConfig
-from topological_nav.evaluate.episodes import Episodes
+from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import Events, State
 from topological_nav.scenes.simulation import Camera, Seen, Simulator
@@ -23,7 +23,7 @@ EXPERT_WEIGHT = 1.0
 class Contender(Protocol):
     """Plays a batch; everything it remembers can be thinned out."""
 
-    def begin(self, episodes: Episodes) -> None:
+    def begin(self, episodes: DrivenEpisodes) -> None:
         """Fresh episodes."""
         ...
 
@@ -58,7 +58,7 @@ class NavigatorPlayer:
         self._watch = watch
         self.state: State | None = None
 
-    def begin(self, episodes: Episodes) -> None:
+    def begin(self, episodes: DrivenEpisodes) -> None:
         """Takes the goals' images, along as many headings as a localisation's."""
         count = self._navigator.config.images
         around = 2 * np.pi * np.arange(count) / count
@@ -103,7 +103,7 @@ class ActionPlayer:
         """
         self._simulator, self._make_act, self._config = simulator, make_act, config
 
-    def begin(self, episodes: Episodes) -> None:
+    def begin(self, episodes: DrivenEpisodes) -> None:
         """See `Contender`."""
         self._episode, self._act = episodes.number, self._make_act()
 

@@ -23,7 +23,7 @@ from topological_nav.drives import driving
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.errors import RunError
 from topological_nav.evaluate.contenders import Contender, NavigatorPlayer, expert, learned
-from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
+from topological_nav.evaluate.episodes import DrivenEpisodes, count_of, draw_episodes
 from topological_nav.learn.pairs import Networks, load_networks
 from topological_nav.maps.build import drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
@@ -99,7 +99,7 @@ class ContestScene:
         return scene_rooms(self.scene, self.space, DataConfig())
 
     @functools.cached_property
-    def episodes(self) -> Episodes:
+    def episodes(self) -> DrivenEpisodes:
         """All episodes of the scene."""
         config = self.contest.config
         return draw_episodes(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)

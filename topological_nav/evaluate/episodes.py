@@ -22,7 +22,7 @@ LEAST, MOST, PER_M2 = 25, 60, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Episodes:
+class DrivenEpisodes:
     """Fixed episodes of one scene."""
 
     number: np.ndarray
@@ -39,9 +39,9 @@ class Episodes:
     shortest_m: np.ndarray
     """[n] length of the shortest way round walls and furniture, for half of the robot's width."""
 
-    def take(self, rows: Any) -> Episodes:
+    def take(self, rows: Any) -> DrivenEpisodes:
         """Some of them."""
-        return Episodes(**{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
+        return DrivenEpisodes(**{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
 
     def __len__(self) -> int:
         return len(self.yaw_rad)
@@ -52,7 +52,7 @@ def count_of(scene: Scene, config: EvaluationConfig) -> int:
     return config.episodes or int(np.clip(round(PER_M2 * scene.manifest.floor_area_m2), LEAST, MOST))
 
 
-def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, config: EvaluationConfig) -> Episodes:
+def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, config: EvaluationConfig) -> DrivenEpisodes:
     """Draws episodes: number i depends on seed and scene alone, however many there are.
 
     Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
@@ -84,7 +84,7 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
             yaws.append(yaw)
     a, b = np.array(pairs).T
     shortest = _shortest_m(space, places[a], places[b])
-    return Episodes(np.arange(count), places[a], np.array(yaws), places[b], room[a], room[b], shortest)
+    return DrivenEpisodes(np.arange(count), places[a], np.array(yaws), places[b], room[a], room[b], shortest)
 
 
 def _shortest_m(space: FreeSpace, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:

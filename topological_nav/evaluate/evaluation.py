@@ -1,4 +1,4 @@
-"""Episodes of a scene and a contender in, one row an episode out: success, SPL, contacts, duration.
+"""DrivenEpisodes of a scene and a contender in, one row an episode out: success, SPL, contacts, duration.
 
 Contenders: the navigator on a map, dense or thinned, with trained networks or with the truth in their place; an expert
 that has the map and knows where everything stands; a learned policy that is told the goal's position. All play the
@@ -17,7 +17,7 @@ import numpy as np
 from interactive_nav.metrics import path_efficiency
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contenders import Contender
-from topological_nav.evaluate.episodes import Episodes
+from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.navigate.state import Events
 from topological_nav.scenes.simulation import Seen, Simulator
 
@@ -66,7 +66,7 @@ Tell = Callable[[int, float], None]
 def play(
     contender: Contender,
     simulator: Simulator,
-    episodes: Episodes,
+    episodes: DrivenEpisodes,
     config: EvaluationConfig,
     tell: Tell = lambda *_: None,
 ) -> Played:
@@ -94,7 +94,7 @@ def play(
 class _Tally:
     """What has come of the episodes so far; those over may be left out of the batch."""
 
-    def __init__(self, episodes: Episodes, config: EvaluationConfig, dt_s: float):
+    def __init__(self, episodes: DrivenEpisodes, config: EvaluationConfig, dt_s: float):
         n = len(episodes)
         self._episodes, self._config, self._dt_s = episodes, config, dt_s
         self._whole = {name: np.zeros(n, bool) for name in ("success", "arrived", "broken")}
@@ -159,7 +159,7 @@ class _Tally:
         return Played(**self._whole, **self._numbers, **self._counts, track_w=tracks)
 
 
-def columns(episodes: Episodes, played: Played, config: EvaluationConfig) -> dict[str, np.ndarray]:
+def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) -> dict[str, np.ndarray]:
     """A row's numbers, an array each; SPL, RC and AADC are means of them (see `scores`)."""
     contact = played.contact_s > 0
     return {

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 from interactive_nav_common.errors import ConfigError
 from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.evaluate.episodes import Episodes
+from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, play
 from topological_nav.figures.episode_figures import map_lines, plan_picture, plt, write_video
 from topological_nav.figures.maps import floor_plan
@@ -37,7 +37,7 @@ class Driven:
 
     venue: ContestScene
     map: TopologicalMap
-    journey: Episodes
+    journey: DrivenEpisodes
     """The one alone."""
     played: Played
     goal_node: int

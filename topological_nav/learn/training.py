@@ -24,7 +24,7 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav_common.config import to_dict
-from topological_nav.config import PITCHES, TrainConfig
+from topological_nav.config import PITCHES, NetworkTrainConfig
 from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
 from topological_nav.errors import Asked, RunError, go_on, readable
@@ -134,7 +134,7 @@ def train(
     task: str,
     dataset: Path,
     out: Path,
-    config: TrainConfig,
+    config: NetworkTrainConfig,
     tell: Callable[[str], None] = lambda _: None,
     should_stop: Asked = go_on,
 ) -> dict[str, Any]:
@@ -178,7 +178,7 @@ def train(
         return write_results(out, _scores(trained, work))
 
 
-def _key(config: TrainConfig, phase: int) -> jax.Array:
+def _key(config: NetworkTrainConfig, phase: int) -> jax.Array:
     return jax.random.fold_in(jax.random.PRNGKey(config.seed), phase)
 
 
@@ -186,7 +186,7 @@ def _learned_without_labels(
     learner: Learner,
     places: np.ndarray,
     out: Path,
-    config: TrainConfig,
+    config: NetworkTrainConfig,
     tell: Callable[[str], None],
     should_stop: Asked,
 ) -> Learner:
@@ -204,7 +204,7 @@ def _learned_without_labels(
     return with_backbone(learner, {"params": paired.params, "batch_stats": paired.batch_stats})
 
 
-def _about(header: dict[str, Any], work: _Work, config: TrainConfig, learner: Learner) -> dict[str, Any]:
+def _about(header: dict[str, Any], work: _Work, config: NetworkTrainConfig, learner: Learner) -> dict[str, Any]:
     """Content of network.json, but for the digest."""
     return {
         "task": work.task,
@@ -245,7 +245,7 @@ def load_trained(run: Path) -> Trained:
     return Trained(network, read_weights(run, template, about), about)
 
 
-def _work(task: str, dataset: Path, config: TrainConfig) -> _Work:
+def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
     rooms = load_rooms(dataset)
     size = rooms.images.shape[3:]
     around = rooms.images.shape[2]

@@ -167,11 +167,11 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
     config = overridden(SimulatorConfig(), arguments.settings)
     ros = debian.load()
     from topological_nav.ros.nodes import Pace, SimulatorNode
-    from topological_nav.ros.simulator import Simulator
+    from topological_nav.ros.simulator import RosSimulator
 
     with launch.some_master(ros, arguments.port), _ended(ros):
         with contextlib.redirect_stdout(sys.stderr):  # Warp tells of its kernels there
-            simulator = Simulator(arguments.scene, config)
+            simulator = RosSimulator(arguments.scene, config)
             pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.recorded)
             tally = SimulatorNode(ros, simulator, pace, _tell).run(lambda: bool(stops))
         print(json.dumps(tally.row()), flush=True)

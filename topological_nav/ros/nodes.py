@@ -17,7 +17,7 @@ from topological_nav.ros.debian import RosError
 from topological_nav.ros.drivers import Command, Driver, checked
 
 if TYPE_CHECKING:
-    from topological_nav.ros.simulator import Sensed, Simulator
+    from topological_nav.ros.simulator import RosSimulator, Sensed
 
 COMMAND_HOLDS_S = 0.5
 """A velocity command is driven for this long; then the robot stops, as mobile bases do."""
@@ -71,7 +71,7 @@ class Tally:
 class SimulatorNode:
     """Publishes what the sensors tell, drives as it is told."""
 
-    def __init__(self, ros: Any, simulator: Simulator, pace: Pace, tell: Callable[[str], None] = lambda _: None):
+    def __init__(self, ros: Any, simulator: RosSimulator, pace: Pace, tell: Callable[[str], None] = lambda _: None):
         """Announces its topics.
 
         Args:

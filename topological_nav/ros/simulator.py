@@ -55,7 +55,7 @@ class Sensed:
     """(3,) x, y (m), yaw (rad), world: no sensor tells it."""
 
 
-class Simulator:
+class RosSimulator:
     """One robot in one scene."""
 
     range_min_m, lidar_pos_m = LIDAR_NEAR_M, LIDAR_POS_M

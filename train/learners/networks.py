@@ -254,7 +254,7 @@ def make_split(
 
 
 @dataclasses.dataclass(frozen=True)
-class ActorCritic:
+class PpoNetworks:
     """A policy and a value network, and their parts where there are any."""
 
     networks: ppo_networks.PPONetworks
@@ -270,7 +270,7 @@ def make_ppo_networks(
     policy_sizes: Sequence[int],
     value_sizes: Sequence[int],
     normalize_observations: bool,
-) -> ActorCritic:
+) -> PpoNetworks:
     """Policy (mean and deviation of a Gaussian before tanh) and value network.
 
     Args:
@@ -293,7 +293,7 @@ def make_ppo_networks(
             policy_hidden_layer_sizes=policy_sizes,
             value_hidden_layer_sizes=value_sizes,
         )
-        return ActorCritic(plain)
+        return PpoNetworks(plain)
     actions = distribution.NormalTanhDistribution(event_size=action_size)
     policy = make_split(config, size, True, prepare, Head(policy_sizes, actions.param_size))
     critic_sees = config.critic_inputs == "all"
@@ -301,4 +301,4 @@ def make_ppo_networks(
         config, size, critic_sees, prepare, Head(value_sizes, 1, output_init=critic_output_init), squeeze=True
     )
     networks = ppo_networks.PPONetworks(policy.whole(), value.whole(), actions)  # type: ignore[call-arg]
-    return ActorCritic(networks, policy, value)
+    return PpoNetworks(networks, policy, value)

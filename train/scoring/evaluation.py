@@ -28,7 +28,7 @@ from train.runs.run_folder import RunFolder
 from train.scoring.brought import BroughtPolicy
 from train.scoring.planners import HostPolicy
 from train.scoring.policies import PolicyFn, make_yardstick
-from train.scoring.rollout import Episodes, Player, episode_keys
+from train.scoring.rollout import BatchPlayer, PlayedEpisodes, episode_keys
 from train.scoring.row_files import EvaluationAsked
 from train.scoring.rows import episode_table
 
@@ -41,7 +41,7 @@ OF_LEARNED = (
 )
 """Columns that are empty for a policy that never learned."""
 AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
-"""Episodes played at a time, per physics backend."""
+"""PlayedEpisodes played at a time, per physics backend."""
 
 
 def add_playing_words(made: argparse.ArgumentParser) -> None:
@@ -117,13 +117,13 @@ def make_policies(
 def evaluate(
     folder: RunFolder | None,
     config: TrainConfig,
-    player: Player,
+    player: BatchPlayer,
     asked: EvaluationAsked,
     record: int,
     console: Console,
     fixed: EpisodeFile | None = None,
     batch: int | None = None,
-) -> Iterator[tuple[pa.Table, dict[str, Episodes]]]:
+) -> Iterator[tuple[pa.Table, dict[str, PlayedEpisodes]]]:
     """Plays the same fixed episodes with each policy: drawn from a seed, or those of a file.
 
     Args:
@@ -192,7 +192,7 @@ def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: Eval
     }
 
 
-def write_paths(path: Path, played: dict[str, Episodes], env: Any) -> None:
+def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None:
     """Writes the recorded paths with the scenes' maps, so that a figure needs no scene folder."""
     arrays: dict[str, Any] = {"policies": np.array(list(played))}
     for policy, episodes in played.items():

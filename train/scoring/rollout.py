@@ -43,7 +43,7 @@ class Paths:
 
 
 @dataclasses.dataclass(frozen=True)
-class Episodes:
+class PlayedEpisodes:
     """N finished episodes."""
 
     scene_index: np.ndarray
@@ -67,12 +67,12 @@ def run_episodes(
     record: int = 0,
     on_progress: Callable[[int, int], None] = lambda finished, step: None,
     starts: Any = None,
-) -> Episodes:
-    """Plays every episode to its end, all in one batch; see `Player.play`."""
-    return Player(env).play(policy, keys, record, on_progress, starts)
+) -> PlayedEpisodes:
+    """Plays every episode to its end, all in one batch; see `BatchPlayer.play`."""
+    return BatchPlayer(env).play(policy, keys, record, on_progress, starts)
 
 
-class Player:
+class BatchPlayer:
     """Plays episodes of one environment.
 
     What is compiled is kept: policies that are `jax.tree_util.Partial`s of one function share it, whatever their
@@ -101,7 +101,7 @@ class Player:
         scene_index: np.ndarray | None = None,
         batch: int | None = None,
         on_note: Callable[[str], None] = lambda note: None,
-    ) -> Episodes:
+    ) -> PlayedEpisodes:
         """Plays every episode to its end.
 
         Args:
@@ -120,7 +120,7 @@ class Player:
         """
         count = len(keys)
         size = min(batch or count, count)
-        parts: list[Episodes] = []
+        parts: list[PlayedEpisodes] = []
         done = 0
         while done < count:
             chosen = np.minimum(np.arange(done, done + size), count - 1)  # the last batch is as large as the others
@@ -157,7 +157,7 @@ class Player:
         starts: Any,
         scene_index: np.ndarray | None,
         first_episode: int,
-    ) -> Episodes:
+    ) -> PlayedEpisodes:
         """Plays the first `count` of the keys' episodes; the rest fill the batch and are over from the start."""
         size, record = len(keys), min(record, count)
         state = self._begin(keys, starts, scene_index)
@@ -199,7 +199,7 @@ class Player:
                 episode_of = episode_of[running]
         paths = _paths(first, ends.pop("object_pos_w"), tracks, record)
         metrics, ends = ({name: x[:count] for name, x in values.items()} for values in (metrics, ends))
-        return Episodes(first.scene_index[:count], metrics, ends, paths)
+        return PlayedEpisodes(first.scene_index[:count], metrics, ends, paths)
 
     def _begin(self, keys: jax.Array, starts: Any, scene_index: np.ndarray | None) -> Any:
         """The first states of a batch; see `play`."""
@@ -223,7 +223,7 @@ def _paths(first: Any, object_end: np.ndarray, tracks: list[np.ndarray], record:
     )
 
 
-def _joined(parts: list[Episodes]) -> Episodes:
+def _joined(parts: list[PlayedEpisodes]) -> PlayedEpisodes:
     """Batches one after the other; recorded paths as long as the longest."""
     if len(parts) == 1:
         return parts[0]
@@ -236,7 +236,7 @@ def _joined(parts: list[Episodes]) -> Episodes:
             arrays = [np.pad(a, pad, constant_values=np.nan) for a, pad in zip(arrays, pads, strict=True)]
         return np.concatenate(arrays)
 
-    return Episodes(
+    return PlayedEpisodes(
         np.concatenate([part.scene_index for part in parts]),
         {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
         {name: np.concatenate([part.of_objects[name] for part in parts]) for name in OF_OBJECTS},

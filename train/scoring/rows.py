@@ -1,4 +1,4 @@
-"""Episodes in, one row each in Parquet files out, those files read back, and means with their intervals."""
+"""PlayedEpisodes in, one row each in Parquet files out, those files read back, and means with their intervals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.statistics import RESAMPLES, mean_text
 
 if TYPE_CHECKING:
-    from train.scoring.rollout import Episodes
+    from train.scoring.rollout import PlayedEpisodes
 
 SCORES = {
     "success": "success",
@@ -51,7 +51,7 @@ steps."""
 
 
 def episode_table(
-    episodes: Episodes, scenes: Any, categories: Sequence[Sequence[str]], constants: dict[str, Any]
+    episodes: PlayedEpisodes, scenes: Any, categories: Sequence[Sequence[str]], constants: dict[str, Any]
 ) -> pa.Table:
     """One row an episode.
 
@@ -73,7 +73,7 @@ def episode_table(
     return pa.table({**columns, "by_category": pa.array(told, BY_CATEGORY)})
 
 
-def _by_category(episodes: Episodes, episode: int, categories: Sequence[str]) -> list[dict[str, Any]]:
+def _by_category(episodes: PlayedEpisodes, episode: int, categories: Sequence[str]) -> list[dict[str, Any]]:
     """One episode's entries of `by_category`, in alphabetical order."""
     path_m, steps, force_n = (episodes.of_objects[name][episode] for name in OF_OBJECTS)
     rows = []

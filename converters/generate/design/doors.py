@@ -7,7 +7,7 @@ import math
 import numpy as np
 import shapely
 
-from converters.generate.design.instance import Hinge, Instance
+from converters.generate.design.instance import Instance, LeafHinge
 from converters.generate.design.plan import Doorway, Plan
 from converters.generate.models.cad import CadModel
 
@@ -77,7 +77,7 @@ def door_leaf(
     at_origin = Instance(model, scale, yaw, np.zeros(3))
     offset = at_origin.to_floor(np.array([origin]))[0]
     position = np.array([hinge[0] - offset[0], hinge[1] - offset[1], lift_m - scale[1] * model.bounds[0, 1]])
-    leaf = Instance(model, scale, yaw, position, Hinge((0.0, 1.0, 0.0), origin, swing))
+    leaf = Instance(model, scale, yaw, position, LeafHinge((0.0, 1.0, 0.0), origin, swing))
     return leaf, _swept_floor(hinge, math.atan2(closed[1], closed[0]) + sign * np.linspace(0.0, most, 24), width)
 
 

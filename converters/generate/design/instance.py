@@ -15,7 +15,7 @@ from converters.generate.models.cad import CadModel
 
 
 @dataclasses.dataclass(frozen=True)
-class Hinge:
+class LeafHinge:
     """How a door leaf turns; CAD frame, angle 0 is the pose as placed."""
 
     axis: tuple[float, float, float]
@@ -34,7 +34,7 @@ class Instance:
     """About the vertical; at 0 the CAD's +z shows along -y of the scan frame."""
     position: np.ndarray
     """(3,) of the CAD origin; z above the floor."""
-    hinge: Hinge | None = None
+    hinge: LeafHinge | None = None
 
     @property
     def matrix(self) -> np.ndarray:

@@ -23,7 +23,7 @@ DOORWAY_MARGIN_M = 0.12
 
 
 @dataclasses.dataclass(frozen=True)
-class Box:
+class PlanBox:
     """An axis-aligned box."""
 
     low: tuple[float, float, float]
@@ -86,12 +86,12 @@ class Plan:
     """Clear inside of each room."""
     outer: Rect
     """Outline of the building, outer walls included."""
-    walls: tuple[Box, ...]
+    walls: tuple[PlanBox, ...]
     """Wall pieces, doorways cut out; those above a doorway start at its height."""
     doorways: tuple[Doorway, ...]
-    windows: tuple[Box, ...]
+    windows: tuple[PlanBox, ...]
     """Glass: as deep as the outer wall."""
-    fixtures: tuple[Box, ...]
+    fixtures: tuple[PlanBox, ...]
     """Built-in cupboards and counters: unmovable."""
     corridor: int | None
     """Index of the corridor in `rooms`."""
@@ -237,7 +237,7 @@ def _doorways(
     return chosen
 
 
-def _wall_boxes(wall: Rect, axis: int, doorways: list[Doorway], height: float) -> list[Box]:
+def _wall_boxes(wall: Rect, axis: int, doorways: list[Doorway], height: float) -> list[PlanBox]:
     """The pieces of one wall around its doorways, and the pieces above them."""
     along = 1 - axis
     holes = []
@@ -247,10 +247,10 @@ def _wall_boxes(wall: Rect, axis: int, doorways: list[Doorway], height: float) -
             holes.append(d)
     holes.sort(key=lambda d: (d.rect.x0, d.rect.y0)[along])
 
-    def piece(start: float, end: float, base: float) -> Box:
+    def piece(start: float, end: float, base: float) -> PlanBox:
         if axis == 0:
-            return Box((wall.x0, start, base), (wall.x1, end, height))
-        return Box((start, wall.y0, base), (end, wall.y1, height))
+            return PlanBox((wall.x0, start, base), (wall.x1, end, height))
+        return PlanBox((start, wall.y0, base), (end, wall.y1, height))
 
     boxes, at = [], (wall.x0, wall.y0)[along]
     for d in holes:
@@ -281,10 +281,12 @@ def doorway_zone(doorway: Doorway, reach_m: float, side_m: float = 0.05) -> Rect
     return Rect(r.x0 - grow[0], r.y0 - grow[1], r.x1 + grow[0], r.y1 + grow[1])
 
 
-def _fixtures(rooms: list[Rect], doorways: list[Doorway], cfg: BuildingConfig, rng: np.random.Generator) -> list[Box]:
+def _fixtures(
+    rooms: list[Rect], doorways: list[Doorway], cfg: BuildingConfig, rng: np.random.Generator
+) -> list[PlanBox]:
     """Cupboards and counters in corners of rooms, away from doorways."""
     wanted = int(rng.integers(cfg.n_static[0], cfg.n_static[1] + 1))
-    boxes: list[Box] = []
+    boxes: list[PlanBox] = []
     zones = [doorway_zone(d, 1.05, 0.15) for d in doorways]
     order = rng.permutation(len(rooms))
     for room in [rooms[i] for i in order] * 3:
@@ -301,18 +303,18 @@ def _fixtures(rooms: list[Rect], doorways: list[Doorway], cfg: BuildingConfig, r
         rect = Rect(lo, at, hi, at + length) if axis == 0 else Rect(at, lo, at + length, hi)
         if any(_overlap(rect, z) for z in zones) or any(_overlap(rect, b.rect) for b in boxes):
             continue
-        boxes.append(Box((rect.x0, rect.y0, 0.0), (rect.x1, rect.y1, height)))
+        boxes.append(PlanBox((rect.x0, rect.y0, 0.0), (rect.x1, rect.y1, height)))
     return boxes
 
 
 def _windows(
     inside: Rect,
     rooms: list[Rect],
-    fixtures: list[Box],
+    fixtures: list[PlanBox],
     thick: float,
     cfg: BuildingConfig,
     rng: np.random.Generator,
-) -> list[Box]:
+) -> list[PlanBox]:
     """Windows in outer walls, each before one room, none behind a cupboard."""
     wanted = int(rng.integers(cfg.n_windows[0], cfg.n_windows[1] + 1))
     outer_faces = {(0, 1): inside.x0, (0, -1): inside.x1, (1, 1): inside.y0, (1, -1): inside.y1}
@@ -320,7 +322,7 @@ def _windows(
         s for room in rooms for s in _sides(room)
         if abs(s[2] - outer_faces[s[0], s[1]]) < CM / 2 and s[4] - s[3] > 1.6
     ]  # fmt: skip
-    boxes: list[Box] = []
+    boxes: list[PlanBox] = []
     for k in rng.permutation(len(sides)):
         if len(boxes) == wanted:
             break
@@ -331,7 +333,7 @@ def _windows(
         rect = Rect(lo, at, hi, at + width) if axis == 0 else Rect(at, lo, at + width, hi)
         near = Rect(rect.x0 - 0.3, rect.y0 - 0.3, rect.x1 + 0.3, rect.y1 + 0.3)
         if not any(_overlap(near, f.rect) for f in fixtures):
-            boxes.append(Box((rect.x0, rect.y0, 0.9), (rect.x1, rect.y1, 2.05)))
+            boxes.append(PlanBox((rect.x0, rect.y0, 0.9), (rect.x1, rect.y1, 2.05)))
     return boxes
 
 
@@ -365,10 +367,10 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
         outer = Rect(*(snap(v) for v in (inside.x0 - thick, inside.y0 - thick, inside.x1 + thick, inside.y1 + thick)))
         boxes = [b for w in walls for b in _wall_boxes(w.rect, w.axis, doorways, height)]
         boxes += [
-            Box((outer.x0, outer.y0, 0.0), (inside.x0, outer.y1, height)),
-            Box((inside.x1, outer.y0, 0.0), (outer.x1, outer.y1, height)),
-            Box((inside.x0, outer.y0, 0.0), (inside.x1, inside.y0, height)),
-            Box((inside.x0, inside.y1, 0.0), (inside.x1, outer.y1, height)),
+            PlanBox((outer.x0, outer.y0, 0.0), (inside.x0, outer.y1, height)),
+            PlanBox((inside.x1, outer.y0, 0.0), (outer.x1, outer.y1, height)),
+            PlanBox((inside.x0, outer.y0, 0.0), (inside.x1, inside.y0, height)),
+            PlanBox((inside.x0, inside.y1, 0.0), (inside.x1, outer.y1, height)),
         ]
         fixtures = _fixtures(rooms, doorways, cfg, rng)
         windows = _windows(inside, plain, fixtures, thick, cfg, rng)

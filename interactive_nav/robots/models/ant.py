@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from interactive_nav.robots.gait import Legged, Servo, legged_robot
-from interactive_nav.robots.spec import Camera, RobotSpec
+from interactive_nav.robots.spec import RobotCamera, RobotSpec
 
 SCALE = 0.25
 TORQUE_NM = 250.0 * SCALE**4
@@ -133,7 +133,7 @@ def ant(control_mode: str = "native") -> RobotSpec:
         footprint_radius_m=0.25,
         height_m=0.21,
         spawn_height_m=(0.4 * math.sqrt(2.0) * math.sin(HOME_ANKLE_RAD) + 0.08) * SCALE,
-        camera=Camera("ant_torso", (0.0, 0.0, 0.0)),
+        camera=RobotCamera("ant_torso", (0.0, 0.0, 0.0)),
         mass_kg=182.2 * SCALE**3,
         size_m=(1.39 * SCALE, 1.39 * SCALE, 0.81 * SCALE),
         drive_type="4 legs, 8 hinges",

@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 from interactive_nav.robots.gait import Legged, Servo, legged_robot
-from interactive_nav.robots.spec import Camera, RobotSpec
+from interactive_nav.robots.spec import RobotCamera, RobotSpec
 
 _THIGH_RAD, _SHIN_RAD = 0.2, 0.24
 """Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
@@ -266,7 +266,7 @@ def humanoid(control_mode: str = "native") -> RobotSpec:
         footprint_radius_m=0.35,
         height_m=1.57,
         spawn_height_m=_spawn_height_m(),
-        camera=Camera("humanoid_torso", (0.0, 0.0, 0.19)),
+        camera=RobotCamera("humanoid_torso", (0.0, 0.0, 0.19)),
         mass_kg=42.116,
         size_m=(0.28, 0.58, 1.56),
         drive_type="2 legs, 17 hinges",

@@ -16,7 +16,7 @@ import math
 from typing import Any
 
 from interactive_nav.robots.gait import Legged, Servo, legged_robot
-from interactive_nav.robots.spec import Camera, RobotSpec
+from interactive_nav.robots.spec import RobotCamera, RobotSpec
 
 UPPER_M, LOWER_M = 0.115, 0.2
 HIP_X_M, FOOT_Y_M = 0.21, 0.107
@@ -182,7 +182,7 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
         footprint_radius_m=0.36,
         height_m=0.23,
         spawn_height_m=_DROP_M + TOE_RADIUS_M,
-        camera=Camera("minitaur_chassis", (0.3, 0.0, 0.05)),
+        camera=RobotCamera("minitaur_chassis", (0.3, 0.0, 0.05)),
         home_qpos=tuple((joint.replace("motor", part), value) for joint in JOINTS for part, value in parts),
         mass_kg=6.0,
         size_m=(0.65, 0.28, 0.21),

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.metrics import GRAVITY
-from interactive_nav.robots.spec import Camera, ControlLaw, RobotSpec, TwistMap, check_mode, set_servo
+from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.rotations import rotate_back, yaw_from_quat
 
 MASS_KG = 0.5
@@ -221,7 +221,7 @@ def quadrotor(control_mode: str = "native") -> RobotSpec:
         footprint_radius_m=0.32,
         height_m=HOVER_HEIGHT_M + 0.1,
         spawn_height_m=HOVER_HEIGHT_M,
-        camera=Camera("quadrotor", (0.0, 0.05, -0.05)),
+        camera=RobotCamera("quadrotor", (0.0, 0.05, -0.05)),
         kind="flying",
         mass_kg=MASS_KG,
         size_m=(0.592, 0.592, 0.09),

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from interactive_nav.robots.build import Joint, WheeledBase, wheeled_robot
-from interactive_nav.robots.spec import Camera, RobotSpec
+from interactive_nav.robots.spec import RobotCamera, RobotSpec
 
 
 def _wheels(max_speed_rad_s: float, *rows: str) -> tuple[Joint, ...]:
@@ -74,7 +74,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.5,
             "footprint_radius_m": 0.31,
             "height_m": 1.12,
-            "camera": Camera("head_tilt", (0.0593, 0.0, 0.0076), pitch_rad=0.2618),
+            "camera": RobotCamera("head_tilt", (0.0593, 0.0, 0.0076), pitch_rad=0.2618),
             "mass_kg": 121.28,
             "size_m": (0.573, 0.528, 1.093),
             "drive_type": "differential, 4 casters; torso, head, 7-joint arm, gripper",
@@ -98,7 +98,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.528,
             "footprint_radius_m": 0.31,
             "height_m": 0.359,
-            "camera": Camera("base", (0.2645, 0.0, 0.198), pitch_rad=-0.1745),
+            "camera": RobotCamera("base", (0.2645, 0.0, 0.198), pitch_rad=-0.1745),
             "mass_kg": 78.85,
             "size_m": (0.573, 0.528, 0.359),
             "drive_type": "differential, 4 casters",
@@ -124,7 +124,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.67,
             "footprint_radius_m": 0.56,
             "height_m": 0.39,
-            "camera": Camera("base", (0.4, 0.0, 0.294)),
+            "camera": RobotCamera("base", (0.4, 0.0, 0.294)),
             "mass_kg": 41.0,
             "size_m": (0.99, 0.67, 0.39),
             "drive_type": "skid steer, 4 wheels",
@@ -148,7 +148,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.64,
             "footprint_radius_m": 0.48,
             "height_m": 0.993,
-            "camera": Camera("base", (-0.2378, 0.0, 0.97)),
+            "camera": RobotCamera("base", (-0.2378, 0.0, 0.97)),
             "mass_kg": 144.53,
             "size_m": (0.73, 0.64, 0.99),
             "drive_type": "differential, 1 rear caster",
@@ -174,7 +174,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.5,
             "footprint_radius_m": 0.53,
             "height_m": 1.293,
-            "camera": Camera("base", (0.224, 0.0, 1.024)),
+            "camera": RobotCamera("base", (0.224, 0.0, 1.024)),
             "mass_kg": 148.18,
             "size_m": (0.98, 0.634, 1.29),
             "drive_type": "differential, 2 casters; 5-joint arm",
@@ -198,7 +198,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.45,
             "footprint_radius_m": 0.33,
             "height_m": 1.1,
-            "camera": Camera("base", (0.1, 0.0, 1.02)),
+            "camera": RobotCamera("base", (0.1, 0.0, 1.02)),
             "mass_kg": 30.0,
             "size_m": (0.5, 0.45, 1.1),
             "drive_type": "skid steer, 4 wheels",
@@ -224,7 +224,7 @@ _TABLE: tuple[tuple[WheeledBase, dict[str, Any]], ...] = (
             "body_width_m": 0.333,
             "footprint_radius_m": 0.18,
             "height_m": 0.41,
-            "camera": Camera("base", (-0.087, -0.0125, 0.272)),
+            "camera": RobotCamera("base", (-0.087, -0.0125, 0.272)),
             "mass_kg": 2.673,
             "size_m": (0.352, 0.352, 0.41),
             "drive_type": "differential, 2 casters",

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from converters.geometry.boxes import Box, Hull
+from converters.geometry.boxes import Hull, OrientedBox
 from converters.records import cache
 from converters.records.cache import KEEP_S, LIMIT_BYTES, PACKAGES, StageCache, fingerprint, prune
 from converters.records.raw import RawScene, ScanMesh
@@ -21,7 +21,7 @@ def stage(points: np.ndarray, scale: float, extra=None):
     CALLS.append((points, scale))
     hull = Hull(points * scale, np.array([[0, 1, 2]]))
     values = [1, 2.5, np.float64(0.1) + 0.2, None, "text", True]
-    return hull, values, (Box(points[0], np.eye(3), points[1]),), float("nan")
+    return hull, values, (OrientedBox(points[0], np.eye(3), points[1]),), float("nan")
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def test_the_second_call_is_read_and_is_the_same(tmp_path):
     first = StageCache(tmp_path).call(stage, POINTS, 2.0)
     second = StageCache(tmp_path).call(stage, POINTS.copy(), 2.0)
     assert len(CALLS) == 1
-    assert isinstance(second[0], Hull) and isinstance(second[2][0], Box)
+    assert isinstance(second[0], Hull) and isinstance(second[2][0], OrientedBox)
     np.testing.assert_array_equal(second[0].vertices, first[0].vertices)
     assert second[0].faces.dtype == first[0].faces.dtype and second[1] == first[1] and np.isnan(second[3])
     assert all(type(a) is type(b) for a, b in zip(second[1], [*first[1][:2], 0.3, *first[1][3:]], strict=True))

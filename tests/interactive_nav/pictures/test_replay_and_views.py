@@ -18,15 +18,15 @@ import interactive_nav
 from interactive_nav import record, topdown
 from interactive_nav.interop import gym_env
 from interactive_nav.pictures import replay
-from interactive_nav.pictures.replay import Player, ReplayError
+from interactive_nav.pictures.replay import EpisodePlayer, ReplayError
 from interactive_nav.pictures.views import (
     GOAL_COLOUR,
     INSIDE,
     NOTHING,
     OUTSIDE,
-    Camera,
     FloorPaint,
     SceneView,
+    Viewpoint,
     depth_picture,
     mask_picture,
     robot_camera,
@@ -54,7 +54,7 @@ def straight(observation, key):
 
 @pytest.fixture(scope="module")
 def played(env):
-    return Player(env, straight, "straight", "by hand").play(jax.random.PRNGKey(3), episode=4)
+    return EpisodePlayer(env, straight, "straight", "by hand").play(jax.random.PRNGKey(3), episode=4)
 
 
 def test_a_replay_is_what_the_environment_kept_account_of(env, played):
@@ -90,12 +90,12 @@ def test_a_planner_on_the_host_sees_the_state_and_the_step(env):
         asked.append((episode, step, state.info["nav"].step_count.tolist()))
         return np.full((1, 2), 0.4)
 
-    run = Player(env, planner=ahead).play(jax.random.PRNGKey(3), episode=2)
+    run = EpisodePlayer(env, planner=ahead).play(jax.random.PRNGKey(3), episode=2)
     assert asked == [(2, t, [t]) for t in range(run.num_steps)]
     np.testing.assert_allclose(run.action, 0.4)
     assert np.linalg.norm(run.robot_xy_w[10] - run.robot_xy_w[0]) > 0.1
     with pytest.raises(UserError, match="expected exactly one of them"):
-        Player(env)
+        EpisodePlayer(env)
 
 
 def test_a_replay_survives_its_file(played, tmp_path):
@@ -128,7 +128,7 @@ IDENTITY = [1.0, 0.0, 0.0, 0.0]
 
 
 def test_rays_of_a_camera_by_hand():
-    camera = Camera(np.zeros(3), np.array([1.0, 0, 0]), math.radians(90), 2, 4)
+    camera = Viewpoint(np.zeros(3), np.array([1.0, 0, 0]), math.radians(90), 2, 4)
     # Half the field of view is 45 degrees: rows at +-0.5 of its reach, columns at +-0.5 and +-1.5.
     np.testing.assert_allclose(camera.rays()[0], [1, 1.5, 0.5], atol=1e-12)
     np.testing.assert_allclose(camera.rays()[-1], [1, -1.5, -0.5], atol=1e-12)
@@ -137,7 +137,7 @@ def test_rays_of_a_camera_by_hand():
 def test_depth_and_classes_by_hand(view):
     """A room of 4 x 3 m with a cube of 0.4 m on the floor at (0.7, 0); the eye is at 0.3 m."""
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([IDENTITY]))
-    eye = Camera(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0]), math.radians(90), 101, 101)
+    eye = Viewpoint(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0]), math.radians(90), 101, 101)
     seen = view.look(eye, INSIDE)
     assert CLASSES[seen.classes[50, 50]] == "chair" and seen.depth_m[50, 50] == pytest.approx(1.5, abs=1e-5)
     # Beside the cube the wall, 3 m ahead of the eye: depth is along the axis, so equal over the wall.
@@ -165,12 +165,12 @@ def test_the_robot_is_seen_from_outside_only(view):
     np.testing.assert_allclose(camera.forward_w, [1, 0, 0], atol=1e-9)
     index = CLASSES.index("robot")
     assert not (view.look(camera, INSIDE).classes == index).any()
-    above = Camera(np.array([-1.5, 0.3, 2.0]), np.array([math.sqrt(0.5), 0, -math.sqrt(0.5)]), 1.0, 60, 60)
+    above = Viewpoint(np.array([-1.5, 0.3, 2.0]), np.array([math.sqrt(0.5), 0, -math.sqrt(0.5)]), 1.0, 60, 60)
     assert (view.look(above, OUTSIDE).classes == index).sum() > 20
 
 
 def test_goal_and_path_are_painted_on_the_floor(view):
-    down = Camera(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0]), 0.3, 41, 41)
+    down = Viewpoint(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0]), 0.3, 41, 41)
     paint = FloorPaint(np.array([-1.2, 0.0]), 0.2, np.array([[-1.2, 0.3]]))
     plain, painted = view.look(down, OUTSIDE).colour, view.look(down, OUTSIDE, paint).colour
     changed = (plain != painted).any(-1)

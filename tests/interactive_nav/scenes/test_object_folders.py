@@ -16,7 +16,7 @@ import interactive_nav
 from converters.single_object import ObjectConfig, convert_object
 from interactive_nav import episodes
 from interactive_nav.config import make_config
-from interactive_nav.pictures.replay import Player, load, save
+from interactive_nav.pictures.replay import EpisodePlayer, load, save
 from interactive_nav.scenes.object_folders import load_object, small_objects
 from interactive_nav.scenes.objects import Box, pick
 from interactive_nav.topdown import outlines
@@ -122,7 +122,7 @@ def test_episodes_know_how_an_object_moves_and_not_how_it_looks(room, folders, t
 
 
 def test_replays_draw_the_objects(env, tmp_path):
-    replay = Player(env, lambda obs, key: jax.numpy.zeros(2)).play(jax.random.PRNGKey(1), 0)
+    replay = EpisodePlayer(env, lambda obs, key: jax.numpy.zeros(2)).play(jax.random.PRNGKey(1), 0)
     save(replay, tmp_path / "r.npz")
     again = load(tmp_path / "r.npz")
     assert again.objects == replay.objects and again.small == env.world.small_objects

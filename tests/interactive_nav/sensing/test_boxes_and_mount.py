@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from interactive_nav.robots.spec import Camera
+from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.objects import pick
 from interactive_nav.sensing.base import look_along
 from interactive_nav.sensing.boxes import box_poses
@@ -77,7 +77,7 @@ ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><freejoi
 
 def test_a_camera_on_a_jointed_head_is_where_c_mujoco_has_it():
     model = mujoco.MjModel.from_xml_string(ARM)
-    camera = Camera("head", (0.1, 0.02, 0.05), pitch_rad=0.26)
+    camera = RobotCamera("head", (0.1, 0.02, 0.05), pitch_rad=0.26)
     mount = make_mount(model, "base", camera)
     camera_pose, data = jax.jit(mount.pose), mujoco.MjData(model)
     rng = np.random.default_rng(1)
@@ -100,9 +100,9 @@ def test_a_camera_on_a_jointed_head_is_where_c_mujoco_has_it():
 def test_a_camera_on_no_body_of_the_robot_is_refused():
     model = mujoco.MjModel.from_xml_string(ARM)
     with pytest.raises(UserError, match="camera body 'hed' is no body of the robot, did you mean 'head'"):
-        make_mount(model, "base", Camera("hed", (0, 0, 0)))
+        make_mount(model, "base", RobotCamera("hed", (0, 0, 0)))
     with pytest.raises(UserError, match="camera body 'other'"):
-        make_mount(model, "base", Camera("other", (0, 0, 0)))
+        make_mount(model, "base", RobotCamera("other", (0, 0, 0)))
 
 
 def test_numpys_cameras_are_jaxs():

@@ -25,7 +25,7 @@ from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
 from topological_nav.evaluate.contenders import learned
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.evaluate.episodes import Episodes, count_of, draw_episodes
+from topological_nav.evaluate.episodes import DrivenEpisodes, count_of, draw_episodes
 from topological_nav.evaluate.evaluation import play
 from topological_nav.evaluate.rows import _stem, play_contest
 from topological_nav.navigate.state import Events
@@ -83,11 +83,11 @@ class Line:
         return (x + 0.2 * (at < 10) * ~over, step + 1, number), events
 
 
-def line_journeys(goals) -> Episodes:
+def line_journeys(goals) -> DrivenEpisodes:
     n = len(goals)
     goal = np.stack([np.array(goals, float), np.zeros(n)], -1)
     zero = np.zeros(n)
-    return Episodes(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float))
+    return DrivenEpisodes(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float))
 
 
 def test_an_episode_is_won_where_a_run_ends_near_the_goal():

@@ -8,14 +8,14 @@ import pytest
 
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate import scores
-from topological_nav.evaluate.episodes import Episodes
+from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, columns
 
 
-def journeys(shortest) -> Episodes:
+def journeys(shortest) -> DrivenEpisodes:
     n = len(shortest)
     zero = np.zeros(n)
-    return Episodes(
+    return DrivenEpisodes(
         np.arange(n),
         np.zeros((n, 2)),
         zero,

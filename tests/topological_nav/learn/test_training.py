@@ -9,7 +9,7 @@ import pytest
 
 from interactive_nav_common.config import overridden
 from interactive_nav_common.records import read_metrics
-from topological_nav.config import TrainConfig
+from topological_nav.config import NetworkTrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.errors import RunError, Stopped
 from topological_nav.learn import training
@@ -84,7 +84,7 @@ def test_a_detector_that_does_not_say_its_lengths_is_refused(made, tmp_path):
 def whole(made, tmp_path_factory):
     """An uninterrupted run of both phases."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    config = overridden(TrainConfig(), [*WORDS, *SELFSUP])
+    config = overridden(NetworkTrainConfig(), [*WORDS, *SELFSUP])
     assert training.train("rooms", made.data, out, config) is not None
     return out, config
 
@@ -131,12 +131,12 @@ def test_other_settings_are_refused(made, whole):
 
 
 def test_a_backbone_is_taken_from_another_run(made, whole, tmp_path):
-    config = overridden(TrainConfig(), [*WORDS, f"init={whole[0]}", "epochs=1", "learning_rate=1e-9"])
+    config = overridden(NetworkTrainConfig(), [*WORDS, f"init={whole[0]}", "epochs=1", "learning_rate=1e-9"])
     assert training.train("passages", made.data, tmp_path / "run", config) is not None
     # A step of 1e-9 leaves the backbone where it was.
     pairs = zip(*(jax.tree.leaves(weights(r)["body"]) for r in (tmp_path / "run", whole[0])), strict=True)
     assert all(np.allclose(a, b, atol=1e-6) for a, b in pairs)
-    wider = overridden(TrainConfig(), [*WORDS, f"init={whole[0]}", "width=8"])
+    wider = overridden(NetworkTrainConfig(), [*WORDS, f"init={whole[0]}", "width=8"])
     with pytest.raises(RunError, match="does not fit: its backbone differs in kind or width; it is alexnet of width 4"):
         training.train("passages", made.data, tmp_path / "wider", wider)
 

@@ -9,7 +9,7 @@ import pytest
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 from topological_nav.ros.config import SimulatorConfig
-from topological_nav.ros.simulator import Simulator
+from topological_nav.ros.simulator import RosSimulator
 
 CONFIG = SimulatorConfig(
     start=(-2.0, 1.0, 0.0), width=32, height=24, supersample=2, engine="rays", lidar_rays=4, lidar_fov_deg=360.0,
@@ -24,7 +24,7 @@ def room(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def simulator(room):
-    return Simulator(room, CONFIG)
+    return RosSimulator(room, CONFIG)
 
 
 def test_it_drives_ahead_until_it_meets_the_wall(simulator):
@@ -68,14 +68,14 @@ def test_it_turns_as_fast_as_it_is_told_and_pictures_change(simulator):
 
 
 def test_pictures_span_the_field_of_view_that_is_asked_for(room):
-    narrow = Simulator(room, dataclasses.replace(CONFIG, fov_deg=40.0)).sense().rgb
-    wide = Simulator(room, CONFIG).sense().rgb
+    narrow = RosSimulator(room, dataclasses.replace(CONFIG, fov_deg=40.0)).sense().rgb
+    wide = RosSimulator(room, CONFIG).sense().rgb
     assert np.abs(narrow.astype(float) - wide).mean() > 2
 
 
 def test_a_blocked_start_is_refused(room):
     with pytest.raises(UserError, match=r"start \(1.4, -0.5\) is 0.00 m from obstacles, expected at least"):
-        Simulator(room, SimulatorConfig(start=(1.4, -0.5, 0.0)))
+        RosSimulator(room, SimulatorConfig(start=(1.4, -0.5, 0.0)))
 
 
 def test_settings_are_checked():

@@ -19,7 +19,7 @@ from tests.train.toy_run import build_toy
 from train import evaluate
 from train.scoring.brought import BroughtPolicy, _on_host, named, told
 from train.scoring.policies import make_follower
-from train.scoring.rollout import Player, episode_keys
+from train.scoring.rollout import BatchPlayer, episode_keys
 
 KEYS = episode_keys(5, 8)
 
@@ -86,7 +86,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def player(env):
-    return Player(env)
+    return BatchPlayer(env)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from interactive_nav_common.statistics import interval
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.scoring import rollout
 from train.scoring.policies import make_follower, make_random
-from train.scoring.rollout import Player, episode_keys, run_episodes
+from train.scoring.rollout import BatchPlayer, episode_keys, run_episodes
 from train.scoring.row_files import EvaluationAsked, files_of_run
 from train.scoring.rows import episode_table
 
@@ -65,7 +65,7 @@ class TwoScenes(ToyEnv):
 def test_batches_do_not_change_episodes():
     """Twelve episodes in batches of five (the last one padded) equal twelve at once, paths included."""
     env = TwoScenes(ToyConfig(episode_steps=60))
-    keys, scenes, player = episode_keys(seed=3, episodes=12), np.arange(12, dtype=np.int32) % 2, Player(env)
+    keys, scenes, player = episode_keys(seed=3, episodes=12), np.arange(12, dtype=np.int32) % 2, BatchPlayer(env)
     told: list[tuple[int, int]] = []
     whole = player.play(make_random(env), keys, record=8, scene_index=scenes)
     parts = player.play(
@@ -84,7 +84,7 @@ def test_batches_do_not_change_episodes():
 
 def test_batches_that_do_not_fit_are_halved(monkeypatch):
     env, notes, sizes = ToyEnv(ToyConfig(episode_steps=60)), [], []
-    player = Player(env)
+    player = BatchPlayer(env)
     usual = player._chunk
 
     def small_memory(policy, state, keys, ended, step):
@@ -137,7 +137,7 @@ def test_rows_and_file(tmp_path):
         "object_contact_steps": np.array([[3, 0, 2, 0], [0] * 4]),
         "object_force_sum_n": np.array([[8.0, 0.0, 4.0, 0.0], [0.0] * 4], np.float32),
     }
-    played = rollout.Episodes(np.array([1, 0]), {"success": np.array([1.0, 0.0], np.float32)}, of_objects, paths)
+    played = rollout.PlayedEpisodes(np.array([1, 0]), {"success": np.array([1.0, 0.0], np.float32)}, of_objects, paths)
     scenes = (SimpleNamespace(name="a", split="train"), SimpleNamespace(name="b", split="test"))
     categories = (("toy", "", "chair", ""), ("toy", "chair", "chair", ""))
     table = episode_table(played, scenes, categories, {"run": "r", "k_int": 0.1})
