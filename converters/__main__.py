@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from converters.generating import Commands, add_generate, add_generate_scenes, add_launcher, add_models, positive
+from converters.library.commands import add_library
 from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import refuse_unused
@@ -294,7 +295,7 @@ def _add_preview(commands: Commands) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    generating = (add_generate, add_generate_scenes, add_models)
+    generating = (add_generate, add_generate_scenes, add_models, add_library)
     for add in (_add_convert, _add_propose, _add_object, _add_check, *generating, _add_preview):
         add(commands)
     return parser

@@ -155,14 +155,9 @@ def _structure_visual(
 
 def _object_visual(cloud: ColourCloud, annotated: PlacedObject, max_faces: int, size: int) -> tuple[VisualMesh, float]:
     """The CAD model retextured at its annotated pose (where the scan showed it), in the body frame."""
-    visual, seen = bake_object(
-        to_world(annotated, annotated.vertices_b),
-        annotated.faces,
-        annotated.face_colours,
-        cloud,
-        max_faces,
-        size,
-    )
+    vertices_w, faces = to_world(annotated, annotated.vertices_b), annotated.faces
+    low = simplify(vertices_w, faces, max_faces)
+    visual, seen = bake_object(vertices_w, faces, annotated.face_colours, cloud, low, size)
     back = (visual.vertices - annotated.position_w) @ matrix_from_quat(annotated.quaternion_w)
     return dataclasses.replace(visual, vertices=back), seen
 

@@ -24,7 +24,7 @@ from converters.bodies.physical import MATERIALS, Physical, mass_moments
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
-from converters.geometry.faces import merge_vertices
+from converters.geometry.faces import merge_vertices, simplify
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
@@ -137,7 +137,7 @@ def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMe
     # Points twice as dense as the texels of the picture; a grey model has nothing to show but its faces' colour.
     chosen = np.arange(len(surface.faces)) if surface.texture is not None else np.zeros(0, np.int64)
     cloud = colour_cloud(scan, surface.vertices, surface.faces, chosen, max(extent / TEXELS, 1e-4))
-    return bake_object(vertices, faces, colours, cloud, FACES, TEXELS)[0]
+    return bake_object(vertices, faces, colours, cloud, simplify(vertices, faces, FACES), TEXELS)[0]
 
 
 def convert_object(

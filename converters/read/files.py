@@ -213,6 +213,8 @@ def read_obj(path: Path) -> ObjMesh:
                 uvs.extend((line.split() + ["0"])[1:3])
             elif line.startswith("f "):
                 words = line.split()[1:]
+                if len(words) == 2:
+                    continue  # an edge: it has no surface, and other programs pass over it
                 if len(words) < 3:
                     raise SceneRejected(f"{path}:{number}: a face has {len(words)} corners, expected at least 3")
                 if "-" in line:
@@ -252,7 +254,10 @@ def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:
 
 
 def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """(c,) vertex and (c,) texture indices, from 1; None where a corner has no texture coordinate."""
+    """(c,) vertex and (c,) texture indices, from 1; None where no corner has a texture coordinate.
+
+    Where some have none (faces of plain materials), they take the first: a plain colour is the same everywhere.
+    """
     if not corners:
         return np.zeros(0, np.int64), None
     slashes = corners[0].count("/")
@@ -261,8 +266,8 @@ def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
         return table[:, 0], table[:, 1] if slashes else None
     split = [(c.split("/") + [""])[:2] for c in corners]
     index = np.array([s[0] for s in split], np.int64)
-    has_uv = all(s[1] for s in split)
-    return index, np.array([s[1] for s in split], np.int64) if has_uv else None
+    has_uv = any(s[1] for s in split)
+    return index, np.array([s[1] or "1" for s in split], np.int64) if has_uv else None
 
 
 def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from converters.geometry.faces import sample_faces, simplify
+from converters.geometry.faces import sample_faces
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, VisualMesh
@@ -183,7 +183,7 @@ def bake_object(
     faces: np.ndarray,
     face_colours: np.ndarray,
     cloud: ColourCloud,
-    max_faces: int,
+    low: tuple[np.ndarray, np.ndarray],
     size: int,
 ) -> tuple[VisualMesh, float]:
     """Simplified CAD model, retextured from the scan points that showed the object.
@@ -197,13 +197,13 @@ def bake_object(
         faces: (m, 3).
         face_colours: (m, 3) uint8 of the CAD materials.
         cloud: scan points that were cut as this object.
-        max_faces: of the result.
+        low: vertices and faces of the simplified surface.
         size: of the texture, pixels.
 
     Returns:
         The mesh (world frame, as given) and the share of texels that the scan showed.
     """
-    low_vertices, low_faces = simplify(vertices, faces, max_faces)
+    low_vertices, low_faces = low
     uv, uv_faces = unwrap(low_vertices, low_faces, size)
     texel, point, face = texel_surface(low_vertices, low_faces, uv, uv_faces, size)
     normal = np.asarray(trimesh.triangles.normals(low_vertices[low_faces])[0])

@@ -26,6 +26,16 @@ def test_polygons_become_fans_whatever_the_index_style(tmp_path, face):
     assert mesh.corner_uv is None
 
 
+def test_faces_without_texture_coordinates_leave_the_others_theirs_and_edges_are_passed_over(tmp_path):
+    (tmp_path / "m.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0.5 0.5\nvt 0.25 0.75\nf 1/2 2/2 3/2\nf 1//1 3//1 4//1\nf 1 2\n"
+    )
+    mesh = read_obj(tmp_path / "m.obj")
+    assert len(mesh.faces) == 2 and mesh.corner_uv is not None
+    np.testing.assert_array_equal(mesh.corner_uv[0], [[0.25, 0.75]] * 3)
+    np.testing.assert_array_equal(mesh.corner_uv[1], [[0.5, 0.5]] * 3)
+
+
 def test_texture_coordinates_belong_to_corners(tmp_path):
     text = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\nf 1/4/1 2/3/1 3/2/1\nf 1/-4 2/-3 3/-2\n"
     mesh = read_obj(obj(tmp_path, text))
@@ -38,7 +48,7 @@ def test_texture_coordinates_belong_to_corners(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (SQUARE + "f 1 2\n", "mesh.obj:5: a face has 2 corners"),
+        (SQUARE + "f 1 2 3\nf 1\n", "mesh.obj:6: a face has 1 corners"),
         (SQUARE + "f 1 2 9\n", "names vertex 8 of 4"),
         (SQUARE + "f 0 1 2\n", "names vertex"),
         (SQUARE + "f 1 2 x\n", "not readable as OBJ"),

@@ -67,11 +67,15 @@ def test_vertex_colours_come_with_the_chosen_faces_only():
     np.testing.assert_array_equal(cloud.colours[:, 0], [1, 3, 4])
 
 
+def as_is(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
 def test_object_takes_scan_colours_and_in_paints_the_rest():
     mesh = trimesh.creation.box((1, 1, 1)).subdivide().subdivide()
     grey = np.full((len(mesh.faces), 3), 128, np.uint8)
     upper = cloud_over(mesh, (200, 40, 40), lambda p: p[:, 2] > 0)
-    visual, seen = bake_object(np.asarray(mesh.vertices), np.asarray(mesh.faces), grey, upper, 500, 64)
+    visual, seen = bake_object(*as_is(mesh), grey, upper, as_is(mesh), 64)
     assert 0.4 < seen < 0.65  # the upper half of the cube, and 8 cm more
     assert np.abs(visual.image.astype(int) - (200, 40, 40)).max() <= 1  # in-painted from seen neighbours
     assert visual.uv.min() >= 0 and visual.uv.max() <= 1
@@ -84,7 +88,7 @@ def test_each_material_is_in_painted_from_itself():
     red = cloud_over(mesh, (200, 0, 0), lambda p: (p[:, 2] > 0.2) & (p[:, 0] < -0.1))
     blue = cloud_over(mesh, (0, 0, 200), lambda p: (p[:, 2] > 0.2) & (p[:, 0] > 0.1))
     both = ColourCloud(*(np.vstack([getattr(red, f), getattr(blue, f)]) for f in ("points", "normals", "colours")))
-    visual, _ = bake_object(np.asarray(mesh.vertices), np.asarray(mesh.faces), colours, both, 500, 64)
+    visual, _ = bake_object(*as_is(mesh), colours, both, as_is(mesh), 64)
     texel, point, _ = texel_surface(visual.vertices, visual.faces, visual.uv, visual.uv_faces, 64)
     shown = visual.image.reshape(-1, 3)[texel].astype(int)
     low = point[:, 2] < -0.1  # unseen by the scan
@@ -96,7 +100,7 @@ def test_an_object_that_the_scan_does_not_show_keeps_its_cad_colour():
     mesh = trimesh.creation.box((1, 1, 1))
     empty = ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     colours = np.full((12, 3), 77, np.uint8)
-    visual, seen = bake_object(np.asarray(mesh.vertices), np.asarray(mesh.faces), colours, empty, 500, 32)
+    visual, seen = bake_object(*as_is(mesh), colours, empty, as_is(mesh), 32)
     assert seen == 0.0 and (visual.image == 77).all()
 
 

@@ -1,0 +1,1 @@
+"""Furniture that people modelled: catalogues of it, a packaged selection, and how that is made."""

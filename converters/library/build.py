@@ -1,0 +1,195 @@
+"""Catalogues and a selection in, the packaged furniture out: scaled, simplified, textured, decomposed.
+
+`selection.yaml` names the models of each category and split; no creator is in both splits.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import multiprocessing
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
+from converters.geometry.boxes import convex_hull
+from converters.geometry.faces import face_areas, merge_vertices, sample_faces, simplify
+from converters.geometry.simplify import simplify_within, surface_distance
+from converters.library.catalogue import Catalogue, Piece, read_catalogue, unpack_model
+from converters.library.store import Credit, Model, Shape, attribution, write_library
+from converters.read.files import SourceFolder
+from converters.read.meshes import colours_of_faces, read_surface
+from converters.read.obj import TexturedMesh
+from converters.records.errors import SceneRejected
+from converters.records.raw import ScanMesh
+from converters.records.visual import ColourCloud
+from converters.write.texture import bake_object, colour_cloud
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.records import Reader
+from scenes_mjcf.categories import CATEGORIES
+
+SELECTION = Path(__file__).with_name("selection.yaml")
+MOST_M, LEAST_AREA = 0.01, 0.97
+"""How far a surface may be simplified."""
+MOST_FACES = 3000
+MOST_LOST, MOST_OFF_M = 0.1, 0.04
+"""What a model may lose of its area, and lie off, at that number."""
+LOOSER, ROUNDS = 1.6, 3
+"""What exceeds them is simplified to an error larger by this factor, so many times, and then to their number."""
+SOLID_M = 0.004
+"""Error of the surface that is decomposed."""
+TEXELS = 256
+FOOT_SHARE = 0.03
+"""Of the height: hulls that end within it above the base reach down to it."""
+HULLS = DecomposeConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class Chosen:
+    """A piece and what it is to be."""
+
+    catalogue: Catalogue
+    piece: Piece
+    category: str
+    split: str
+
+
+def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> tuple[Chosen, ...]:
+    """The pieces that a selection names, by category.
+
+    Raises:
+        ConfigError: a category or piece that is not known, or a creator in both splits.
+    """
+    known = {piece.key: (catalogue, piece) for catalogue in catalogues for piece in catalogue.pieces}
+    data = Reader(ConfigError, "converters/library/selection.yaml shows the form").decoded(
+        path.read_bytes(), "YAML", str(path)
+    )
+    chosen, splits = [], {}
+    for category, of in data.items():
+        if category not in CATEGORIES:
+            raise ConfigError(f"{path}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
+        for split in sorted(of):
+            for key in of[split]:
+                if key not in known:
+                    raise ConfigError(f"{path}: {category}: no piece '{key}' in the libraries")
+                catalogue, piece = known[key]
+                if splits.setdefault(piece.creator, split) != split:
+                    raise ConfigError(f"{path}: {key}: its creator {piece.creator} has models in both splits")
+                chosen.append(Chosen(catalogue, piece, category, split))
+    return tuple(chosen)
+
+
+def as_catalogued(surface: TexturedMesh, piece: Piece, where: str) -> TexturedMesh:
+    """The surface turned and scaled as its catalogue says, the middle of its base at the origin.
+
+    Raises:
+        SceneRejected: no faces, or flat in a direction in which the catalogue gives it a size.
+    """
+    if not len(surface.faces):
+        raise SceneRejected(f"{where}: has no face; choose another model")
+    used, index = np.unique(surface.faces, return_inverse=True)
+    vertices = surface.vertices[used] @ piece.rotation.T
+    low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    if not np.isfinite(span).all() or (span < 1e-9 * max(float(span.max()), 1e-12)).any():
+        raise SceneRejected(f"{where}: its surface has the size {span}, expected one in each direction")
+    vertices = (vertices - low - span * [0.5, 0.0, 0.5]) * (np.array(piece.size_m) / span)
+    return dataclasses.replace(surface, vertices=vertices, faces=index.reshape(-1, 3))
+
+
+def _standing(points: np.ndarray, foot_m: float) -> np.ndarray:
+    level = points[points[:, 1] < foot_m] * [1.0, 0.0, 1.0]
+    return np.vstack([points, level])
+
+
+def _cloud(surface: TexturedMesh) -> ColourCloud:
+    if surface.texture is None:
+        return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+    none = np.zeros(len(surface.vertices), np.int64)
+    scan = ScanMesh(surface.vertices, surface.faces, none, None, surface.corner_uv, surface.texture)
+    spacing = max(float(np.ptp(surface.vertices, axis=0).max()) / TEXELS, 1e-3)
+    return colour_cloud(scan, surface.vertices, surface.faces, np.arange(len(surface.faces)), spacing)
+
+
+def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]:
+    """One model, ready to be packaged.
+
+    Raises:
+        SceneRejected: an unusable model.
+        StageFailed: coacd cannot decompose it.
+    """
+    piece, where = chosen.piece, f"{chosen.catalogue.path}: {chosen.piece.model}"
+    with tempfile.TemporaryDirectory(prefix="library-") as folder:
+        path = unpack_model(chosen.catalogue, piece, Path(folder))
+        surface = as_catalogued(read_surface(SourceFolder(path.parent), path.name, ""), piece, where)
+    vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
+    colours = colours_of_faces(surface)[keep]
+    solid = simplify_within(vertices, faces, SOLID_M)
+    made = decompose_all({piece.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
+    foot_m = FOOT_SHARE * piece.size_m[1]
+    hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in made.hulls[piece.key])
+    most_m, low = MOST_M, simplify_within(vertices, faces, MOST_M, LEAST_AREA)
+    while len(low[1]) > MOST_FACES and most_m < MOST_M * LOOSER**ROUNDS:
+        most_m *= LOOSER
+        low = simplify_within(*low, most_m, LEAST_AREA)
+    low = simplify(*low, MOST_FACES)
+    lost = 1 - face_areas(*low).sum() / face_areas(vertices, faces).sum()
+    off_m = surface_distance(sample_faces(vertices, faces, 0.03)[0], *low).max()
+    if lost > MOST_LOST or off_m > MOST_OFF_M:
+        raise SceneRejected(
+            f"{where}: loses {lost:.2f} of its surface or {off_m:.3f} m at {len(low[1])} faces; leave it out"
+        )
+    if len(low[1]) > 1.1 * MOST_FACES:
+        raise SceneRejected(
+            f"{where}: has {len(low[1])} faces after simplification, expected {MOST_FACES}; leave it out"
+        )
+    visual, _ = bake_object(vertices, faces, colours, _cloud(surface), low, TEXELS)
+    credit = Credit(piece.name, piece.creator, _licence(chosen.catalogue.licence), piece.key)
+    size_m = (round(piece.size_m[0], 4), round(piece.size_m[1], 4), round(piece.size_m[2], 4))
+    model = Model(piece.key, chosen.category, chosen.split, size_m, len(visual.faces), len(hulls), credit)
+    return model, Shape(visual, hulls)
+
+
+def _licence(text: str) -> str:
+    if text == "Public domain":
+        return "CC0 1.0"
+    found = re.search(r"Attribution 3.0( United States)?", text)
+    return f"CC BY 3.0{' US' if found and found[1] else ''}" if found else text
+
+
+def build(
+    files: Sequence[Path], target: Path, jobs: int, report: Callable[[str, float], None], selection: Path = SELECTION
+) -> int:
+    """Makes `models.zip` and `ATTRIBUTION.md` from the libraries; each appears whole or not at all.
+
+    Args:
+        files: `.sh3f` libraries.
+        target: folder.
+        jobs: models side by side.
+        report: progress.
+        selection: what to package.
+
+    Returns:
+        How many models.
+
+    Raises:
+        SceneRejected, StageFailed: a model that cannot be used.
+    """
+    chosen = read_selection([read_catalogue(path) for path in files], selection)
+    done: list[tuple[Model, Shape]] = []
+    with concurrent.futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        running = [pool.submit(make_model, one) for one in chosen]
+        try:
+            for one, future in zip(chosen, running, strict=True):
+                done.append(future.result())
+                report(one.piece.key, len(done) / len(chosen))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    with whole_file(target / "models.zip") as partial:
+        write_library(partial, done)
+    write_text(target / "ATTRIBUTION.md", attribution([model for model, _ in done]))
+    return len(done)

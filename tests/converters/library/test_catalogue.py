@@ -1,0 +1,102 @@
+"""Furniture libraries: what a catalogue says of its pieces, and what of a broken one is told."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.library.catalogue import PROPERTIES, parse_properties, read_catalogue, unpack_model
+from converters.library.fetch import fetch
+from converters.records.errors import SceneRejected
+from interactive_nav_common.errors import FileError
+
+ENTRY = {
+    "name": "Caf\\u00e9 chair", "category": "Kitchen", "model": "/small/chair/chair.obj", "width": "50",
+    "depth": "60.5", "height": "90",
+    "movable": "true", "doorOrWindow": "false", "creator": "Ada", "modelRotation": "0 0 1 0 1 0 -1 0 0",
+}  # fmt: skip
+
+
+def write_library(path: Path, **changes: str) -> Path:
+    """A library of one chair; a change to None leaves its key out."""
+    entry = {k: v for k, v in {**ENTRY, **changes}.items() if v is not None}
+    lines = ["# a comment", "license=Public domain", *(f"{k}#1={v}" for k, v in entry.items())]
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(PROPERTIES, "\n".join(lines))
+        archive.writestr("small/chair/chair.obj", "v 0 0 0\nv 2 0 0\nv 0 3 1\nf 1 2 3\n")
+        archive.writestr("small/chair/wood.png", b"png")
+        archive.writestr("small/other.obj", "v 0 0 0\n")
+    return path
+
+
+def test_properties_are_javas():
+    text = b"! note\nname#1 = \\u0041rm\\\n    chair\nwidth#1:50\nempty#1=\n"
+    assert parse_properties(text) == {"name#1": "Armchair", "width#1": "50", "empty#1": ""}
+
+
+def test_a_piece_is_read_in_metres(tmp_path):
+    catalogue = read_catalogue(write_library(tmp_path / "Small.sh3f"))
+    (piece,) = catalogue.pieces
+    assert catalogue.licence == "Public domain" and piece.key == "Small/chair"
+    assert (piece.name, piece.group, piece.creator) == ("Café chair", "Kitchen", "Ada")
+    assert piece.size_m == (0.5, 0.9, 0.605) and piece.movable and not piece.door_or_window
+    np.testing.assert_array_equal(piece.rotation @ [0, 0, 1], [1, 0, 0])
+    (tmp_path / "out").mkdir()
+    model = unpack_model(catalogue, piece, tmp_path / "out")
+    assert model.name == "chair.obj" and sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "chair.obj",
+        "wood.png",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": "0"}, "is 0 x 60.5 x 90 cm, expected sides above 0"),
+        ({"width": None}, "width is None, expected a number"),
+        ({"height": "nan"}, "height is 'nan', expected a number"),
+        ({"depth": "9999"}, "expected sides above 0 and below 50 m"),
+        ({"model": "/../secret.obj"}, "its model '../secret.obj' is not in the archive"),
+        ({"modelRotation": "1 0 0"}, "expected the 9 numbers of a rotation"),
+        ({"modelRotation": "2 0 0 0 1 0 0 0 1"}, "expected the 9 numbers of a rotation"),
+    ],
+)
+def test_a_piece_that_cannot_be_used_is_one_line(tmp_path, changes, message):
+    with pytest.raises(SceneRejected) as refused:
+        read_catalogue(write_library(tmp_path / "Small.sh3f", **changes))
+    assert message in str(refused.value) and "piece 1" in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_broken_archive_is_one_line(tmp_path):
+    path = write_library(tmp_path / "Small.sh3f")
+    catalogue, data = read_catalogue(path), path.read_bytes()
+    for broken in (b"", data[:100], b"PK" + data[2:60]):
+        (tmp_path / "broken.sh3f").write_bytes(broken)
+        with pytest.raises(SceneRejected, match="not readable as a furniture library"):
+            read_catalogue(tmp_path / "broken.sh3f")
+    at = data.index(b"v 2 0 0")
+    path.write_bytes(data[:at] + b"x" + data[at + 1 :])
+    with pytest.raises(SceneRejected, match="chair.obj: damaged"):
+        unpack_model(catalogue, catalogue.pieces[0], tmp_path)
+    with pytest.raises(SceneRejected, match="no such file"):
+        read_catalogue(tmp_path / "absent.sh3f")
+
+
+def test_libraries_are_fetched_whole_and_checked(tmp_path, monkeypatch):
+    (tmp_path / "given").mkdir()
+    target = tmp_path / "there"
+    with pytest.raises(FileError, match="holds no BlendSwap-CC-0.sh3f; give the package with --from"):
+        fetch(tmp_path / "given", target)
+    write_library(tmp_path / "given" / "BlendSwap-CC-0.sh3f")
+    with pytest.raises(FileError, match=r"BlendSwap-CC-0.sh3f is not that of version 1.8 \(sha256 differs\)"):
+        fetch(tmp_path / "given", target)
+    (tmp_path / "package.deb").write_bytes(b"!<arch>\n" + b"data.tar.xz".ljust(48) + b"4".ljust(10) + b"`\nxxxx")
+    with pytest.raises(FileError, match="not readable as a Debian package"):
+        fetch(tmp_path / "package.deb", target)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FileError, match="apt-get is not here to download it"):
+        fetch(None, target)
+    assert not target.exists()

@@ -1,0 +1,129 @@
+"""The packaged furniture: what is in it, that it is credited, solid and as large as it says, and made as it is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from converters.geometry.simplify import loose_parts, simplify_within, surface_distance
+from converters.library.build import MOST_FACES, SELECTION, as_catalogued, make_model, read_selection
+from converters.library.catalogue import Piece, read_catalogue
+from converters.library.store import ATTRIBUTION, PACKED, attribution, read_index, read_shape, write_library
+from converters.read.obj import TexturedMesh
+from converters.records.errors import SceneRejected
+from interactive_nav_common.errors import ConfigError, FileError
+from scenes_mjcf.categories import CATEGORIES
+from tests.converters.library.test_catalogue import write_library as write_catalogue
+
+INDEX = read_index()
+
+
+def test_the_selection_is_what_is_packaged():
+    chosen = yaml.safe_load(SELECTION.read_text())
+    listed = {(key, c, split) for c, of in chosen.items() for split, keys in of.items() for key in keys}
+    assert listed == {(m.name, m.category, m.split) for m in INDEX.values()} and len(INDEX) >= 150
+    assert {m.category for m in INDEX.values()} <= set(CATEGORIES) and len({m.category for m in INDEX.values()}) == 32
+    counts = Counter(m.category for m in INDEX.values())
+    assert min(counts[c] for c in ("chair", "table", "sofa", "bed", "desk", "armchair")) >= 4
+    assert PACKED.stat().st_size < 8 * 2**20
+
+
+def test_no_creator_is_in_both_splits_and_all_are_credited():
+    by_split = {split: {m.credit.creator for m in INDEX.values() if m.split == split} for split in ("train", "test")}
+    assert by_split["train"].isdisjoint(by_split["test"])
+    assert {m.credit.licence for m in INDEX.values()} == {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
+    assert all(m.credit.creator and m.credit.title for m in INDEX.values() if m.credit.licence != "CC0 1.0")
+    assert ATTRIBUTION.read_text() == attribution(list(INDEX.values()))
+
+
+@pytest.mark.parametrize("name", sorted(INDEX)[::23])
+def test_a_model_is_as_large_as_it_says_and_its_hulls_hold_it(name):
+    model, shape = INDEX[name], read_shape(name)
+    visual = shape.visual
+    assert len(visual.faces) == model.faces <= 1.1 * MOST_FACES and len(shape.hulls) == model.hulls
+    assert visual.image.shape == (256, 256, 3) and visual.uv.min() >= 0 and visual.uv.max() <= 1
+    np.testing.assert_allclose(np.ptp(visual.vertices, axis=0), model.size_m, atol=0.05)
+    assert abs(visual.vertices[:, 1].min()) < 0.02
+    points = np.vstack([hull.vertices for hull in shape.hulls])
+    np.testing.assert_allclose(np.ptp(points, axis=0), model.size_m, atol=0.08)
+    for hull in shape.hulls:
+        a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        area = np.linalg.norm(normal, axis=1)
+        above_m = np.einsum("fd,fvd->fv", normal, hull.vertices[None] - a[:, None]) / np.maximum(area, 1e-12)[:, None]
+        assert above_m[area > 1e-5].max(initial=0) < 5e-3  # convex, faces outwards
+
+
+def test_packing_twice_gives_the_same_bytes_and_a_damaged_archive_is_one_line(tmp_path):
+    names = sorted(INDEX)[:2]
+    for place in ("a.zip", "b.zip"):
+        write_library(tmp_path / place, [(INDEX[n], read_shape(n)) for n in names])
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    assert read_index(tmp_path / "a.zip") == {n: INDEX[n] for n in names}
+    (tmp_path / "c.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:500])
+    for read in (read_index, lambda path: read_shape(names[0], path)):
+        with pytest.raises(FileError, match="is not readable"):
+            read(tmp_path / "c.zip")
+    with pytest.raises(FileError, match="Nobody/nothing.arrays is not readable"):
+        read_shape("Nobody/nothing")
+
+
+def box_of_boxes() -> tuple[np.ndarray, np.ndarray]:
+    """A finely cut ball of 0.4 m, and beside it a rod of 6 mm that a count alone would take away."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.4)
+    rod = trimesh.creation.cylinder(radius=0.003, height=1.0, sections=48)
+    whole = trimesh.util.concatenate([ball, rod.apply_translation([0.8, 0, 0])])
+    return np.asarray(whole.vertices, float), np.asarray(whole.faces, np.int64)
+
+
+def test_simplification_keeps_every_part_within_its_error():
+    vertices, faces = box_of_boxes()
+    low, kept = simplify_within(vertices, faces, 0.01)
+    assert len(kept) < len(faces) / 8 and len(np.unique(loose_parts(kept, len(low)))) == 2
+    assert surface_distance(vertices, low, kept).max() <= 0.0101
+    assert surface_distance(low, vertices, faces).max() <= 0.0101
+
+
+def test_a_piece_takes_its_catalogues_size():
+    corners = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [9, 9, 9]])  # the last is in no face
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]])
+    piece = Piece("L", "n", "g", "n.obj", (0.5, 0.9, 0.6), np.eye(3), 0.0, True, False, "c")
+    mesh = as_catalogued(TexturedMesh(corners, faces, None, None), piece, "n")
+    np.testing.assert_allclose(mesh.vertices.min(axis=0), [-0.25, 0.0, -0.3])
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.9, 0.6])
+    with pytest.raises(SceneRejected, match="n: has no face"):
+        as_catalogued(TexturedMesh(corners, faces[:0], None, None), piece, "n")
+    with pytest.raises(SceneRejected, match="expected one in each direction"):
+        as_catalogued(TexturedMesh(corners[:3], faces[:1], None, None), piece, "n")
+
+
+def test_a_model_is_made_from_a_catalogue(tmp_path, hull_cache):
+    catalogue = read_catalogue(write_catalogue(tmp_path / "Small.sh3f", modelRotation=None))
+    selection = tmp_path / "selection.yaml"
+    selection.write_text("chair: {train: [Small/chair]}")
+    (chosen,) = read_selection([catalogue], selection)
+    model, shape = make_model(chosen, hull_cache)
+    assert model.category == "chair" and model.size_m == (0.5, 0.9, 0.605) and model.credit.licence == "CC0 1.0"
+    points = np.vstack([hull.vertices for hull in shape.hulls])
+    assert abs(points[:, 1].min()) < 0.05 and model.hulls == len(shape.hulls) >= 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("throne: {train: [Small/chair]}", "category is 'throne', expected one of"),
+        ("chair: {train: [Small/sofa]}", "chair: no piece 'Small/sofa' in the libraries"),
+        ("chair: {train: [Small/chair], test: [Small/chair]}", "its creator Ada has models in both splits"),
+    ],
+)
+def test_a_selection_that_does_not_fit_is_one_line(tmp_path: Path, text, message):
+    catalogue = read_catalogue(write_catalogue(tmp_path / "Small.sh3f"))
+    (tmp_path / "selection.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_selection([catalogue], tmp_path / "selection.yaml")
