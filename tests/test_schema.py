@@ -80,3 +80,16 @@ def test_a_damaged_or_odd_map_is_named(room, tmp_path):
     np.savez(tmp_path / "maps.npz", traversable=np.ones((2, 2), bool), resolution=[1, 2], origin=[0, 0], floor_height=0)
     with pytest.raises(schema.SceneError, match="maps.npz: not readable"):
         schema.load_maps(tmp_path)
+
+
+@pytest.mark.parametrize(("origin", "floor_height"), [((np.nan, 0.0), 0.0), ((0.0, np.inf), 0.0), ((0.0, 0.0), np.nan)])
+def test_a_map_that_lies_nowhere_is_refused(tmp_path, origin, floor_height):
+    np.savez(
+        tmp_path / "maps.npz",
+        traversable=np.ones((2, 2), bool),
+        resolution=0.05,
+        origin=origin,
+        floor_height=floor_height,
+    )
+    with pytest.raises(schema.SceneError, match="maps.npz: origin is .*expected x, y and a height, finite"):
+        schema.load_maps(tmp_path)
