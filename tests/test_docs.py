@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import importlib.util
 import io
+import itertools
 import re
 import shlex
 import traceback
@@ -123,7 +124,7 @@ def help_of(module: str, words: list[str]) -> str:
         else module
     )
     main = importlib.import_module(name).main
-    sub = [words[0]] if words and re.fullmatch(r"[a-z][a-z-]*", words[0]) else []
+    sub = list(itertools.takewhile(lambda word: re.fullmatch(r"[a-z][a-z-]*", word), words[:2]))  # or a place it takes
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         main([*sub, "--help"])
@@ -134,7 +135,7 @@ def unknown_flags(text: str) -> list[str]:
     """'module --flag' for every flag in a page's commands that the program's help does not name."""
     wrong, helps = [], {}
     for module, words in commands(text):
-        key = (module, words[0] if words else "")
+        key = (module, *words[:2])
         if key not in helps:
             helps[key] = help_of(module, words)
         flags = [w.partition("=")[0] for w in words if re.match(r"--?[a-z]", w)]
