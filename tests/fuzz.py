@@ -182,7 +182,9 @@ def runs() -> dict[str, Target]:
 
     def read_run(root: Path) -> None:
         folder = RunFolder(root)
-        folder.read_config(), folder.origin(), folder.read_metrics()
+        folder.read_config()
+        folder.origin()
+        folder.read_metrics()
 
     def sweep(root: Path) -> None:
         folder = SweepFolder(spec.load(str(write_sweep(root))))

@@ -100,7 +100,7 @@ def write_room(
     save_manifest(
         SceneManifest(
             name=folder.name,
-            split=split,
+            split=split,  # pyright: ignore[reportArgumentType]
             source={"format": "toy", "files": {}},
             licence="CC0-1.0",
             floor_area_m2=float(free.sum() * resolution_m**2),

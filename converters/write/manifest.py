@@ -60,7 +60,7 @@ def make_manifest(
     parameters = {k: v for k, v in dataclasses.asdict(decompose).items() if k != "timeout_s"}
     return SceneManifest(
         name=parts.name,
-        split=split,
+        split=split,  # pyright: ignore[reportArgumentType]: load_manifest checks it
         source={"format": raw.source_format, "sha256": raw.sources},
         licence=raw.licence,
         floor_area_m2=round(floor_area_m2, 3),

@@ -238,7 +238,7 @@ def main() -> None:
                 mesh = {"up": "z", "unit": "m"}
             began = time.process_time()
             try:
-                read_source(place, **mesh)
+                read_source(place, **mesh)  # pyright: ignore[reportArgumentType]
                 said = "read"
             except SceneRejected as error:
                 said = str(error)

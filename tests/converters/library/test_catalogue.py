@@ -20,7 +20,7 @@ ENTRY = {
 }  # fmt: skip
 
 
-def write_library(path: Path, **changes: str) -> Path:
+def write_library(path: Path, **changes: str | None) -> Path:
     """A library of one chair; a change to None leaves its key out."""
     entry = {k: v for k, v in {**ENTRY, **changes}.items() if v is not None}
     lines = ["# a comment", "license=Public domain", *(f"{k}#1={v}" for k, v in entry.items())]

@@ -113,7 +113,7 @@ def test_a_mirrored_or_inside_out_mesh_is_refused_and_mirrors_back(tmp_path, cei
     right = tall_room()
     if ceiling:
         lid = [[0, 0, 2.3], [3.0, 0, 2.3], [3.0, 2.5, 2.3], [0, 2.5, 2.3]]
-        right = trimesh.util.concatenate([right, trimesh.Trimesh(lid, [[0, 2, 1], [0, 3, 2]], process=False)])
+        right += trimesh.Trimesh(lid, [[0, 2, 1], [0, 3, 2]], process=False)
     right.export(tmp_path / "right.ply")
     expected = read_source(tmp_path / "right.ply", up="z")
     assert expected.floor_height_m == pytest.approx(tiny_raw.FLOOR_M, abs=0.01)

@@ -44,7 +44,7 @@ def box_at(x: float, y: float, size: tuple[float, float, float]) -> PlacedObject
 @pytest.mark.parametrize("at", [(-0.4, 1.0), (1.0, -0.4), (2.4, 1.0), (-5.0, 9.0)])
 def test_a_thing_beside_the_map_shadows_nothing(at):
     maps = SceneMaps(np.ones((40, 40), bool), CELL_M, (0.0, 0.0), 0.0)
-    assert not shadow([box_at(*at, (0.4, 0.4, 0.4))], maps).any()
+    assert not shadow([box_at(at[0], at[1], (0.4, 0.4, 0.4))], maps).any()
     assert shadow([box_at(1.0, 1.0, (0.4, 0.4, 0.4))], maps).sum() == 64
 
 

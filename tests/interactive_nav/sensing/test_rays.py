@@ -16,7 +16,7 @@ from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav.sensing.boxes import build_boxes
 from interactive_nav.sensing.rays import RayRenderer, cast_fan
-from scenes_mjcf.categories import SEGMENTATIONS, class_id
+from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses, class_id
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
@@ -29,7 +29,7 @@ def drawn(boxes, jumble):
     return jax.jit(RayRenderer(boxes, LENS, tiled=True).render_batch)(scene, qpos, look_along(eye, forward))
 
 
-def c_mujoco(world, scene, qpos, pos, axes, lens, classes=4):
+def c_mujoco(world, scene, qpos, pos, axes, lens, classes: MaskClasses = 4):
     """Depth and class ids by `mj_multiRay` over the physics model's own geoms, the robot's left out."""
     model, layout = world.models[scene], world.layout
     data = mujoco.MjData(model)
