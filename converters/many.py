@@ -6,6 +6,7 @@ fails or is killed costs no other.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -29,7 +30,7 @@ from converters.sets import Runner, run_side_by_side
 from interactive_nav_common.errors import ConfigError, FileError, UserError
 from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.rows import write_parquet
-from scenes_mjcf.schema import load_manifest
+from scenes_mjcf.schema import SceneError, load_manifest
 
 ROWS = "conversions.parquet"
 SCHEMA = pa.schema(
@@ -58,9 +59,11 @@ def digest_of(source: Path, config: ConvertConfig, scenes: Sequence[Path] = ()) 
     roots = [root for root in (source, config.library) if root is not None]
     paths = [(root, path) for root in roots for path in (root, *sorted(root.rglob("*"))) if path.is_file()]
     if source.is_file():
-        root, made = root_of(source), [s for s in scenes if (s / "scene.json").is_file()]
-        named = sorted({name for scene in made for name in load_manifest(scene).source["sha256"]})
-        paths += [(root, root / name) for name in named if (root / name).is_file()]
+        root, named = root_of(source), set()
+        for scene in scenes:
+            with contextlib.suppress(SceneError):  # a damaged one has no digest of before, so it is made again
+                named |= set(load_manifest(scene).source.get("sha256", {}))
+        paths += [(root, root / name) for name in sorted(named) if (root / name).is_file()]
     files = [(os.path.relpath(p, root), p.stat().st_size, p.stat().st_mtime_ns) for root, p in paths]
     options = {**dataclasses.asdict(config), "jobs": 0, "overwrite": False, "library": config.library is not None}
     return hashlib.sha256(repr((options, files)).encode()).hexdigest()[:16]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import concurrent.futures.process
 import dataclasses
 import multiprocessing
 import re
@@ -24,7 +25,7 @@ from converters.library.store import Credit, Model, Shape, attribution, write_li
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.read.obj import TexturedMesh
-from converters.records.errors import SceneRejected
+from converters.records.errors import SceneRejected, StageFailed
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud
 from converters.write.texture import bake_object, colour_cloud
@@ -187,6 +188,10 @@ def build(
             for one, future in zip(chosen, running, strict=True):
                 done.append(future.result())
                 report(one.piece.key, len(done) / len(chosen))
+        except concurrent.futures.process.BrokenProcessPool:
+            raise StageFailed(
+                f"library: a process died while {jobs} models were made; try again with fewer --jobs"
+            ) from None
         finally:
             pool.shutdown(cancel_futures=True)
     with whole_file(target / "models.zip") as partial:

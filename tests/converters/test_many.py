@@ -127,6 +127,8 @@ def test_a_file_that_the_source_names_is_one_of_its_inputs(tmp_path):
     assert convert() == 1 and convert() == 0 and lines[0] == "room: is there, kept"
     (tmp_path / "paint.mtl").write_text("newmtl wall\nKd 0.9 0.1 0.1\n")
     assert convert() == 1 and convert() == 0
+    (tmp_path / "o" / "room" / "scene.json").write_text("{")  # what is damaged is made again, and stops nothing
+    assert convert() == 1 and convert() == 0
 
 
 def test_of_the_command(tmp_path, monkeypatch, capsys):
