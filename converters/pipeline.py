@@ -16,7 +16,7 @@ import numpy as np
 
 from converters.bodies.alignment import Alignment
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
-from converters.bodies.objects import PlacedObject, name_objects, place_object, to_world
+from converters.bodies.objects import PlacedObject, name_objects, place_object
 from converters.bodies.physical import physical_properties, with_source
 from converters.bodies.placement import compare, upright
 from converters.check.gates import evaluate
@@ -34,16 +34,16 @@ from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.gate import Gate
 from converters.records.raw import CATEGORY_LABELS, RawScene
-from converters.records.visual import ColourCloud, VisualMesh, joined_clouds
+from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
 from converters.structure.floor import level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.structure.walls import wall_boxes
+from converters.write.drawn import Drawn, as_it_is, draw_objects
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest, scene_objects
-from converters.write.texture import bake_object, bake_structure, colour_cloud
+from converters.write.texture import bake_structure, colour_cloud
 from interactive_nav_common.files import check_name, part_folder, publish
-from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
 PARALLEL_OBJECTS = 8
@@ -71,7 +71,8 @@ class ConvertConfig:
     timeout_s: float = dataclasses.field(default=240.0, metadata=NOT_HASHED)
     """Of the decomposition of one model."""
     structure_faces: int = 16000
-    object_faces: int = 1500
+    object_faces: int = 3000
+    """Most, where a simplification within 1 cm leaves more."""
     structure_texture: int = 1024
     object_texture: int = 256
     auto_align: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
@@ -136,7 +137,15 @@ def _structure_visual(
     annotated: tuple[PlacedObject, ...],
     config: ConvertConfig,
 ) -> tuple[VisualMesh, float]:
-    """The cleaned scan, levelled, filled, simplified and textured; and the area of the patches, m2."""
+    """The scan as it is, where it is small and whole; else levelled, filled, simplified and textured.
+
+    Returns:
+        The mesh and the area of the patches, m2.
+    """
+    own = TexturedMesh(vertices_w, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
+    small = as_it_is(own, config.structure_faces, config.structure_texture)
+    if small is not None and keep.all() and not raw.picture:
+        return small, 0.0
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
@@ -153,34 +162,34 @@ def _structure_visual(
     return bake_structure(*whole, both, config.structure_texture), area
 
 
-def _object_visual(cloud: ColourCloud, annotated: PlacedObject, max_faces: int, size: int) -> tuple[VisualMesh, float]:
-    """The CAD model retextured at its annotated pose (where the scan showed it), in the body frame."""
-    vertices_w, faces = to_world(annotated, annotated.vertices_b), annotated.faces
-    low = simplify(vertices_w, faces, max_faces)
-    visual, seen = bake_object(vertices_w, faces, annotated.face_colours, cloud, low, size)
-    back = (visual.vertices - annotated.position_w) @ matrix_from_quat(annotated.quaternion_w)
-    return dataclasses.replace(visual, vertices=back), seen
-
-
 def _object_visuals(
     raw: RawScene,
     vertices_w: np.ndarray,
     owner: np.ndarray,
     annotated: tuple[PlacedObject, ...],
     config: ConvertConfig,
-) -> list[tuple[VisualMesh, float]]:
-    """Every object's visual and the share of it that the scan showed, side by side in processes."""
+) -> list[Drawn]:
+    """Every object's visual, model by model, side by side in processes."""
+    models: dict[tuple[str, bytes], list[int]] = {}
+    for k, placed in enumerate(annotated):
+        models.setdefault((placed.cad_id, placed.vertices_b.tobytes()), []).append(k)
+    # A modelled structure shows nothing of what stands in it.
+    shown = np.full_like(owner, -1) if raw.picture else owner
     clouds = [
-        colour_cloud(raw.scan, vertices_w, raw.scan.faces, np.flatnonzero(owner == k)) for k in range(len(annotated))
+        colour_cloud(raw.scan, vertices_w, raw.scan.faces, np.flatnonzero(shown == k)) for k in range(len(annotated))
     ]
-    count = len(annotated)
-    bake = functools.partial(_object_visual, max_faces=config.object_faces, size=config.object_texture)
-    if config.jobs < 2 or count < PARALLEL_OBJECTS:
-        return [bake(c, o) for c, o in zip(clouds, annotated, strict=True)]
-    # Not forked: the caller may hold threads.
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(min(config.jobs, count), mp_context=context) as pool:
-        return list(pool.map(bake, clouds, annotated))
+    groups = [([annotated[k] for k in of], [clouds[k] for k in of]) for of in models.values()]
+    draw = functools.partial(draw_objects, most_faces=config.object_faces, size=config.object_texture)
+    if config.jobs < 2 or len(groups) < PARALLEL_OBJECTS:
+        drawn = [draw(*group) for group in groups]
+    else:
+        # Not forked: the caller may hold threads.
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(min(config.jobs, len(groups)), mp_context=context) as pool:
+            drawn = list(pool.map(draw, *zip(*groups, strict=True)))
+    places = [k for of in models.values() for k in of]
+    made = dict(zip(places, [one for some in drawn for one in some], strict=True))
+    return [made[k] for k in range(len(annotated))]
 
 
 def _with_alignments(
@@ -215,13 +224,14 @@ def _decompose_models(
 
 
 def _report_objects(
-    rows: list[dict[str, Any]], settled: Settled, seen: list[float], annotated: tuple[PlacedObject, ...]
+    rows: list[dict[str, Any]], settled: Settled, drawn: list[Drawn], annotated: tuple[PlacedObject, ...]
 ) -> None:
-    """Adds to each object's row how it settled and how much of it the scan showed."""
-    for row, moved, drop, share, placed in zip(
-        rows, settled.displacement_m, settled.drop_m, seen, annotated, strict=True
+    """Adds to each object's row how it settled, how much of it the scan showed and what is drawn of its surface."""
+    for row, moved, drop, own, placed in zip(
+        rows, settled.displacement_m, settled.drop_m, drawn, annotated, strict=True
     ):
-        row |= {"settle_shift_m": moved, "settle_drop_m": drop, "texture_seen_share": round(share, 3)}
+        row |= {"settle_shift_m": moved, "settle_drop_m": drop, "texture_seen_share": round(own.seen_share, 3)}
+        row |= {"drawn_area_share": round(own.kept_share, 3), "drawn_off_m": round(own.off_m, 4)}
         if placed.hinge is not None:
             row["hinge_assumed"] = placed.hinge.assumed
 
@@ -270,13 +280,14 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         unsettled = SceneParts(raw.name, annotated, physical, walls)
         settled = settle(unsettled) if annotated else Settled(unsettled, (), ())
     with clock.stage("texture") as progress:
-        structure, _ = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
+        structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)[0]
         progress(0.5)
-        baked = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
-        visuals, seen = [v for v, _ in baked], [share for _, share in baked]
-    _report_objects(rows, settled, seen, annotated)
+        drawn = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
+    _report_objects(rows, settled, drawn, annotated)
     with clock.stage("write"):
-        parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=tuple(visuals))
+        parts = dataclasses.replace(
+            settled.parts, structure_visual=structure, object_visuals=tuple(d.mesh for d in drawn)
+        )
         write_scene(parts, folder)
         save_maps(maps, folder)
     with clock.stage("gates"):

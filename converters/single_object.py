@@ -24,19 +24,20 @@ from converters.bodies.physical import MATERIALS, Physical, mass_moments
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
-from converters.geometry.faces import merge_vertices, simplify
+from converters.geometry.faces import merge_vertices
 from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.geometry.simplify import simplify_to
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import RigidObject, read_urdf
 from converters.records.errors import SceneRejected
-from converters.records.raw import ScanMesh
 from converters.records.visual import VisualMesh
+from converters.write.drawn import as_it_is
 from converters.write.emit import SceneParts, build_spec, write_scene
 from converters.write.manifest import PACKAGES
-from converters.write.texture import bake_object, colour_cloud
+from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.files import whole_folder
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import TABLE
@@ -46,7 +47,7 @@ FOOT_SHARE = 0.03
 """Of the height: what ends within this above the base is brought down to it. Collision meshes come from voxels, and
 a pot on unequal hulls rests tilted."""
 TEXELS = 256
-FACES = 1500
+FACES = 3000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,23 +122,16 @@ def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
 
 
 def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
-    """The surface simplified, with a texture of its own (body frame, as the vertices)."""
+    """The surface as it is where it is small, else simplified with a texture of its own (body frame)."""
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     colours = colours_of_faces(surface)[keep]
     vertices, faces, colours = clean_surface(source, where, vertices, faces, colours)
-    extent = float(np.ptp(vertices, axis=0).max())
-    scan = ScanMesh(
-        surface.vertices,
-        surface.faces,
-        np.zeros(len(surface.vertices), np.int64),
-        np.full((len(surface.vertices), 3), 170, np.uint8) if surface.texture is None else None,
-        surface.corner_uv if surface.texture is not None else None,
-        surface.texture,
-    )
-    # Points twice as dense as the texels of the picture; a grey model has nothing to show but its faces' colour.
-    chosen = np.arange(len(surface.faces)) if surface.texture is not None else np.zeros(0, np.int64)
-    cloud = colour_cloud(scan, surface.vertices, surface.faces, chosen, max(extent / TEXELS, 1e-4))
-    return bake_object(vertices, faces, colours, cloud, simplify(vertices, faces, FACES), TEXELS)[0]
+    small = as_it_is(surface, FACES, TEXELS)
+    if small is not None:
+        return small
+    # Points twice as dense as the texels of the picture.
+    cloud = textured_cloud(surface, max(float(np.ptp(vertices, axis=0).max()) / TEXELS, 1e-4))
+    return bake_object(vertices, faces, colours, cloud, simplify_to(vertices, faces, FACES), TEXELS)[0]
 
 
 def convert_object(

@@ -10,6 +10,7 @@ import numpy as np
 from converters.bodies.alignment import Alignment
 from converters.geometry.boxes import Hull, OrientedBox, convex_hull, fit_box
 from converters.records.raw import Annotation, CadModel
+from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
 
 FOOT_M = 0.02
@@ -47,6 +48,8 @@ class PlacedObject:
     quaternion_w: np.ndarray
     """(4,) w x y z."""
     hinge: BodyHinge | None
+    surface_b: TexturedMesh | None = None
+    """What the model looks like, where it has more than the colours of its faces."""
 
 
 def to_world(placed: PlacedObject, points_b: np.ndarray) -> np.ndarray:
@@ -100,7 +103,7 @@ def place_object(
         floor_height_m: of the scan frame; the world's z is the scan's less this.
         walls_yaw: main direction of the building, rad.
     """
-    vertices = cad.vertices * pose.scale
+    vertices, look = cad.vertices * pose.scale, cad.surface
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     hulls = tuple(convex_hull(h.vertices * pose.scale - base) for h in hulls_cad)
@@ -121,6 +124,7 @@ def place_object(
         position_w=position,
         quaternion_w=np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)]),
         hinge=_door_hinge(annotation, pose.scale, base, high - low) if annotation.category == "door" else None,
+        surface_b=None if look is None else dataclasses.replace(look, vertices=look.vertices * pose.scale - base),
     )
 
 

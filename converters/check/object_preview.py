@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
 from converters.read.files import read_image, read_textured_obj
-from converters.records.raw import ScanMesh
-from converters.write.texture import colour_cloud
+from converters.records.visual import TexturedMesh
+from converters.write.texture import textured_cloud
 from interactive_nav_common.files import check_name
 from scenes_mjcf.schema import SCENES, SceneError
 
@@ -69,9 +69,8 @@ def draw_object(folder: Path) -> Figure:
     turn, origin = data.xmat[body].reshape(3, 3), data.xpos[body]
     vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{name}_visual.obj")
     image = read_image(folder / "assets" / f"{name}.png", "RGB")
-    scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
     size_m = float(np.ptp(vertices, axis=0).max())
-    cloud = colour_cloud(scan, vertices @ turn.T + origin, faces, np.arange(len(faces)), 0.9 * size_m / PIXELS)
+    cloud = textured_cloud(TexturedMesh(vertices @ turn.T + origin, faces, corner_uv, image), 0.9 * size_m / PIXELS)
     figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
     for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
         points = cloud.points @ axes_w.T

@@ -27,10 +27,10 @@ from converters.bodies.objects import PlacedObject
 from converters.check.object_preview import draw_object, view
 from converters.geometry.boxes import convex_hull
 from converters.read.files import read_image, read_textured_obj
-from converters.records.raw import RawScene, ScanMesh
-from converters.records.visual import ColourCloud
+from converters.records.raw import RawScene
+from converters.records.visual import ColourCloud, TexturedMesh
 from converters.structure.cut import cut_furniture
-from converters.write.texture import colour_cloud
+from converters.write.texture import colour_cloud, textured_cloud
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
@@ -80,9 +80,7 @@ def _coloured_points(folder: Path, stem: str, spacing_m: float) -> ColourCloud:
     """Points on a visual mesh, as stored."""
     vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{stem}_visual.obj")
     image = read_image(folder / "assets" / f"{stem}.png", "RGB")
-    assert corner_uv is not None
-    scan = ScanMesh(vertices, faces, np.zeros(len(vertices), np.int64), None, corner_uv, image)
-    return colour_cloud(scan, vertices, faces, np.arange(len(faces)), spacing_m)
+    return textured_cloud(TexturedMesh(vertices, faces, corner_uv, image), spacing_m)
 
 
 def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:

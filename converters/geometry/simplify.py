@@ -7,13 +7,22 @@ import numpy as np
 import trimesh
 from scipy import sparse
 from scipy.sparse import csgraph
+from scipy.spatial import KDTree
 
-from converters.geometry.faces import face_areas, merge_vertices, sample_faces
+from converters.geometry.faces import face_areas, merge_vertices, sample_faces, simplify
 
 PLAIN_FACES = 12
 """A part of so few faces stays as it is: a box."""
 SAMPLES = 1500
 """Points of a part that its simplification is measured at, about."""
+MOST_M, LEAST_AREA = 0.01, 0.97
+"""How far a surface may be simplified."""
+LOOSER, ROUNDS = 1.6, 3
+"""What exceeds a number of faces is simplified to an error larger by this factor, so many times."""
+SPREAD, NEAREST, WORST = 6000, 8, 200
+"""Samples of a mesh, about, that a distance is sought at; how many of them; distances that are computed exactly."""
+LOSS_M = 0.03
+"""Sampling of a surface whose loss is measured."""
 
 
 def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
@@ -29,9 +38,26 @@ def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
 
 
 def surface_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n,) distance of points to a triangle mesh, m."""
+    """(n,) distance of points to a triangle mesh, m: to the nearest of the faces whose samples are nearest.
+
+    At most the samples' spacing too large, which is a share of the mesh's size.
+    """
+    area = float(face_areas(vertices, faces).sum())
+    samples, face = sample_faces(vertices, faces, max(np.sqrt(2 * area / SPREAD), 1e-4))
+    index = KDTree(samples).query(points, k=min(NEAREST, len(samples)))[1].reshape(len(points), -1)
+    corners = vertices[faces[face[index]]].reshape(-1, 3, 3)
+    near = trimesh.triangles.closest_point(corners, np.repeat(points, index.shape[1], axis=0))
+    return np.linalg.norm(near.reshape(*index.shape, 3) - points[:, None], axis=2).min(axis=1)
+
+
+def farthest(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, most_m: float = 0.0) -> float:
+    """Largest distance of points to a triangle mesh, m; exact where it is beyond `most_m`."""
+    about = surface_distance(points, vertices, faces)
+    beyond = np.argsort(-about)[:WORST]
+    if about[beyond[0]] <= most_m:
+        return float(about[beyond[0]])
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    return np.asarray(trimesh.proximity.closest_point(mesh, points)[1])
+    return float(trimesh.proximity.closest_point(mesh, points[beyond])[1].max())
 
 
 def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: float) -> tuple[np.ndarray, np.ndarray]:
@@ -49,8 +75,8 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
         if (
             0 < reached < len(best[1])
             and face_areas(*tried).sum() >= least * area
-            and surface_distance(points, *tried).max() <= most_m
-            and surface_distance(tried[0], vertices, faces).max() <= most_m
+            and farthest(points, *tried, most_m) <= most_m
+            and farthest(tried[0], vertices, faces, most_m) <= most_m
         ):
             best, high = tried, target
         else:
@@ -59,7 +85,7 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
 
 
 def simplify_within(
-    vertices: np.ndarray, faces: np.ndarray, most_m: float = 0.01, least: float = 0.97
+    vertices: np.ndarray, faces: np.ndarray, most_m: float = MOST_M, least: float = LEAST_AREA
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with as few faces as leave each loose part where it was.
 
@@ -83,3 +109,20 @@ def simplify_within(
         done.append((piece[0], piece[1] + first))
         first += len(piece[0])
     return np.vstack([v for v, _ in done]), np.vstack([f for _, f in done])
+
+
+def simplify_to(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh simplified within `MOST_M` and `LEAST_AREA`; within more, and then in any case, to so many faces."""
+    most_m, low = MOST_M, simplify_within(vertices, faces)
+    while len(low[1]) > most_faces and most_m < MOST_M * LOOSER**ROUNDS:
+        most_m *= LOOSER
+        low = simplify_within(*low, most_m)
+    return simplify(*low, most_faces)
+
+
+def surface_loss(
+    vertices: np.ndarray, faces: np.ndarray, low_vertices: np.ndarray, low_faces: np.ndarray
+) -> tuple[float, float]:
+    """Share of a mesh's area that a simplified one has, and the farthest that the mesh lies from it, m."""
+    kept = face_areas(low_vertices, low_faces).sum() / face_areas(vertices, faces).sum()
+    return float(kept), farthest(sample_faces(vertices, faces, LOSS_M)[0], low_vertices, low_faces)

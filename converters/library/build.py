@@ -18,30 +18,24 @@ import numpy as np
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import face_areas, merge_vertices, sample_faces, simplify
-from converters.geometry.simplify import simplify_within, surface_distance
+from converters.geometry.faces import merge_vertices
+from converters.geometry.simplify import simplify_to, simplify_within, surface_loss
 from converters.library.catalogue import Catalogue, Piece, read_catalogue, unpack_model
 from converters.library.store import Credit, Model, Shape, attribution, write_library
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected, StageFailed
-from converters.records.raw import ScanMesh
-from converters.records.visual import ColourCloud
-from converters.write.texture import bake_object, colour_cloud
+from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.records import Reader
 from scenes_mjcf.categories import CATEGORIES
 
 SELECTION = Path(__file__).with_name("selection.yaml")
-MOST_M, LEAST_AREA = 0.01, 0.97
-"""How far a surface may be simplified."""
 MOST_FACES = 3000
 MOST_LOST, MOST_OFF_M = 0.1, 0.04
 """What a model may lose of its area, and lie off, at that number."""
-LOOSER, ROUNDS = 1.6, 3
-"""What exceeds them is simplified to an error larger by this factor, so many times, and then to their number."""
 SOLID_M = 0.004
 """Error of the surface that is decomposed."""
 TEXELS = 256
@@ -107,15 +101,6 @@ def _standing(points: np.ndarray, foot_m: float) -> np.ndarray:
     return np.vstack([points, level])
 
 
-def _cloud(surface: TexturedMesh) -> ColourCloud:
-    if surface.texture is None:
-        return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
-    none = np.zeros(len(surface.vertices), np.int64)
-    scan = ScanMesh(surface.vertices, surface.faces, none, None, surface.corner_uv, surface.texture)
-    spacing = max(float(np.ptp(surface.vertices, axis=0).max()) / TEXELS, 1e-3)
-    return colour_cloud(scan, surface.vertices, surface.faces, np.arange(len(surface.faces)), spacing)
-
-
 def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]:
     """One model, ready to be packaged.
 
@@ -133,13 +118,9 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
     made = decompose_all({piece.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
     foot_m = FOOT_SHARE * piece.size_m[1]
     hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in made.hulls[piece.key])
-    most_m, low = MOST_M, simplify_within(vertices, faces, MOST_M, LEAST_AREA)
-    while len(low[1]) > MOST_FACES and most_m < MOST_M * LOOSER**ROUNDS:
-        most_m *= LOOSER
-        low = simplify_within(*low, most_m, LEAST_AREA)
-    low = simplify(*low, MOST_FACES)
-    lost = 1 - face_areas(*low).sum() / face_areas(vertices, faces).sum()
-    off_m = surface_distance(sample_faces(vertices, faces, 0.03)[0], *low).max()
+    low = simplify_to(vertices, faces, MOST_FACES)
+    kept, off_m = surface_loss(vertices, faces, *low)
+    lost = 1 - kept
     if lost > MOST_LOST or off_m > MOST_OFF_M:
         raise SceneRejected(
             f"{where}: loses {lost:.2f} of its surface or {off_m:.3f} m at {len(low[1])} faces; leave it out"
@@ -148,7 +129,8 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
         raise SceneRejected(
             f"{where}: has {len(low[1])} faces after simplification, expected {MOST_FACES}; leave it out"
         )
-    visual, _ = bake_object(vertices, faces, colours, _cloud(surface), low, TEXELS)
+    spacing_m = max(float(np.ptp(surface.vertices, axis=0).max()) / TEXELS, 1e-3)
+    visual, _ = bake_object(vertices, faces, colours, textured_cloud(surface, spacing_m), low, TEXELS)
     credit = Credit(piece.name, piece.creator, _licence(chosen.catalogue.licence), piece.key)
     size_m = (round(piece.size_m[0], 4), round(piece.size_m[1], 4), round(piece.size_m[2], 4))
     model = Model(piece.key, chosen.category, chosen.split, size_m, len(visual.faces), len(hulls), credit)

@@ -1,4 +1,4 @@
-"""A ShapeNet-like OBJ with its materials in, one `CadModel` (z up, a colour per face) out."""
+"""A ShapeNet-like OBJ with its materials in, one `CadModel` (z up) out."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from converters.geometry.faces import merge_vertices
 from converters.geometry.pieces import convex_pieces
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder, read_obj
-from converters.read.obj import GREY, read_painted_obj, texels
+from converters.read.obj import GREY, join_textures, read_painted_obj, texels
 from converters.records.errors import SceneRejected
 from converters.records.raw import SYNSETS, CadModel
+from converters.records.visual import TexturedMesh
 
 COLLISION = "collision.obj"
 """Beside a model: its collision mesh, made of convex pieces that share no vertex."""
@@ -49,7 +50,12 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     vertices, faces, keep = merge_vertices(mesh.vertices[used], faces.reshape(-1, 3))
     vertices, faces, colours = clean_surface(source, relative, vertices, faces, colours[order][keep])
     pieces = _own_pieces(source, f"cad/{synset}/{cad_id}/models/{COLLISION}")
-    return CadModel(SYNSETS[synset], cad_id, vertices @ Y_UP_TO_Z_UP.T, faces, colours, pieces)
+    surface = None
+    if images:
+        uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
+        surface = TexturedMesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, *join_textures(uv, image, images))
+    turned = vertices @ Y_UP_TO_Z_UP.T
+    return CadModel(SYNSETS[synset], cad_id, turned, faces, colours, pieces, surface=surface)
 
 
 def _own_pieces(source: SourceFolder, relative: str) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:

@@ -6,7 +6,6 @@ missing costs colour only and is a warning.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 from urllib.parse import unquote
@@ -17,6 +16,7 @@ from PIL import Image
 from converters.read.files import ObjMesh, SourceFolder, read_image, read_obj
 from converters.records.errors import SceneRejected
 from converters.records.limits import PIXELS
+from converters.records.visual import TexturedMesh
 
 GREY = (170, 170, 170)
 """Colour of what has none."""
@@ -24,20 +24,6 @@ MAX_TEXTURE_PX = 8192
 """Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
 SMALL_IMAGE = 10_000
 """Numbers in an image that is compared with others to be kept once."""
-
-
-@dataclasses.dataclass(frozen=True)
-class TexturedMesh:
-    """A mesh with at most one image."""
-
-    vertices: np.ndarray
-    """(n, 3) float64, m."""
-    faces: np.ndarray
-    """(m, 3) int64."""
-    corner_uv: np.ndarray | None
-    """(m, 3, 2) float64, origin at the lower left, or None without an image."""
-    texture: np.ndarray | None
-    """(h, w, 3) uint8, or None."""
 
 
 def find_file(source: SourceFolder, folder: Path, name: str) -> Path | None:

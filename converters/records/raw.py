@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 
 from converters.records.cache import NOT_HASHED
+from converters.records.visual import TexturedMesh
 from scenes_mjcf.categories import TABLE
 
 SYNSETS = {category.synset: category.name for category in TABLE if category.synset}
@@ -64,6 +65,8 @@ class CadModel:
     """The source's own mass; None: density times volume."""
     friction: float | None = None
     """The source's own sliding coefficient; None: the category's."""
+    surface: TexturedMesh | None = None
+    """What it looks like, CAD frame; None: nothing but the colours of the faces."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,6 +20,20 @@ class ColourCloud:
 
 
 @dataclasses.dataclass(frozen=True)
+class TexturedMesh:
+    """A mesh with at most one image."""
+
+    vertices: np.ndarray
+    """(n, 3) float64, m."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    corner_uv: np.ndarray | None
+    """(m, 3, 2) float64, origin at the lower left, or None without an image."""
+    texture: np.ndarray | None
+    """(h, w, 3) uint8, or None."""
+
+
+@dataclasses.dataclass(frozen=True)
 class VisualMesh:
     """A mesh with texture coordinates of its own index."""
 
@@ -33,6 +47,8 @@ class VisualMesh:
     """(m, 3) into `uv`."""
     image: np.ndarray
     """(h, w, 3) uint8, first row at the top."""
+    exact: bool = False
+    """The image is the source's own, and is written as it is."""
 
 
 def joined_clouds(*clouds: ColourCloud) -> ColourCloud:

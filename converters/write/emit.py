@@ -15,7 +15,7 @@ from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
 from converters.geometry.boxes import Hull, OrientedBox, least_turned
 from converters.records.visual import VisualMesh
-from converters.write.texture import quantise
+from converters.write.texture import as_png, quantise
 
 TIMESTEP_S = 0.005
 DOOR_DAMPING = 2.0
@@ -250,7 +250,8 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
             visual.uv_faces,
             decimals=3 if stem == "structure" else 4,
         )
-        quantise(visual.image, palette).save(assets / f"{stem}.png", optimize=True)
+        image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
+        image.save(assets / f"{stem}.png", optimize=True)
     for placed in parts.objects:
         for i, hull in enumerate(placed.hulls_b):
             _write_hull(assets / f"{placed.name}_hull_{i}.obj", hull)

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from converters.geometry.faces import sample_faces
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
-from converters.records.visual import ColourCloud, VisualMesh
+from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
 
 SEEN_M = 0.08
 """A scan point this close to the model's surface shows it: alignments are off by several centimetres."""
@@ -63,6 +63,15 @@ def colour_cloud(
     column = np.clip((uv[:, 0] % 1.0 * width).astype(int), 0, width - 1)
     row = np.clip(((1.0 - uv[:, 1] % 1.0) * height).astype(int), 0, height - 1)
     return ColourCloud(points, _unit(normal)[index], scan.texture[row, column].astype(float))
+
+
+def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
+    """Coloured points of a whole surface with an image; none without one."""
+    if mesh.texture is None:
+        return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+    none = np.zeros(len(mesh.vertices), np.int64)
+    scan = ScanMesh(mesh.vertices, mesh.faces, none, None, mesh.corner_uv, mesh.texture)
+    return colour_cloud(scan, mesh.vertices, mesh.faces, np.arange(len(mesh.faces)), spacing_m)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -148,6 +157,17 @@ def fill_image(texel: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
     nearest = ndimage.distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
     assert nearest is not None
     return np.clip(np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]]), 0, 255).astype(np.uint8)
+
+
+def as_png(image: np.ndarray) -> Image.Image:
+    """The image (h, w, 3) uint8 to the bit, with a palette where it has at most 256 colours."""
+    packed = image.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32)
+    colours, index = np.unique(packed, return_inverse=True)
+    if len(colours) > 256:
+        return Image.fromarray(image)
+    made = Image.fromarray(index.reshape(packed.shape).astype(np.uint8)).convert("P")
+    made.putpalette((colours[:, None] >> np.array([16, 8, 0], np.uint32) & 255).astype(np.uint8).tobytes())
+    return made
 
 
 def quantise(image: np.ndarray, colours: int) -> Image.Image:

@@ -15,6 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from converters.__main__ import main
@@ -22,6 +23,7 @@ from converters.check.gates import LIMITS
 from converters.check.settle import settle
 from converters.clock import STAGES
 from converters.pipeline import ConvertConfig, convert
+from converters.read.files import read_textured_obj
 from converters.records.errors import SceneRejected
 from converters.records.gate import Limit
 from interactive_nav_common.errors import FileError
@@ -275,3 +277,22 @@ def test_the_next_conversion_clears_what_a_killed_one_left_and_not_what_runs(pri
         convert(pristine / "gibson", out, ConvertConfig(), cache=hull_cache)
     assert (out / "scene.json").read_text() == "kept"
     assert sorted(p.name for p in out.parent.iterdir()) == [".output.part-1", "out"]  # another scene's stays
+
+
+def test_a_small_whole_scan_is_drawn_as_it_is(tmp_path, hull_cache):
+    """Own vertices, texture coordinates and image, to the bit."""
+    room = trimesh.creation.box((4.0, 3.0, 2.5)).apply_translation((2.0, 1.5, 1.25))
+    room.invert()
+    colours = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
+    uv = np.round(np.random.default_rng(1).random((len(room.vertices), 2)), 4)
+    room.visual = trimesh.visual.TextureVisuals(uv, image=Image.fromarray(colours))
+    (tmp_path / "raw").mkdir()
+    room.export(tmp_path / "raw" / "room.obj")
+    upright = dataclasses.replace(SMALL, up="z")
+    convert(tmp_path / "raw" / "room.obj", tmp_path / "room", upright, None, hull_cache)
+    vertices, faces, corner_uv = read_textured_obj(tmp_path / "room" / "assets" / "structure_visual.obj")
+    assert (np.asarray(Image.open(tmp_path / "room" / "assets" / "structure.png").convert("RGB")) == colours).all()
+    assert corner_uv is not None and len(faces) == 12
+    order, given = np.lexsort(vertices[faces].mean(axis=1).round(4).T), room.triangles.mean(axis=1).round(4)
+    assert np.allclose(vertices[faces].mean(axis=1)[order], given[np.lexsort(given.T)], atol=1e-3)
+    assert np.allclose(np.unique(corner_uv.reshape(-1, 2), axis=0), np.unique(uv, axis=0), atol=1e-4)

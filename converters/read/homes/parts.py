@@ -228,11 +228,12 @@ def _furniture(
     if name == "door":
         turn = leaf_turn(vertices)
         vertices, pose = vertices @ turn, pose.copy()
+        surface = dataclasses.replace(surface, vertices=surface.vertices @ turn)
         pose[:3, :3] = pose[:3, :3] @ turn
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
         hinge = assume_hinge(vertices, pose, structure)
     cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
-    cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction)
+    cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction, surface)
     none = np.zeros((0, 3))
     return Annotation(name, cad_id, pose, "__SYM_NONE", none, none, hinge), cad
 

@@ -37,7 +37,11 @@ def shapenet(root: Path, texture: str = "../images/t.png") -> SourceFolder:
 def test_a_cad_models_texture_in_a_folder_beside_its_own_is_loaded(tmp_path):
     source = shapenet(tmp_path)
     image(tmp_path / "cad/04379243/t/images/t.png")
-    assert (read_cad(source, "04379243", "t").face_colours == RED).all()
+    cad = read_cad(source, "04379243", "t")
+    assert (cad.face_colours == RED).all()
+    assert cad.surface is not None and cad.surface.texture is not None
+    assert (cad.surface.texture == RED).all() and cad.surface.texture.shape == (4, 4, 3)
+    assert np.allclose(np.sort(cad.surface.vertices, axis=0), np.sort(cad.vertices, axis=0))
     assert "cad/04379243/t/images/t.png" in source.sha256
     assert not [w for w in source.warnings if "texture" in w]
 
