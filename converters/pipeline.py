@@ -24,7 +24,7 @@ from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import face_areas, simplify, simplify_parts
+from converters.geometry.faces import simplify, simplify_parts
 from converters.propose.proposals import propose_instances
 from converters.propose.report import floor_of
 from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
@@ -136,30 +136,24 @@ def _structure_visual(
     plan: FloorPlan,
     annotated: tuple[PlacedObject, ...],
     config: ConvertConfig,
-) -> tuple[VisualMesh, float]:
-    """The scan as it is, where it is small and whole; else levelled, filled, simplified and textured.
-
-    Returns:
-        The mesh and the area of the patches, m2.
-    """
+) -> VisualMesh:
+    """The scan as it is, where it is small and whole; else levelled, filled, simplified and textured."""
     own = TexturedMesh(vertices_w, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
     small = as_it_is(own, config.structure_faces, config.structure_texture)
     if small is not None and keep.all() and not raw.picture:
-        return small, 0.0
+        return small
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
     if raw.picture:
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
-        return bake_structure(
-            drawn + (vertices_w[0] - raw.scan.vertices[0]), faces, cloud, config.structure_texture
-        ), 0.0
+        drawn = drawn + (vertices_w[0] - raw.scan.vertices[0])
+        return bake_structure(drawn, faces, cloud, config.structure_texture)
     scan = simplify(level, raw.scan.faces[kept], config.structure_faces)
     patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
     both = joined_clouds(cloud, patch_cloud)
-    area = float(face_areas(patches.vertices, patches.faces).sum())
     whole = np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])])
-    return bake_structure(*whole, both, config.structure_texture), area
+    return bake_structure(*whole, both, config.structure_texture)
 
 
 def _object_visuals(
@@ -280,14 +274,13 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         unsettled = SceneParts(raw.name, annotated, physical, walls)
         settled = settle(unsettled) if annotated else Settled(unsettled, (), ())
     with clock.stage("texture") as progress:
-        structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)[0]
+        structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
         progress(0.5)
         drawn = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
     _report_objects(rows, settled, drawn, annotated)
     with clock.stage("write"):
-        parts = dataclasses.replace(
-            settled.parts, structure_visual=structure, object_visuals=tuple(d.mesh for d in drawn)
-        )
+        visuals = tuple(own.mesh for own in drawn)
+        parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=visuals)
         write_scene(parts, folder)
         save_maps(maps, folder)
     with clock.stage("gates"):
