@@ -104,6 +104,8 @@ def _value(key: str, value: Any, default: Any, where: str) -> Any:
         return tuple(value)
     if value is None and key in OPTIONAL:
         return None
+    if isinstance(default, str):
+        return value
     if isinstance(default, tuple):
         pair = value if isinstance(value, list) else [value, value]
         if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):

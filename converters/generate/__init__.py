@@ -17,6 +17,7 @@ from converters.generate.design.plan import Plan, make_plan
 from converters.generate.homes.config import HomeConfig
 from converters.generate.homes.design import design_home
 from converters.generate.surface.annotate import annotate_items
+from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
 from converters.generate.surface.write import LICENCE, write_cad, write_json, write_png, write_scan
@@ -24,7 +25,7 @@ from interactive_nav_common.files import part_folder, publish
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 3
 """Raised whenever the same seed would give other bytes."""
 
 Progress = Callable[[str, float], None]
@@ -93,9 +94,15 @@ def _design_home(seed: int, cfg: HomeConfig, rng: np.random.Generator) -> Buildi
     return Building(home.plan, home.items, floor_height_m, home.uses, measured)
 
 
-def render_building(building: Building, seed: int, config: BuildingConfig, progress: Progress) -> tuple[Scan, Atlas]:
-    """Scans and paints a building."""
+def render_building(
+    building: Building, seed: int, config: BuildingConfig | HomeConfig, progress: Progress
+) -> tuple[Scan, Atlas]:
+    """Scans and paints a building; of a home without artefacts its exact structure."""
     streams = _streams(seed)
+    if isinstance(config, HomeConfig) and config.artefacts == "none":
+        progress("painting", 0.1)
+        return model_building(building.plan, building.items, building.uses, streams[2])
+    config = config.shell if isinstance(config, HomeConfig) else config
     progress("scanning", 0.1)
     scan = scan_building(building.plan, list(building.items), config, streams[1])
     progress("painting", 0.6)
@@ -131,7 +138,7 @@ def generate_building(
     with part_folder(out_dir, overwrite=True) as work:
         tell("drawing the plan", 0.0)
         building = design_building(seed, cfg)
-        scan, atlas = render_building(building, seed, cfg.shell if isinstance(cfg, HomeConfig) else cfg, tell)
+        scan, atlas = render_building(building, seed, cfg, tell)
         tell("writing", 0.85)
         _write(work, building, scan, atlas, seed, cfg)
         publish({work: out_dir}, overwrite=False)

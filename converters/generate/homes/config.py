@@ -7,6 +7,7 @@ from typing import Any
 
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.models.cad import HOME_TRAIN_MODELS
+from interactive_nav_common.config import nearest
 
 Range = tuple[float, float]
 SHARE_TOLERANCE = 0.02
@@ -25,6 +26,8 @@ COUNTED = (
 """Settings of `BuildingConfig` that say how much of what stands where: a home's rooms and shares say it instead."""
 
 
+ARTEFACTS = ("none", "phone")
+"""Of a scan."""
 OPTIONAL = ("must_push_turtlebot", "must_push_fetch")
 """Settings that may be None."""
 
@@ -47,6 +50,9 @@ class HomeConfig:
     although there is one with them away; None: any."""
     must_push_fetch: Range | None = (0.0, 0.40)
     """The same for Fetch's."""
+    artefacts: str = "none"
+    """`none`: the exact structure, finely painted, without what moves; `phone`: a fused scan of everything, with the
+    holes, noise and wrong labels that a phone's would have."""
 
     @property
     def floor_area_m2(self) -> Range:
@@ -63,12 +69,15 @@ class HomeConfig:
         """Returns itself, or raises.
 
         Raises:
-            GenerationError: an unknown tier, a share that is none, a range upside down, or a shell that
-                `BuildingConfig` refuses.
+            GenerationError: an unknown tier or kind of artefacts, a share that is none, a range upside down, or a shell
+                that `BuildingConfig` refuses.
         """
         if self.tier not in TIERS:
             raise GenerationError(f"tier is '{self.tier}': expected one of {', '.join(TIERS)}")
         self.shell.validate()
+        if self.artefacts not in ARTEFACTS:
+            near = nearest(str(self.artefacts), ARTEFACTS)
+            raise GenerationError(f"artefacts is {self.artefacts!r}: expected one of {', '.join(ARTEFACTS)}{near}")
         if not 0.0 <= self.furniture_share <= MOST_SHARE:
             raise GenerationError(
                 f"furniture_share is {self.furniture_share}: expected 0 to {MOST_SHARE}, no home takes more"

@@ -92,7 +92,7 @@ def annotate_items(items: list[Instance], scan: Scan, floor_height_m: float, cfg
     lift = np.array([0.0, 0.0, floor_height_m])
     centre = (scan.vertices.min(axis=0) + scan.vertices.max(axis=0)) / 2 + lift
     to_world_m = -SCAN_TO_WORLD.apply(centre)
-    owner = np.array([s.owner for s in scan.solids])[scan.solid]
+    owner = scan.owner
     models = []
     for k, item in enumerate(items):
         true_t, true_r = pose_in_world(item, to_world_m, floor_height_m)

@@ -33,6 +33,8 @@ class Finish:
 
     floor_colour: Colouring
     wall_colour: Colouring
+    skirting: bool = True
+    """A board runs along the foot of its walls."""
 
 
 def hashed(*keys: np.ndarray) -> np.ndarray:
@@ -54,11 +56,17 @@ def boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
     return base * (tone * grain * joint)[:, None]
 
 
-def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False) -> np.ndarray:
-    """Square tiles with grout, over a plane's two coordinates."""
+def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False,
+          blur_m: float = 0.0) -> np.ndarray:  # fmt: skip
+    """Square tiles with grout, over a plane's two coordinates; `blur_m` is the width of a texel that takes its share of
+    a line of grout."""
     i, j = np.floor(u / side_m), np.floor(v / side_m)
-    grout = (np.mod(u, side_m) < 0.012) | (np.mod(v, side_m) < 0.012)
-    tone = np.where(grout, 0.75, 0.96 + 0.06 * hashed(i, j))
+    if blur_m:
+        off = np.minimum(*(np.minimum(np.mod(w, side_m), side_m - np.mod(w, side_m)) for w in (u, v)))
+        grout = np.clip((0.0035 + blur_m / 2 - off) / blur_m, 0, 1)
+    else:
+        grout = (np.mod(u, side_m) < 0.012) | (np.mod(v, side_m) < 0.012)
+    tone = 0.75 * grout + (1 - grout) * (0.96 + 0.06 * hashed(i, j))
     if chequered:
         tone = tone * np.where(np.mod(i + j, 2) < 1, 1.0, 0.62)
     return base * tone[:, None]
@@ -99,23 +107,35 @@ def _pictures(
     return hung
 
 
+def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Colours of a picture: a horizon under a sky with a sun.
+
+    Args:
+        at: (n, 2) places, right and up, -1..1 on the picture.
+        half: (2,) half its width and height, m.
+        frame: (3,) colour of its rim.
+        rng: random stream of this picture.
+    """
+    sky, land = rng.uniform(0.45, 0.95, 3), rng.uniform(0.12, 0.7, 3)
+    sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
+    rim = np.asarray(((1 - np.abs(at)) * half < 0.035).any(axis=1))
+    hill = at[:, 1] < horizon + 0.15 * np.sin(5 * at[:, 0] + 9 * sun)
+    inner = np.where(hill[:, None], land, sky)
+    shines = np.hypot((at[:, [0]] - sun) * half[0] / half[1], at[:, [1]] - 0.5) < 0.16
+    inner = np.where(shines, [0.96, 0.86, 0.55], inner)
+    return np.where(rim[:, None], frame, inner)
+
+
 def _hang(p: np.ndarray, colour: np.ndarray, room: Room, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Paints pictures, each a horizon under a sky with a sun, over a wall's colours."""
+    """Paints pictures over a wall's colours."""
     for axis, wall, middle, half, frame in _pictures(room, count, rng):
-        sky, land = rng.uniform(0.45, 0.95, 3), rng.uniform(0.12, 0.7, 3)
-        sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
         at = (p[:, [1 - axis, 2]] - middle) / half
         on = (np.abs(p[:, axis] - wall) < 0.08) & (np.abs(at) < 1).all(axis=1)
-        rim = np.asarray(((1 - np.abs(at)) * half < 0.035).any(axis=1))
-        hill = at[:, 1] < horizon + 0.15 * np.sin(5 * at[:, 0] + 9 * sun)
-        inner = np.where(hill[:, None], land, sky)
-        shines = np.hypot(at[:, [0]] - sun, at[:, [1]] - 0.5) < 0.16
-        inner = np.where(shines, [0.96, 0.86, 0.55], inner)
-        colour = np.where(on[:, None], np.where(rim[:, None], frame, inner), colour)
+        colour = np.where(on[:, None], framed(at, half, frame, rng), colour)
     return colour
 
 
-def _wall(room: Room, use: str, rng: np.random.Generator) -> Colouring:
+def _wall(room: Room, use: str, rng: np.random.Generator, pictured: bool) -> Colouring:
     """Paint or wallpaper over a skirting board; glazed tiles in wet rooms; pictures in dry ones."""
     base, glaze = PAINTS[rng.integers(len(PAINTS))], GLAZES[rng.integers(len(GLAZES))]
     tiled_to = {"bathroom": rng.choice([1.25, 2.0]), "kitchen": 1.45}.get(use, 0.0)
@@ -123,15 +143,17 @@ def _wall(room: Room, use: str, rng: np.random.Generator) -> Colouring:
     papered = use in ("bedroom", "living", "dining") and rng.random() < 0.4
     stripe, accent = rng.uniform(0.08, 0.2), base * rng.uniform(0.82, 0.93, 3)
     pictures = 0 if use in ("", "bathroom", "storage") else int(rng.integers(1, 4))
+    pictures *= pictured
     seed = int(rng.integers(2**31))
 
     def colour(p: np.ndarray) -> np.ndarray:
         out = np.tile(base, (len(p), 1))
-        along = np.where(np.minimum(np.abs(p[:, 0] - room[0]), np.abs(p[:, 0] - room[2])) < 0.1, p[:, 1], p[:, 0])
+        off = np.minimum(np.abs(p[:, :2] - room[:2]), np.abs(p[:, :2] - room[2:]))
+        along = np.where(off[:, 0] < off[:, 1], p[:, 1], p[:, 0])
         if papered:
             out[np.mod(along, 2 * stripe) < stripe] = accent
         tile = (p[:, 2] < tiled_to) & (p[:, 2] > tiled_from)
-        out[tile] = tiles(along[tile], p[tile, 2], glaze, 0.15)
+        out[tile] = tiles(along[tile], p[tile, 2], glaze, 0.15, blur_m=0.0125)
         if tiled_from or not tiled_to:
             out[p[:, 2] < SKIRTING_M] = [0.95, 0.95, 0.94]
         return _hang(p, out, room, pictures, np.random.default_rng(seed))
@@ -148,7 +170,7 @@ def _floor(room: Room, use: str, wood: np.ndarray, along: int, rng: np.random.Ge
 
     def colour(p: np.ndarray) -> np.ndarray:
         if use in WET:
-            return tiles(p[:, 0], p[:, 1], tile, side_m, chequered)
+            return tiles(p[:, 0], p[:, 1], tile, side_m, chequered, 0.0125)
         if soft:
             return carpet * (0.9 + 0.16 * hashed(np.floor(p[:, 0] / 0.015), np.floor(p[:, 1] / 0.015)))[:, None]
         under = boards(p, wood, along)
@@ -157,7 +179,9 @@ def _floor(room: Room, use: str, wood: np.ndarray, along: int, rng: np.random.Ge
     return colour
 
 
-def finishes(rooms: Sequence[Room], uses: Sequence[str], rng: np.random.Generator) -> list[Finish]:
+def finishes(
+    rooms: Sequence[Room], uses: Sequence[str], rng: np.random.Generator, pictures: bool = True
+) -> list[Finish]:
     """How each room is finished.
 
     Args:
@@ -165,11 +189,12 @@ def finishes(rooms: Sequence[Room], uses: Sequence[str], rng: np.random.Generato
         uses: keys of `converters.generate.homes.rooms.USES`, one a room; none where the building has none: then paint
             on all walls, boards on the floors, and tiles on a quarter of them.
         rng: random stream.
+        pictures: some are painted on the walls.
     """
     wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))
     if uses:
         return [
-            Finish(_floor(room, use, wood, along, rng), _wall(room, use, rng))
+            Finish(_floor(room, use, wood, along, rng), _wall(room, use, rng, pictures), use != "bathroom")
             for room, use in zip(rooms, uses, strict=True)
         ]
     tiled = rng.random(len(rooms)) < 0.25

@@ -42,9 +42,15 @@ class Scan:
     """(m, 3) int64."""
     labels: np.ndarray
     """(n,) uint8 NYU40 ids, with label noise."""
-    solid: np.ndarray
-    """(n,) int64: index of the nearest solid, without noise."""
-    solids: tuple[Solid, ...]
+    solid: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+    """(n,) int64: index of the nearest solid, without noise; empty where `solids` is."""
+    solids: tuple[Solid, ...] = ()
+    """None: it shows nothing that moves."""
+
+    @property
+    def owner(self) -> np.ndarray:
+        """(n,) index of the piece of furniture that each vertex shows, -1 where it shows none."""
+        return np.array([s.owner for s in self.solids])[self.solid] if self.solids else np.full(len(self.labels), -1)
 
 
 def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
