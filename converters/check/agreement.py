@@ -34,10 +34,13 @@ def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX and model.geom_contype[geom]:
             turn = np.zeros(9)
             mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            beyond = (
-                np.abs((points - model.geom_pos[geom, :2]) @ turn.reshape(3, 3)[:2, :2]) - model.geom_size[geom, :2]
-            )
-            outside = np.minimum(outside, beyond.max(axis=-1))
+            level, middle, size = turn.reshape(3, 3)[:2, :2], model.geom_pos[geom, :2], model.geom_size[geom, :2]
+            # Only cells about the box; about a tilted one, all.
+            reach = np.abs(level) @ (size + 2 * side) if turn[8] > 1 - 1e-9 else np.inf
+            ends = (np.stack([middle - reach, middle + reach]) - maps.origin_w) / side + pad
+            (c0, r0), (c1, r1) = np.clip(ends + [[0], [1]], 0, free.shape[::-1]).astype(int)
+            beyond = np.abs((points[r0:r1, c0:c1] - middle) @ level) - size
+            outside[r0:r1, c0:c1] = np.minimum(outside[r0:r1, c0:c1], beyond.max(axis=-1))
     rim = border_cells(free)
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
         body = model.jnt_bodyid[joint]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import fast_simplification
@@ -31,7 +32,8 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points on every face no further apart than the spacing, by even barycentric steps (no chance involved).
+    """Points on every face no further apart than the spacing, by even barycentric steps (no chance involved), or by
+    even rows where these would be more than a block.
 
     Returns:
         points (k, 3) m, face (k,) the face each lies on.
@@ -41,7 +43,9 @@ def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> t
     """
     if len(faces) == 0:
         return np.zeros((0, 3)), np.zeros(0, np.int64)
-    count = float((_steps(vertices, faces, spacing_m).astype(float) ** 2).sum() / 2)
+    corners = vertices[faces]
+    steps, short = _steps(corners, spacing_m).astype(float), _sides(corners).min(axis=1) / spacing_m
+    count = float(np.where(beyond_block(corners, spacing_m), steps * (short / 2 + 1), steps**2 / 2).sum())
     check_count(
         "a surface", count, SAMPLES, f"points at {spacing_m:g} m", "remove long thin faces, or split the source"
     )
@@ -51,24 +55,47 @@ def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> t
 
 def sampled(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The points of `sample_faces` and their faces, in blocks that fit the memory however large the faces are."""
-    corners, steps = vertices[faces], _steps(vertices, faces, spacing_m)
-    for n in np.unique(steps):
+    corners, beyond = vertices[faces], beyond_block(vertices[faces], spacing_m)
+    steps = _steps(corners, spacing_m)
+    for n in np.unique(steps[~beyond]):
+        i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+        u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n
+        weights = np.stack([1 - u - v, u, v], axis=1)
         chosen = np.flatnonzero(steps == n)
-        rows = max(BLOCK // int(n), 1)
-        for first in range(0, n, rows):
-            i, j = np.meshgrid(np.arange(first, min(first + rows, n)), np.arange(n), indexing="ij")
-            u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n
-            weights = np.stack([1 - u - v, u, v], axis=1)
-            for part in np.array_split(chosen, -(-len(chosen) * len(weights) // BLOCK)):
-                large = len(weights) > LARGE  # matmul is faster there, and rounds otherwise
-                points = weights @ corners[part] if large else np.einsum("kw,fwd->fkd", weights, corners[part])
-                yield points.reshape(-1, 3), np.repeat(part, len(weights))
+        for part in np.array_split(chosen, -(-len(chosen) * len(weights) // BLOCK)):
+            large = len(weights) > LARGE  # matmul is faster there, and rounds otherwise
+            points = weights @ corners[part] if large else np.einsum("kw,fwd->fkd", weights, corners[part])
+            yield points.reshape(-1, 3), np.repeat(part, len(weights))
+    for face in np.flatnonzero(beyond):
+        for points in _by_rows(corners[face], int(steps[face]), spacing_m):
+            yield points, np.full(len(points), face)
 
 
-def _steps(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> np.ndarray:
-    corners = vertices[faces]
-    longest = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
-    return np.maximum(np.ceil(longest / spacing_m).astype(int), 1)
+def _by_rows(corners: np.ndarray, n: int, spacing_m: float) -> Iterator[np.ndarray]:
+    """Points of one triangle in n rows along its shortest side: a long thin one needs few."""
+    side = int(_sides(corners[None])[0].argmin())
+    apex, first, last = corners[side - 2], corners[side], corners[side - 1]
+    along = (np.arange(n) + 0.5) / n
+    counts = np.maximum(np.ceil(along * np.linalg.norm(last - first) / spacing_m).astype(int), 1)
+    for rows in np.split(np.arange(n), np.flatnonzero(np.diff(np.cumsum(counts) * 4 // BLOCK)) + 1):
+        row = np.repeat(rows, counts[rows])
+        column = np.arange(len(row)) - np.repeat(np.cumsum(counts[rows]) - counts[rows], counts[rows])
+        across = (column + 0.5) / counts[row]
+        yield apex + along[row, None] * (first - apex + across[:, None] * (last - first))
+
+
+def beyond_block(corners: np.ndarray, spacing_m: float) -> np.ndarray:
+    """(m,) bool: triangles (m, 3, 3) with more points, by even barycentric steps, than are sampled at a time."""
+    return _steps(corners, spacing_m) > math.isqrt(2 * BLOCK)
+
+
+def _sides(corners: np.ndarray) -> np.ndarray:
+    """(m, 3) m: lengths of the sides of triangles, each from the corner before."""
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+
+
+def _steps(corners: np.ndarray, spacing_m: float) -> np.ndarray:
+    return np.maximum(np.ceil(np.max(_sides(corners), axis=1) / spacing_m).astype(int), 1)
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

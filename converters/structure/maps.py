@@ -15,7 +15,7 @@ from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import face_labels, sampled
+from converters.geometry.faces import beyond_block, face_labels, sampled
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 from interactive_nav_common.rotations import yaw_matrix
@@ -57,10 +57,10 @@ class Grid:
     shape: tuple[int, int]
     resolution_m: float
 
-    def cells(self, points_w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Row, column and inside flag of (n, 2+) world points."""
+    def cells(self, points_w: np.ndarray, push: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row, column and inside flag of (n, 2+) world points, pushed by so many cells."""
         turned = points_w[:, :2] @ yaw_matrix(self.yaw)[:2, :2]
-        index = np.floor((turned - self.origin) / self.resolution_m).astype(np.int64)
+        index = np.floor((turned - self.origin) / self.resolution_m + push).astype(np.int64)
         row, column = index[:, 1], index[:, 0]
         inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
         return row, column, inside
@@ -70,12 +70,6 @@ class Grid:
         rows, columns = np.indices(self.shape)
         turned = np.stack([columns + 0.5, rows + 0.5], axis=-1) * self.resolution_m + self.origin
         return turned @ yaw_matrix(self.yaw)[:2, :2].T
-
-    def count(self, points_w: np.ndarray) -> np.ndarray:
-        """(rows, columns) number of points in each cell."""
-        row, column, inside = self.cells(points_w)
-        flat = row[inside] * self.shape[1] + column[inside]
-        return np.bincount(flat, minlength=self.shape[0] * self.shape[1]).reshape(self.shape)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -291,28 +285,34 @@ class _Shown:
 def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> _Shown:
     counts, top, heights = np.zeros((4, *grid.shape), np.int64), np.zeros(grid.shape), [np.zeros(0)]
     facing, turn = np.zeros((2, *grid.shape)), yaw_matrix(grid.yaw)[:2, 1::-1]
-    # In blocks: the points on a large hall do not fit the memory.
-    kept = np.flatnonzero(of_face != CEILING)
+    kept, of_structure = np.flatnonzero(of_face != CEILING), np.isin(of_face, STRUCTURE_LABELS)
     a, b, c = (vertices_w[faces[:, k]] for k in range(3))
     unit = np.cross(b - a, c - a)
     unit = unit[:, :2] / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
-    for points, face in sampled(vertices_w, faces[kept], grid.resolution_m / 3):
-        label, z = of_face[kept][face], points[:, 2]
-        is_floor, structural = label == FLOOR, np.isin(label, STRUCTURE_LABELS)
-        high = (z > NOISE_M) & ~is_floor
-        solid = high & (z < BAND_M[1])
-        level = (is_floor & (np.abs(z) < 0.2)) | ((label == UNLABELLED) & (np.abs(z) < NOISE_M))
-        for count, chosen in zip(
-            counts, (level, solid, solid & structural & (label != DOOR), solid & structural), strict=True
-        ):
-            count += grid.count(points[chosen])
-        row, column, inside = grid.cells(points[solid])
-        normal = unit[kept][face[solid][inside]] @ turn
-        for axis in range(2):
-            np.add.at(facing[axis], (row[inside], column[inside]), normal[:, axis])
-        row, column, inside = grid.cells(points[high & ~structural])
-        np.maximum.at(top, (row[inside], column[inside]), z[high & ~structural][inside])
-        heights.append(z[structural & ~is_floor])
+    spacing_m = grid.resolution_m / 3
+    # A large face's points are pushed off the cells' borders: along a wall on one, rounding would share them out.
+    large = beyond_block(vertices_w[faces[kept]], spacing_m)
+    for chosen, push in ((kept[~large], 0.0), (kept[large], 1e-6)):
+        # In blocks: the points on a large hall do not fit the memory.
+        for points, face in sampled(vertices_w, faces[chosen], spacing_m):
+            label, z = of_face[chosen][face], points[:, 2]
+            is_floor, structural = label == FLOOR, of_structure[chosen][face]
+            high = (z > NOISE_M) & ~is_floor
+            solid = high & (z < BAND_M[1])
+            level = (is_floor & (np.abs(z) < 0.2)) | ((label == UNLABELLED) & (np.abs(z) < NOISE_M))
+            row, column, inside = grid.cells(points, push)
+            cell = row * grid.shape[1] + column
+            for count, shown in zip(
+                counts, (level, solid, solid & structural & (label != DOOR), solid & structural), strict=True
+            ):
+                count += np.bincount(cell[shown & inside], minlength=count.size).reshape(count.shape)
+            shown = solid & inside
+            normal = unit[chosen][face[shown]] @ turn
+            for axis in range(2):
+                np.add.at(facing[axis], (row[shown], column[shown]), normal[:, axis])
+            shown = high & ~structural & inside
+            np.maximum.at(top, (row[shown], column[shown]), z[shown])
+            heights.append(z[structural & ~is_floor])
     walls = np.concatenate(heights)
     tall = float(np.clip(np.percentile(walls, 98), BAND_M[1], 2.5)) if len(walls) else BAND_M[1]
     return _Shown(counts[0], counts[1], counts[2], counts[3], top, facing, round(tall, 3))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import heapq
+
 import numpy as np
 from scipy import ndimage
 
@@ -12,6 +14,8 @@ from interactive_nav_common.rotations import yaw_matrix
 DEPTH_CELLS = 4
 """How far a box may reach into what is not traversable: thick boxes merge ragged walls and are hard to
 tunnel."""
+_Run = tuple[int, int, int, int, int, int, int, int]
+"""1 along a column or 0 along a row, which one, start, stop; rows and columns of the rectangle grown from it."""
 
 
 def border_cells(traversable: np.ndarray) -> np.ndarray:
@@ -33,48 +37,73 @@ def cover_rectangles(
         (row0, row1, column0, column1) half-open, none inside another.
     """
     assert not (needed & ~allowed).any()
-    left = needed.copy()
-    rectangles = []
-    while left.any():
-        best, best_gain = None, 0
-        # Candidates: from each uncovered cell, the widest run of allowed cells along the row grown in rows,
-        # and the other way round. Border runs are straight, so these contain the long rectangles.
-        for row, column in np.argwhere(left):
-            for rectangle in (_grow(allowed, row, column, False), _grow(allowed, row, column, True)):
-                r0, r1, c0, c1 = rectangle
-                gain = int(left[r0:r1, c0:c1].sum())
-                if gain > best_gain:
-                    best, best_gain = rectangle, gain
-        assert best is not None
-        r0, r1, c0, c1 = best
+    left, allowed, rectangles = needed.copy(), allowed.copy(), []
+    # Candidates: each run of allowed cells along a row, grown in rows, and the other way round. Border runs are
+    # straight, so these contain the long rectangles. As cells are covered, gains only fall and first cells only move
+    # on: the least of the heap is the best candidate if its rank has not changed since.
+    blocked = [_blocked_before(grid) for grid in (allowed, allowed.T)]
+    heap: list[tuple[int, int, _Run]] = []
+
+    def offer(run: _Run) -> None:
+        """By most gain, then by first cell, rows before columns; one without gain is dropped."""
+        upright, line, start, stop, r0, r1, c0, c1 = run
+        cells = np.flatnonzero((left.T if upright else left)[line, start:stop])
+        if len(cells):
+            at = (start + int(cells[0]), line) if upright else (line, start + int(cells[0]))
+            heapq.heappush(heap, (-int(np.count_nonzero(left[r0:r1, c0:c1])), at[0] * left.shape[1] + at[1], run))
+
+    whole = [
+        (upright, line, 0, allowed.shape[1 - upright]) for upright in (0, 1) for line in range(allowed.shape[upright])
+    ]
+    found = [run for line in whole for run in _runs(allowed, blocked, *line)]
+    table = np.array(found, np.int32).reshape(-1, 8)
+    for run in found:
+        offer(run)
+    while heap:
+        ranked = heapq.heappop(heap)
+        best = r0, r1, c0, c1 = ranked[2][4:]
+        if disjoint and not allowed[r0:r1, c0:c1].all():
+            continue
+        offer(ranked[2])
+        if not heap or heap[0] != ranked:
+            continue
         rectangles.append(_shrink(left if disjoint else needed, best))
         left[r0:r1, c0:c1] = False
         if disjoint:
-            allowed = allowed & ~_filled(allowed.shape, rectangles[-1])
+            r0, r1, c0, c1 = rectangles[-1]
+            allowed[r0:r1, c0:c1] = False
+            blocked[0][:, r0:r1] = _blocked_before(allowed[r0:r1])
+            blocked[1][:, c0:c1] = _blocked_before(allowed.T[c0:c1])
+            # Candidates that reached into the rectangle are others now, and may have gained.
+            cut = (table[:, 4] < r1) & (table[:, 5] > r0) & (table[:, 6] < c1) & (table[:, 7] > c0)
+            found = [run for old in table[cut, :4].tolist() for run in _runs(allowed, blocked, *old)]
+            table = np.vstack([table[~cut], np.array(found, np.int32).reshape(-1, 8)])
+            for run in found:
+                offer(run)
     return rectangles
 
 
-def _filled(shape: tuple[int, ...], rectangle: tuple[int, int, int, int]) -> np.ndarray:
-    mask = np.zeros(shape, bool)
-    mask[rectangle[0] : rectangle[1], rectangle[2] : rectangle[3]] = True
-    return mask
+def _blocked_before(grid: np.ndarray) -> np.ndarray:
+    """(columns + 1, rows) number of cells that are not allowed in each row before each column."""
+    result = np.zeros((grid.shape[1] + 1, grid.shape[0]), np.int32)
+    np.cumsum(~grid.T, axis=0, out=result[1:])
+    return result
 
 
-def _grow(allowed: np.ndarray, row: int, column: int, upright: bool) -> tuple[int, int, int, int]:
-    """Largest run through the cell along one axis, then as many equal runs beside it as are allowed."""
-    grid = np.asarray(allowed.T if upright else allowed)
-    r, c = (column, row) if upright else (row, column)
-    blocked = np.flatnonzero(np.logical_not(grid[r]))
-    at = np.searchsorted(blocked, c)
-    c0 = int(blocked[at - 1]) + 1 if at > 0 else 0
-    c1 = int(blocked[at]) if at < len(blocked) else grid.shape[1]
-    full = np.all(grid[:, c0:c1], axis=1).tolist()
-    r0 = r1 = int(r)
-    while r0 > 0 and full[r0 - 1]:
-        r0 -= 1
-    while r1 < grid.shape[0] and full[r1]:
-        r1 += 1
-    return (c0, c1, r0, r1) if upright else (r0, r1, c0, c1)
+def _runs(allowed: np.ndarray, blocked: list[np.ndarray], upright: int, line: int, start: int, stop: int) -> list[_Run]:
+    """Runs of allowed cells between start and stop of a line, and the rectangles grown from them."""
+    steps = np.diff((allowed.T if upright else allowed)[line, start:stop], prepend=False, append=False)
+    ends = (np.flatnonzero(steps).reshape(-1, 2) + start).tolist()
+    return [(upright, line, s, e, *_grow(blocked[upright], upright, line, s, e)) for s, e in ends]
+
+
+def _grow(blocked: np.ndarray, upright: int, line: int, start: int, stop: int) -> tuple[int, int, int, int]:
+    """The run from start to stop along a line, and as many equal runs beside it as are allowed."""
+    other = np.flatnonzero(blocked[stop] != blocked[start])
+    at = int(np.searchsorted(other, line))
+    low = int(other[at - 1]) + 1 if at > 0 else 0
+    high = int(other[at]) if at < len(other) else blocked.shape[1]
+    return (start, stop, low, high) if upright else (low, high, start, stop)
 
 
 def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

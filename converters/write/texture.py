@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from converters.geometry.faces import sample_faces
+from converters.geometry.faces import BLOCK, sample_faces
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
@@ -58,7 +58,8 @@ def colour_cloud(
         np.arange(3 * len(chosen)).reshape(-1, 3),
         np.inf,
     )[0][:, :2]
-    uv = _uv_at(points, a[index], b[index], c[index], scan.corner_uv[face_index][index], middle[index])
+    corners, blocks = scan.corner_uv[face_index], np.array_split(np.arange(len(index)), len(index) // BLOCK + 1)
+    uv = np.concatenate([_uv_at(points[at], *(x[index[at]] for x in (a, b, c, corners, middle))) for at in blocks])
     height, width = scan.texture.shape[:2]
     column = np.clip((uv[:, 0] % 1.0 * width).astype(int), 0, width - 1)
     row = np.clip(((1.0 - uv[:, 1] % 1.0) * height).astype(int), 0, height - 1)
