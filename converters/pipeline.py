@@ -260,7 +260,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
             for o in annotated
         )
     with clock.stage("cut"):
-        cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated)
+        cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated, raw.scan.furnished)
     with clock.stage("map"):
         plan = stages.call(
             make_floor_plan, vertices_w, raw.scan.faces[cut.keep], raw.scan.labels, annotated, raw.given_map, walls_yaw

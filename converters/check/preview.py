@@ -299,7 +299,8 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
 
     if raw is not None:
         vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
-        keep = cut_furniture(vertices_w, raw.scan.faces, raw.scan.labels, _placed(scene)).keep
+        scan = raw.scan
+        keep = cut_furniture(vertices_w, scan.faces, scan.labels, _placed(scene), scan.furnished).keep
         for axes, chosen, title in (
             (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
             (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),

@@ -6,6 +6,7 @@ the world's origin. `floors.txt` has one height a line; number k of the map file
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,9 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
         cads = {a.cad_id: cads[a.cad_id] for a in annotations}
     else:
         source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")
-    return building(source, "gibson", mesh, labels, heights, cads, annotations)
+    raw = building(source, "gibson", mesh, labels, heights, cads, annotations)
+    furnished = not source.has(LABELS) or _furnished(root / LABELS)
+    return dataclasses.replace(raw, scan=dataclasses.replace(raw.scan, furnished=furnished))
 
 
 def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heights, cads, annotations) -> RawScene:
@@ -107,6 +110,17 @@ def _labels(path: Path) -> np.ndarray:
     if labels.dtype.kind not in "iu":
         raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
     return labels.reshape(-1).astype(np.int64)
+
+
+def _furnished(path: Path) -> bool:
+    """Whether the mesh shows what is annotated: so it does unless the labels' file says otherwise."""
+    with np.load(path, allow_pickle=False) as arrays:
+        if "furnished" not in arrays.files:
+            return True
+    value = read_npz(path, "furnished", "expected true or false")
+    if value.dtype != bool or value.size != 1:
+        raise SceneRejected(f"{path}: furnished is {value.dtype} of shape {value.shape}, expected one true or false")
+    return bool(value.all())
 
 
 def read_floors(source: SourceFolder) -> tuple[float, ...]:

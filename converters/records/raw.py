@@ -45,6 +45,8 @@ class ScanMesh:
     """(m, 3, 2) float64, texture coordinates of each face corner (origin at the lower left), or None."""
     texture: np.ndarray | None = None
     """(h, w, 3) uint8, or None."""
+    furnished: bool = True
+    """False: it shows the structure alone, so that no face of it is an annotated object's."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -93,7 +93,11 @@ def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> 
 
 
 def cut_furniture(
-    vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray, objects: tuple[PlacedObject, ...]
+    vertices_w: np.ndarray,
+    faces: np.ndarray,
+    labels: np.ndarray,
+    objects: tuple[PlacedObject, ...],
+    furnished: bool = True,
 ) -> CutResult:
     """Decides which scan faces are annotated furniture.
 
@@ -105,7 +109,10 @@ def cut_furniture(
         faces: (m, 3).
         labels: (n,) NYU40.
         objects: placed by their annotations.
+        furnished: the scan shows them; else nothing is cut.
     """
+    if not furnished:
+        return CutResult(np.ones(len(faces), bool), np.full(len(faces), -1, np.int64))
     label = face_labels(labels, faces)
     centres = vertices_w[faces].mean(axis=1)
     owner = np.full(len(faces), -1, np.int64)

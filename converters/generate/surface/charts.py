@@ -20,7 +20,7 @@ MARGIN = 3
 """Texels around each patch that repeat its border, so that smaller versions of the sheet do not mix patches."""
 LIGHT_M = 0.06
 """Between the points of a patch at which light is worked out."""
-LEVELS = 50
+LEVELS = 63
 """Steps of each channel, few enough for a small PNG."""
 
 Light = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -19,6 +19,12 @@ GLAZES = np.array([[0.90, 0.92, 0.92], [0.70, 0.82, 0.84], [0.84, 0.88, 0.80], [
 CARPETS = np.array([[0.62, 0.58, 0.52], [0.48, 0.50, 0.55], [0.66, 0.61, 0.58], [0.45, 0.50, 0.45]])
 RUGS = np.array([[0.55, 0.22, 0.20], [0.22, 0.32, 0.46], [0.72, 0.64, 0.50], [0.33, 0.40, 0.33]])
 FRAMES = np.array([[0.16, 0.15, 0.14], [0.45, 0.30, 0.19], [0.90, 0.90, 0.88]])
+PRINTS = np.array([
+    [[0.78, 0.84, 0.88], [0.32, 0.42, 0.34]], [[0.92, 0.83, 0.70], [0.52, 0.35, 0.26]],
+    [[0.86, 0.80, 0.82], [0.40, 0.34, 0.44]], [[0.70, 0.80, 0.82], [0.20, 0.32, 0.42]],
+    [[0.92, 0.90, 0.86], [0.28, 0.28, 0.31]],
+])  # fmt: skip
+"""Sky and land of pictures."""
 SKIRTING_M = 0.09
 """Height of the white board along the foot of painted walls."""
 WET = ("bathroom", "kitchen")
@@ -84,7 +90,7 @@ def _rug(room: Room, colour: np.ndarray, rng: np.random.Generator) -> Callable[[
         edge = inside.min(axis=1)
         weave = 0.94 + 0.1 * hashed(np.floor(p[:, 0] / 0.02), np.floor(p[:, 1] / 0.02))
         woven = np.mod(np.abs(p[:, :2] - middle).sum(axis=1), period) < period / 3
-        tone = np.where((edge < 0.1) & (edge > 0.05), 1.45, np.where(woven, 1.2, 1.0)) * weave
+        tone = np.where((edge < 0.1) & (edge > 0.05), 1.3, np.where(woven, 1.12, 1.0)) * weave
         return np.where((edge > 0)[:, None], np.clip(colour * tone[:, None], 0, 1), under)
 
     return lay
@@ -108,7 +114,7 @@ def _pictures(
 
 
 def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Colours of a picture: a horizon under a sky with a sun.
+    """Colours of a picture behind a mount: two ridges under a sky with a sun.
 
     Args:
         at: (n, 2) places, right and up, -1..1 on the picture.
@@ -116,14 +122,17 @@ def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.G
         frame: (3,) colour of its rim.
         rng: random stream of this picture.
     """
-    sky, land = rng.uniform(0.45, 0.95, 3), rng.uniform(0.12, 0.7, 3)
+    sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
     sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
-    rim = np.asarray(((1 - np.abs(at)) * half < 0.035).any(axis=1))
-    hill = at[:, 1] < horizon + 0.15 * np.sin(5 * at[:, 0] + 9 * sun)
-    inner = np.where(hill[:, None], land, sky)
-    shines = np.hypot((at[:, [0]] - sun) * half[0] / half[1], at[:, [1]] - 0.5) < 0.16
-    inner = np.where(shines, [0.96, 0.86, 0.55], inner)
-    return np.where(rim[:, None], frame, inner)
+    from_edge = ((1 - np.abs(at)) * half).min(axis=1)[:, None]
+    far, near = (
+        np.clip((level + 0.15 * np.sin(5 * at[:, [0]] + turn * sun) - at[:, [1]]) * half[1] / 0.008 + 0.5, 0, 1)
+        for level, turn in ((horizon, 9), (horizon - 0.35, 4))
+    )
+    inner = sky * (1 - far) + far * ((0.55 * land + 0.45 * sky) * (1 - near) + land * near)
+    shines = np.hypot((at[:, [0]] - sun) * half[0] / half[1], at[:, [1]] - 0.5) < 0.13
+    inner = np.where(shines & (far < 0.5), [0.97, 0.92, 0.76], inner)
+    return np.where(from_edge < 0.02, frame, np.where(from_edge < 0.055, [0.95, 0.94, 0.91], inner))
 
 
 def _hang(p: np.ndarray, colour: np.ndarray, room: Room, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -141,7 +150,7 @@ def _wall(room: Room, use: str, rng: np.random.Generator, pictured: bool) -> Col
     tiled_to = {"bathroom": rng.choice([1.25, 2.0]), "kitchen": 1.45}.get(use, 0.0)
     tiled_from = 0.85 if use == "kitchen" else 0.0
     papered = use in ("bedroom", "living", "dining") and rng.random() < 0.4
-    stripe, accent = rng.uniform(0.08, 0.2), base * rng.uniform(0.82, 0.93, 3)
+    stripe, accent = rng.uniform(0.08, 0.2), base * rng.uniform(0.88, 0.96, 3)
     pictures = 0 if use in ("", "bathroom", "storage") else int(rng.integers(1, 4))
     pictures *= pictured
     seed = int(rng.integers(2**31))

@@ -41,9 +41,10 @@ class Space:
         out, index = np.ones(len(start)), np.arange(len(start))
         gone = np.full(len(start), 0.03)
         for _ in range(40):
-            share = (gone[index] / length[index])[:, None]
-            near = self.at(start[index] + way[index] * share)
-            out[index] = np.minimum(out[index], np.clip(near / (0.05 * gone[index] + 0.02), 0, 1))
+            share = gone[index] / length[index]
+            near = self.at(start[index] + way[index] * share[:, None])
+            # Half shadows are widest half way: what is beside the lamp, or beside the place, hides all or nothing.
+            out[index] = np.minimum(out[index], np.clip(near / (0.08 * gone[index] * (1 - share) + 0.02), 0, 1))
             gone[index] += np.maximum(near, 0.04)
             index = index[(out[index] > 0) & (gone[index] < length[index] - 0.08)]
             if not len(index):

@@ -19,7 +19,7 @@ from converters.generate.surface.charts import Chart, assemble, piece_charts, pl
 from converters.generate.surface.finishes import FRAMES, Colouring, Finish, finishes, framed
 from converters.generate.surface.light import Daylight, space_of
 from converters.generate.surface.scan import NYU40, Scan
-from converters.generate.surface.sides import CLOTHS, ENTRANCES, PICTURE, Side
+from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
 from converters.generate.surface.texture import Atlas
 from converters.records.raw import CEILING, FLOOR, WALL
 
@@ -40,7 +40,7 @@ def _shell(plan: Plan, sides: list[list[Side]], finish: list[Finish]) -> list[Ch
     """Floors, ceilings, walls with their boards, doorways; tops and outsides of the walls."""
     height, charts = plan.wall_height_m, []
     for room, walls, of in zip(plan.rooms, sides, finish, strict=True):
-        charts.append(_flat(room, 0.0, 1, FLOOR, of.floor_colour))
+        charts.append(_flat(room, FLOOR_M, 1, FLOOR, of.floor_colour))
         charts.append(_flat(room, height, -1, CEILING, plain(CEILING_WHITE), 20.0))
         for side in walls:
             charts += at_walls.wall_face(side, height, of.wall_colour)

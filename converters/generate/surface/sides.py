@@ -23,6 +23,8 @@ OTHER, CURTAIN, PICTURE = 38, 16, 11
 WHITE = np.array([0.95, 0.95, 0.94])
 CASING_M, PROUD_M = 0.07, 0.015
 """Width of the board around a doorway, and how far it stands out."""
+FLOOR_M = 0.004
+"""Floors are drawn a little above the plane that things stand on, or the two would flicker."""
 ENTRANCE_M = (0.92, 2.04)
 """Width and height of the front door's leaf."""
 CLOTHS = np.array([[0.86, 0.83, 0.76], [0.62, 0.66, 0.70], [0.70, 0.58, 0.48], [0.55, 0.60, 0.52], [0.80, 0.72, 0.66]])
@@ -174,7 +176,7 @@ def lining(doorway: Doorway, floor: Colouring) -> list[Chart]:
     for a, towards in ((run[0], 1), (run[1], -1)):
         corners = [side.at(a, o, z) for o, z in ((0, 0), (deep, 0), (deep, height), (0, height))]
         inner.append(polygon(corners, towards * (side.at(1, 0, 0) - side.at(0, 0, 0)), WALL, plain(WHITE)))
-    for z, towards, label, paint in ((0.0, 1, FLOOR, floor), (height, -1, WALL, plain(WHITE))):
+    for z, towards, label, paint in ((FLOOR_M, 1, FLOOR, floor), (height, -1, WALL, plain(WHITE))):
         corners = [side.at(a, o, z) for a, o in ((run[0], 0), (run[1], 0), (run[1], deep), (run[0], deep))]
         inner.append(polygon(corners, (0, 0, towards), label, paint))
     return inner
@@ -192,8 +194,10 @@ def outlook(side: Side, sky: np.ndarray, phase: float) -> Colouring:
         wood = np.array([0.42, 0.52, 0.36]) * (1 - crown) + np.array([0.30, 0.41, 0.25]) * crown
         lawn = np.clip((1.22 - z) / 0.32, 0, 1)[:, None]
         grass = np.array([0.55, 0.66, 0.38]) * (1 - lawn) + np.array([0.45, 0.58, 0.30]) * lawn
-        out = np.where((z < trees)[:, None], wood, out)
-        return np.where((z < 1.22)[:, None], grass, out)
+        for level, below in ((trees, wood), (1.22, grass)):
+            share = np.clip((level - z) / 0.02 + 0.5, 0, 1)[:, None]
+            out = out * (1 - share) + below * share
+        return out
 
     return colour
 

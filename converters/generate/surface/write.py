@@ -65,7 +65,8 @@ def write_scan(folder: Path, scan: Scan, atlas: Atlas, floor_height_m: float) ->
         ["newmtl scan\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd mesh_z_up_texture.png\n"],
     )
     write_png(folder / "mesh_z_up_texture.png", atlas.image)
-    write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels)
+    bare = {} if scan.solids else {"furnished": np.array(False)}
+    write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
 
 
 def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:

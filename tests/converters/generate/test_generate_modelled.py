@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import io
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,10 +24,14 @@ from converters.generate.surface.charts import assemble, polygon
 from converters.generate.surface.light import space_of
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import NYU40, Scan
-from converters.generate.surface.sides import entrance_place, sides_of
+from converters.generate.surface.sides import FLOOR_M, entrance_place, sides_of
 from converters.generate.surface.texture import Atlas
+from converters.generate.surface.write import write_npz, write_scan
+from converters.pipeline import ConvertConfig, _structure_visual
+from converters.read.gibson import read_gibson
 from converters.recipes import building_of
-from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, WALL, WINDOW
+from converters.records.errors import SceneRejected
+from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, WALL, WINDOW, RawScene
 from scenes_mjcf.categories import CATEGORIES
 
 SEED = 5
@@ -75,7 +81,7 @@ def test_floors_and_ceilings_are_the_plans_and_look_into_the_rooms():
     plan = home().plan
     rooms = sum(r.area_m2 for r in plan.rooms)
     doorways = sum(d.rect.area_m2 for d in plan.doorways)
-    assert area_of(FLOOR, 2, 1, 0.0) == pytest.approx(rooms + doorways, abs=1e-6)
+    assert area_of(FLOOR, 2, 1, FLOOR_M) == pytest.approx(rooms + doorways, abs=1e-6)
     assert area_of(CEILING, 2, -1, plan.wall_height_m) == pytest.approx(rooms, abs=1e-6)
     assert area_of(CEILING, 2, 1) == 0 and area_of(FLOOR, 2, -1) == 0
     tops = sum(w.rect.area_m2 for w in plan.walls)
@@ -256,6 +262,27 @@ def test_a_polygon_is_seen_from_where_it_shall_be_and_is_painted_in_place():
         for vertex, uv in zip(scan.vertices, atlas.uv, strict=True):
             inward = uv + 0.01 * (atlas.uv.mean(axis=0) - uv)
             assert _texel(atlas, inward) == pytest.approx([vertex[0] / 2 * 255, vertex[2] * 255, 0], abs=6)
+
+
+def written(folder: Path) -> RawScene:
+    write_scan(folder, *made(), home().floor_height_m)
+    (folder / "floors.txt").write_text(f"{home().floor_height_m}\n")
+    return read_gibson(folder)
+
+
+def test_the_folder_says_that_it_shows_no_furniture_and_is_drawn_as_it_is(tmp_path):
+    raw, (scan, atlas) = written(tmp_path), made()
+    assert not raw.scan.furnished and (raw.scan.labels == scan.labels).all()
+    config = ConvertConfig(structure_faces=len(scan.faces), structure_texture=2048)
+    level = raw.scan.vertices - [0, 0, home().floor_height_m]
+    drawn = _structure_visual(raw, level, np.ones(len(scan.faces), bool), None, (), config)  # pyright: ignore
+    assert len(drawn.faces) == len(scan.faces) and (drawn.image == atlas.image).all()
+    height = drawn.vertices[drawn.faces][:, :, 2]
+    assert height[scan.labels[scan.faces[:, 0]] == FLOOR] == pytest.approx(FLOOR_M, abs=1e-9) and FLOOR_M > 0.001
+    for value, told in ((np.array([1.0]), "float64"), (np.array([True, False]), "(2,)")):
+        write_npz(tmp_path / "mesh_z_up.labels.npz", label=scan.labels, furnished=value)
+        with pytest.raises(SceneRejected, match=rf"furnished is .*{re.escape(told)}.*expected one true or false"):
+            read_gibson(tmp_path)
 
 
 def test_annotations_of_a_home_whose_furniture_is_not_in_the_scan():

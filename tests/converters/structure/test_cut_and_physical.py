@@ -47,6 +47,13 @@ def test_the_cut_takes_exactly_the_furniture(scan2cad_raw):
     np.testing.assert_array_equal(result.owner[label == 39], 1)
 
 
+def test_nothing_is_cut_out_of_a_scan_that_shows_no_furniture(scan2cad_raw):
+    raw = read_scan2cad(scan2cad_raw)
+    level = raw.scan.vertices - [0, 0, 0.3]
+    result = cut_furniture(level, raw.scan.faces, raw.scan.labels, placed_objects(raw), furnished=False)
+    assert result.keep.all() and len(result.keep) == len(raw.scan.faces) and (result.owner == -1).all()
+
+
 def test_unlabelled_things_on_a_table_go_with_it_and_a_shelf_beside_stays(scan2cad_raw):
     raw = read_scan2cad(scan2cad_raw)
     book = trimesh.creation.box((0.2, 0.2, 0.05)).subdivide().subdivide().apply_translation((0.9, 1.6, 0.75))
