@@ -11,6 +11,7 @@ import dataclasses
 import math
 
 import numpy as np
+import shapely
 from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
@@ -65,11 +66,21 @@ class Grid:
         inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
         return row, column, inside
 
-    def centres_w(self) -> np.ndarray:
+    def centres_w(self, rows: slice = slice(None), columns: slice = slice(None)) -> np.ndarray:
         """(rows, columns, 2) middles of the cells in the world, m."""
-        rows, columns = np.indices(self.shape)
-        turned = np.stack([columns + 0.5, rows + 0.5], axis=-1) * self.resolution_m + self.origin
+        row, column = np.meshgrid(
+            *(np.arange(n)[at] for n, at in zip(self.shape, (rows, columns), strict=True)), indexing="ij"
+        )
+        turned = np.stack([column + 0.5, row + 0.5], axis=-1) * self.resolution_m + self.origin
         return turned @ yaw_matrix(self.yaw)[:2, :2].T
+
+    def add_below(self, mask: np.ndarray, points_w: np.ndarray, margin_m: float) -> None:
+        """Sets the cells of a (rows, columns) mask whose middles lie in the hull of (n, 2+) points, with a margin."""
+        shadow = MultiPoint(points_w[:, :2]).convex_hull.buffer(margin_m)
+        row, column, _ = self.cells(shapely.get_coordinates(shadow))
+        at = tuple(slice(max(int(k.min()), 0), max(int(k.max()) + 1, 0)) for k in (row, column))
+        centres = self.centres_w(*at)
+        mask[at] |= contains_xy(shadow, centres[..., 0], centres[..., 1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,10 +134,8 @@ def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray
 def _footprint(grid: Grid, placed: PlacedObject) -> np.ndarray:
     """(rows, columns) bool: cells under the object's hulls."""
     mask = np.zeros(grid.shape, bool)
-    centres = grid.centres_w()
     for hull in placed.hulls_b:
-        shadow = MultiPoint(to_world(placed, hull.vertices)[:, :2]).convex_hull.buffer(grid.resolution_m / 2)
-        mask |= contains_xy(shadow, centres[..., 0], centres[..., 1])
+        grid.add_below(mask, to_world(placed, hull.vertices), grid.resolution_m / 2)
     return mask
 
 
@@ -134,13 +143,11 @@ def swept_by_door(grid: Grid, placed: PlacedObject) -> np.ndarray:
     """(rows, columns) bool: cells that the leaf passes over its whole range, with a margin."""
     assert placed.hinge is not None
     mask = np.zeros(grid.shape, bool)
-    centres = grid.centres_w()
     flat = np.vstack([h.vertices for h in placed.hulls_b])
     low, high = placed.hinge.range_rad
     for angle in np.linspace(low, high, max(int((high - low) / math.radians(3)), 2)):
         turned = (flat - placed.hinge.origin_b) @ yaw_matrix(angle).T + placed.hinge.origin_b
-        leaf = MultiPoint(to_world(placed, turned)[:, :2]).convex_hull.buffer(LEAF_MARGIN_M)
-        mask |= contains_xy(leaf, centres[..., 0], centres[..., 1])
+        grid.add_below(mask, to_world(placed, turned), LEAF_MARGIN_M)
     return mask
 
 
