@@ -140,7 +140,7 @@ def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
         `assets/`.
     """
     spec = _empty_spec(parts.name)
-    _add_surroundings(spec, parts.walls)
+    _add_surroundings(spec, parts.walls, parts.structure_visual is not None and parts.structure_visual.exact)
     _add_structure(spec, parts)
     # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
     for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
@@ -165,8 +165,8 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...]) -> None:
-    """Floor, and a light above the middle of the walls."""
+def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool) -> None:
+    """Floor, and a light above the middle of the walls: an even one where the structure is `lit` in its own image."""
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -181,9 +181,11 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...]) -> No
         dir=[0, 0, -1],
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         castshadow=False,
-        diffuse=[0.6, 0.6, 0.6],
-        ambient=[0.4, 0.4, 0.4],
+        diffuse=[0.2] * 3 if lit else [0.6] * 3,
+        ambient=[0.6] * 3 if lit else [0.4] * 3,
     )
+    if lit:
+        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.3] * 3, [0.1] * 3
 
 
 def _add_structure(spec: mujoco.MjSpec, parts: SceneParts) -> None:

@@ -293,6 +293,10 @@ def test_a_small_whole_scan_is_drawn_as_it_is(tmp_path, hull_cache):
     vertices, faces, corner_uv = read_textured_obj(tmp_path / "room" / "assets" / "structure_visual.obj")
     assert (np.asarray(Image.open(tmp_path / "room" / "assets" / "structure.png").convert("RGB")) == colours).all()
     assert corner_uv is not None and len(faces) == 12
+    # Its image holds the light of the place: the scene adds an even one, that a ceiling gets as a floor does.
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "room" / "scene.xml"))
+    even = model.light_ambient[0, 0] + model.vis.headlight.ambient[0]
+    assert even == pytest.approx(0.9) and model.light_diffuse[0, 0] + model.vis.headlight.diffuse[0] <= 0.31
     order, given = np.lexsort(vertices[faces].mean(axis=1).round(4).T), room.triangles.mean(axis=1).round(4)
     assert np.allclose(vertices[faces].mean(axis=1)[order], given[np.lexsort(given.T)], atol=1e-3)
     assert np.allclose(np.unique(corner_uv.reshape(-1, 2), axis=0), np.unique(uv, axis=0), atol=1e-4)
