@@ -19,7 +19,7 @@ from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decompo
 from converters.bodies.objects import PlacedObject, name_objects, place_object
 from converters.bodies.physical import physical_properties, with_source
 from converters.bodies.placement import compare, upright
-from converters.check.gates import evaluate
+from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.fill.holes import fill_holes
@@ -285,7 +285,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         save_maps(maps, folder)
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
-        gates = evaluate(spec, maps, scene_objects(parts))
+        gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows))
         area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
         manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
         save_manifest(manifest, folder)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from converters.check.agreement import manifest_values, wall_values
+from converters.check.surfaces import surface_values
 from converters.records.gate import Gate, Limit
 from converters.structure.maps import label_pieces
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
@@ -51,6 +53,11 @@ LIMITS: dict[str, Limit] = {
     "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
     "hulls": Limit("count", most=600, meaning="hulls in all"),
     "walls": Limit("count", most=200, meaning="wall boxes"),
+    "surface_kept": Limit("share", least=0.9, meaning="of a model's area, what is drawn"),
+    "unseen_hulls": Limit(
+        "share", most=0.1, meaning="of an object's hulls' sides, what lies over 10 cm from what is drawn"
+    ),
+    "unsolid_surface": Limit("share", most=0.1, meaning="of what is drawn, what lies over 5 cm outside of the hulls"),
 }
 
 
@@ -199,13 +206,16 @@ def objects_off_map(model: mujoco.MjModel, maps: SceneMaps) -> tuple[str, ...]:
     return tuple(off)
 
 
-def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, objects: Sequence[SceneObject]) -> tuple[Gate, ...]:
+def evaluate(
+    spec: mujoco.MjSpec, maps: SceneMaps, objects: Sequence[SceneObject], kept: Mapping[str, float] | None = None
+) -> tuple[Gate, ...]:
     """Every gate in the table's order.
 
     Args:
         spec: of the scene; changed in place.
         maps: of the scene.
         objects: from its manifest.
+        kept: object -> share of its model's area that is drawn; older scenes do not say it.
     """
     object_names = [o.name for o in objects]
     try:
@@ -230,11 +240,18 @@ def evaluate(spec: mujoco.MjSpec, maps: SceneMaps, objects: Sequence[SceneObject
     for quantity in ("drift", "turn", "penetration"):
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
     agreed, warnings = manifest_values(model, objects)
-    values |= free_space_values(maps) | wall_values(model, maps) | agreed
+    surface, worst = surface_values(model, kept or {})
+    values |= free_space_values(maps) | wall_values(model, maps) | agreed | surface
+    warnings |= {name: told for name, told in worst.items() if not judge(name, surface[name]).passed}
     warnings["connected_share"] = free_space_warnings(maps)
     if off:
         warnings["unmatched_objects"] = (f"{', '.join(off)}: more than {OFF_MAP_M:g} m from all free floor of the map",)
     return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
+
+
+def drawn_shares(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Object -> share of its model's area that is drawn, from a scene's rows of alignment."""
+    return {str(row["name"]): float(row["drawn_area_share"]) for row in rows if "drawn_area_share" in row}
 
 
 def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
@@ -251,4 +268,4 @@ def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError:
         return manifest, (judge("compiles", 0.0),)
-    return manifest, evaluate(spec, maps, manifest.objects)
+    return manifest, evaluate(spec, maps, manifest.objects, drawn_shares(manifest.alignment))

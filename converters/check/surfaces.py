@@ -1,0 +1,83 @@
+"""Whether what is drawn of an object is what a robot hits, and what its model shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull, KDTree
+
+from converters.geometry.faces import sample_faces
+
+SPACING_M = 0.04
+"""Of the points on hulls and visuals."""
+HIDDEN_M, BARE_M = 0.1, 0.05
+"""A hull's side farther than the first from all that is drawn is hit unseen; what is drawn farther than the second
+outside of all hulls is driven through."""
+SIDE = 0.7
+"""Largest vertical component of the normal of what counts as a side: robots come along the floor."""
+
+
+def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) m in the body's frame and faces (m, 3) of a mesh geom."""
+    mesh, turn = model.geom_dataid[geom], np.zeros(9)
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    vertices = model.mesh_vert[first : first + count].astype(float)
+    faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]].astype(np.int64)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+    return vertices @ turn.reshape(3, 3).T + model.geom_pos[geom], faces
+
+
+def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -> tuple[float, float]:
+    """Of the hulls' outer sides what lies off the drawn mesh, and of the drawn mesh what lies outside of the hulls.
+
+    Args:
+        drawn: vertices (n, 3) m and faces (m, 3).
+        hulls: corners (n, 3) m of each.
+    """
+    solids = [ConvexHull(hull) for hull in hulls]
+
+    def outside(points: np.ndarray, of: list[ConvexHull], by_m: float) -> np.ndarray:
+        free = np.ones(len(points), bool)
+        for s in of:
+            near = free & ((points > s.min_bound - by_m) & (points < s.max_bound + by_m)).all(axis=1)
+            free[near] = (points[near] @ s.equations[:, :3].T + s.equations[:, 3]).max(axis=1) > by_m
+        return free
+
+    sides = []
+    for k, solid in enumerate(solids):
+        points, face = sample_faces(hulls[k], solid.simplices.astype(np.int64), SPACING_M)
+        points = points[np.abs(solid.equations[face, 2]) < SIDE]
+        sides.append(points[outside(points, solids[:k] + solids[k + 1 :], 1e-3)])
+    seen = sample_faces(*drawn, SPACING_M)[0]
+    off = KDTree(seen).query(np.vstack(sides), distance_upper_bound=HIDDEN_M)[0] > HIDDEN_M
+    bare = outside(seen, solids, BARE_M)
+    return float(off.mean()) if len(off) else 0.0, float(bare.mean())
+
+
+def surface_values(
+    model: mujoco.MjModel, kept: Mapping[str, float]
+) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
+    """Worst object's values of the gates on surfaces, and by gate the line that names it.
+
+    Args:
+        model: of the scene.
+        kept: object -> share of its model's area that is drawn, where it is known.
+    """
+    worst: dict[str, tuple[float, str]] = {"unseen_hulls": (0.0, ""), "unsolid_surface": (0.0, "")}
+    worst["surface_kept"] = min(((share, name) for name, share in kept.items()), default=(1.0, ""))
+    shares: dict[bytes, tuple[float, float]] = {}
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    for body in np.flatnonzero(model.body_jntnum[1:] > 0) + 1:
+        own = np.flatnonzero(model.geom_bodyid == body)
+        drawn = [geom_mesh(model, g) for g in own if names[g].endswith("_visual")]
+        hulls = [geom_mesh(model, g)[0] for g in own if "_hull_" in names[g]]
+        if drawn and hulls:
+            key = b"".join(np.round(points, 4).tobytes() for points in (drawn[0][0], *hulls))
+            if key not in shares:
+                shares[key] = body_shares(drawn[0], hulls)
+            for gate, share in zip(("unseen_hulls", "unsolid_surface"), shares[key], strict=True):
+                worst[gate] = max(worst[gate], (share, model.body(body).name))
+    values = {gate: share for gate, (share, _) in worst.items()}
+    return values, {gate: (f"{gate}: {name} is worst",) for gate, (_, name) in worst.items() if name}
