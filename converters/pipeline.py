@@ -36,7 +36,7 @@ from converters.records.gate import Gate
 from converters.records.raw import CATEGORY_LABELS, RawScene
 from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
-from converters.structure.floor import level_floor
+from converters.structure.floor import LIFT_M, level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.structure.walls import wall_boxes
 from converters.write.drawn import Drawn, as_it_is, draw_objects
@@ -138,7 +138,9 @@ def _structure_visual(
     config: ConvertConfig,
 ) -> VisualMesh:
     """The scan as it is, where it is small and whole; else levelled, filled, simplified and textured."""
-    own = TexturedMesh(vertices_w, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
+    # As the levelled floor of a scan: above the plane that collides. A generated structure brings that with it.
+    lift = np.array([0.0, 0.0, LIFT_M if raw.scan.furnished else 0.0])
+    own = TexturedMesh(vertices_w + lift, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
     small = as_it_is(own, config.structure_faces, config.structure_texture)
     if small is not None and keep.all() and not raw.picture:
         return small
@@ -147,7 +149,7 @@ def _structure_visual(
     cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
     if raw.picture:
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
-        drawn = drawn + (vertices_w[0] - raw.scan.vertices[0])
+        drawn = drawn + (vertices_w[0] - raw.scan.vertices[0]) + lift
         return bake_structure(drawn, faces, cloud, config.structure_texture)
     scan = simplify(level, raw.scan.faces[kept], config.structure_faces)
     patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)

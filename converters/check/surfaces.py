@@ -70,7 +70,7 @@ def surface_values(
     shares: dict[bytes, tuple[float, float]] = {}
     names = [model.geom(g).name for g in range(model.ngeom)]
     for body in np.flatnonzero(model.body_jntnum[1:] > 0) + 1:
-        own = np.flatnonzero(model.geom_bodyid == body)
+        own = np.flatnonzero(model.geom_bodyid == body).tolist()
         drawn = [geom_mesh(model, g) for g in own if names[g].endswith("_visual")]
         hulls = [geom_mesh(model, g)[0] for g in own if "_hull_" in names[g]]
         if drawn and hulls:

@@ -26,6 +26,7 @@ from converters.pipeline import ConvertConfig, convert
 from converters.read.files import read_textured_obj
 from converters.records.errors import SceneRejected
 from converters.records.gate import Limit
+from converters.structure.floor import LIFT_M
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_stale
 from interactive_nav_common.rotations import matrix_from_quat
@@ -280,7 +281,7 @@ def test_the_next_conversion_clears_what_a_killed_one_left_and_not_what_runs(pri
 
 
 def test_a_small_whole_scan_is_drawn_as_it_is(tmp_path, hull_cache):
-    """Own vertices, texture coordinates and image, to the bit."""
+    """Own vertices, 4 mm above the plane that collides, texture coordinates and image, to the bit."""
     room = trimesh.creation.box((4.0, 3.0, 2.5)).apply_translation((2.0, 1.5, 1.25))
     room.invert()
     colours = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
@@ -297,6 +298,6 @@ def test_a_small_whole_scan_is_drawn_as_it_is(tmp_path, hull_cache):
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "room" / "scene.xml"))
     even = model.light_ambient[0, 0] + model.vis.headlight.ambient[0]
     assert even == pytest.approx(0.9) and model.light_diffuse[0, 0] + model.vis.headlight.diffuse[0] <= 0.31
-    order, given = np.lexsort(vertices[faces].mean(axis=1).round(4).T), room.triangles.mean(axis=1).round(4)
-    assert np.allclose(vertices[faces].mean(axis=1)[order], given[np.lexsort(given.T)], atol=1e-3)
+    middle, given = vertices[faces].mean(axis=1).round(4), (room.triangles.mean(axis=1) + [0, 0, LIFT_M]).round(4)
+    assert np.allclose(middle[np.lexsort(middle.T)], given[np.lexsort(given.T)], atol=1e-4)
     assert np.allclose(np.unique(corner_uv.reshape(-1, 2), axis=0), np.unique(uv, axis=0), atol=1e-4)
