@@ -24,7 +24,8 @@ from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import simplify, simplify_parts
+from converters.geometry.faces import simplify_parts
+from converters.geometry.simplify import simplify_open
 from converters.propose.proposals import propose_instances
 from converters.propose.report import floor_of
 from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
@@ -151,7 +152,7 @@ def _structure_visual(
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
         drawn = drawn + (vertices_w[0] - raw.scan.vertices[0]) + lift
         return bake_structure(drawn, faces, cloud, config.structure_texture)
-    scan = simplify(level, raw.scan.faces[kept], config.structure_faces)
+    scan = simplify_open(level, raw.scan.faces[kept], config.structure_faces)
     patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
     both = joined_clouds(cloud, patch_cloud)
     whole = np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])])

@@ -21,6 +21,8 @@ LOOSER, ROUNDS = 1.6, 3
 """What exceeds a number of faces is simplified to an error larger by this factor, so many times."""
 SPREAD, NEAREST, WORST = 6000, 8, 200
 """Samples of a mesh, about, that a distance is sought at; how many of them; distances that are computed exactly."""
+RIM_ROUNDS = 5
+"""Tries to meet a number of faces where faces on rims count too."""
 LOSS_M = 0.03
 """Sampling of a surface whose loss is measured."""
 
@@ -126,3 +128,37 @@ def surface_loss(
     """Share of a mesh's area that a simplified one has, and the farthest that the mesh lies from it, m."""
     kept = face_areas(low_vertices, low_faces).sum() / face_areas(vertices, faces).sum()
     return float(kept), farthest(sample_faces(vertices, faces, LOSS_M)[0], low_vertices, low_faces)
+
+
+def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """A surface with holes simplified to at most about so many faces, the holes' rims kept.
+
+    Quadrics do not see a rim: windows and doorways would fray. So each edge of a rim gets a face that stands upright on
+    it, and takes part, but is not in the result.
+    """
+    vertices, faces, _ = merge_vertices(vertices, faces)
+    if len(faces) <= most_faces:
+        return simplify(vertices, faces, most_faces)
+    edges, owner = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), np.repeat(np.arange(len(faces)), 3)
+    _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    edges, owner = edges[first[count == 1]], owner[first[count == 1]]
+    (a, b, c), (start, end) = vertices[faces[owner]].transpose(1, 0, 2), vertices[edges].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    tips = (start + end) / 2 + normal * np.linalg.norm(end - start, axis=1, keepdims=True)
+    points = np.vstack([vertices, tips])
+    whole = np.vstack([faces, np.column_stack([edges[:, ::-1], len(vertices) + np.arange(len(edges))])]).astype(
+        np.int32
+    )
+    target, left = most_faces, faces
+    for _ in range(RIM_ROUNDS):
+        *_, collapses = fast_simplification.simplify(points, whole, target_count=target, return_collapses=True)
+        made, _, place = fast_simplification.replay_simplification(points, whole, collapses)
+        corners = np.asarray(place, np.int64)[faces]
+        left = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+        left = left[np.unique(np.sort(left, axis=1), axis=0, return_index=True)[1]]
+        vertices = np.asarray(made, float)
+        if len(left) <= 1.02 * most_faces:
+            break
+        target = max(target * most_faces // len(left), 4)
+    return simplify(vertices, left, len(left))

@@ -1,0 +1,37 @@
+"""A wall with a window, scanned: its rim stays straight and no triangle is torn out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from converters.geometry.simplify import simplify_open, surface_distance
+
+
+def wall() -> tuple[np.ndarray, np.ndarray]:
+    """4 x 2.5 m in steps of 2.5 cm that waves by 4 mm, without the window 1 <= x < 2.5, 0.9 <= z < 2."""
+    x, z = np.meshgrid(np.arange(161) * 0.025, np.arange(101) * 0.025, indexing="ij")
+    vertices = np.stack([x, 0.004 * np.sin(9 * x) * np.cos(7 * z), z], axis=-1).reshape(-1, 3)
+    corner = (np.arange(160)[:, None] * 101 + np.arange(100)).reshape(-1)
+    faces = np.vstack([corner[:, None] + [0, 101, 1], corner[:, None] + [101, 102, 1]])
+    middle = vertices[faces].mean(axis=1)
+    hole = (middle[:, 0] > 1) & (middle[:, 0] < 2.5) & (middle[:, 2] > 0.9) & (middle[:, 2] < 2)
+    return vertices, faces[~hole]
+
+
+@pytest.mark.parametrize("most", [60, 200])
+def test_a_windows_rim_stays_where_it_was(most):
+    vertices, faces = wall()
+    low = simplify_open(vertices, faces, most)
+    assert 0 < len(low[1]) <= 1.05 * most
+    used = vertices[np.unique(faces)]
+    assert surface_distance(used, *low).max() < 0.012
+    # Nothing reaches over the window: its area is what it was.
+    assert surface_distance(low[0], vertices, faces).max() < 0.012
+    a, b, c = low[0][low[1]].transpose(1, 0, 2)
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(4 * 2.5 - 1.5 * 1.1, abs=0.05)
+
+
+def test_few_faces_stay():
+    vertices, faces = wall()
+    assert len(simplify_open(vertices, faces, len(faces))[1]) == len(faces)
