@@ -289,7 +289,7 @@ def _rest(parts: SceneParts) -> dict[str, Any]:
         "tilt_deg": round(math.degrees(math.acos(float(np.clip(up[2], -1, 1)))), 3),
     }
     for shape, name in (("hull", "hulls"), ("box", "boxes")):
-        values = physical_values(collide_with(build_spec(parts, inline=True), shape))
+        values = physical_values(collide_with(build_spec(parts), shape))
         if not values["finite"]:
             raise SceneRejected(f"{placed.name}: its simulation is not finite with {name}; give another collision mesh")
         result |= {

@@ -12,8 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
-from converters.read.files import read_image, read_textured_obj
-from converters.records.visual import TexturedMesh
+from converters.check.surfaces import geom_surface
 from converters.write.texture import textured_cloud
 from interactive_nav_common.files import check_name
 from scenes_mjcf.schema import SCENES, SceneError
@@ -67,10 +66,10 @@ def draw_object(folder: Path) -> Figure:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     turn, origin = data.xmat[body].reshape(3, 3), data.xpos[body]
-    vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{name}_visual.obj")
-    image = read_image(folder / "assets" / f"{name}.png", "RGB")
-    size_m = float(np.ptp(vertices, axis=0).max())
-    cloud = textured_cloud(TexturedMesh(vertices @ turn.T + origin, faces, corner_uv, image), 0.9 * size_m / PIXELS)
+    surface_b = geom_surface(model, model.geom(f"{name}_visual").id)
+    size_m = float(np.ptp(surface_b.vertices, axis=0).max())
+    surface_w = dataclasses.replace(surface_b, vertices=surface_b.vertices @ turn.T + origin)
+    cloud = textured_cloud(surface_w, 0.9 * size_m / PIXELS)
     figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
     for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
         points = cloud.points @ axes_w.T

@@ -25,10 +25,10 @@ from scipy.spatial import ConvexHull
 
 from converters.bodies.objects import PlacedObject
 from converters.check.object_preview import draw_object, view
+from converters.check.surfaces import geom_mesh, geom_surface
 from converters.geometry.boxes import convex_hull
-from converters.read.files import read_image, read_textured_obj
 from converters.records.raw import RawScene
-from converters.records.visual import ColourCloud, TexturedMesh
+from converters.records.visual import ColourCloud
 from converters.structure.cut import cut_furniture
 from converters.write.texture import colour_cloud, textured_cloud
 from interactive_nav_common.files import whole_file
@@ -76,13 +76,6 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarra
     return points[ConvexHull(points).vertices]
 
 
-def _coloured_points(folder: Path, stem: str, spacing_m: float) -> ColourCloud:
-    """Points on a visual mesh, as stored."""
-    vertices, faces, corner_uv = read_textured_obj(folder / "assets" / f"{stem}_visual.obj")
-    image = read_image(folder / "assets" / f"{stem}.png", "RGB")
-    return textured_cloud(TexturedMesh(vertices, faces, corner_uv, image), spacing_m)
-
-
 def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:
     """A palette image: the views' own commonest colours beside those that the panels draw with.
 
@@ -107,7 +100,6 @@ def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:
 class _Scene:
     """A scene at rest, ready to draw."""
 
-    folder: Path
     model: mujoco.MjModel
     data: mujoco.MjData
     manifest: SceneManifest
@@ -186,7 +178,7 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
     """Each movable object's CAD surface in its category's colour, lit from above, with its name."""
     _draw_ground(axes, scene)
     for item in scene.manifest.objects:
-        vertices, faces, _ = read_textured_obj(scene.folder / "assets" / f"{item.name}_visual.obj")
+        vertices, faces = geom_mesh(scene.model, scene.model.geom(f"{item.name}_visual").id)
         body = scene.model.body(item.name).id
         corners = (vertices @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body])[faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -224,9 +216,9 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
     """The scene's objects as the cut takes them."""
     found = []
     for item in scene.manifest.objects:
-        assets = scene.folder / "assets"
-        vertices, faces, _ = read_textured_obj(assets / f"{item.name}_visual.obj")
-        hulls = [read_textured_obj(assets / f"{item.name}_hull_{i}.obj")[0] for i in range(item.n_hulls)]
+        vertices, faces = geom_mesh(scene.model, scene.model.geom(f"{item.name}_visual").id)
+        names = [f"{item.name}_hull_{i}" for i in range(item.n_hulls)]
+        hulls = [geom_mesh(scene.model, scene.model.geom(name).id)[0] for name in names]
         body = scene.model.body(item.name).id
         found.append(
             PlacedObject(
@@ -248,7 +240,7 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
 
 def _visual_cloud(scene: _Scene, stem: str, spacing_m: float) -> ColourCloud:
     """World points on a textured mesh of the scene."""
-    cloud = _coloured_points(scene.folder, stem, spacing_m)
+    cloud = textured_cloud(geom_surface(scene.model, scene.model.geom(f"{stem}_visual").id), spacing_m)
     body = scene.model.body(stem).id
     turn = scene.data.xmat[body].reshape(3, 3).T
     return ColourCloud(cloud.points @ turn + scene.data.xpos[body], cloud.normals @ turn, cloud.colours)
@@ -364,7 +356,7 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    figure, palette = draw(_Scene(folder, model, data, manifest, maps), raw)
+    figure, palette = draw(_Scene(model, data, manifest, maps), raw)
     with whole_file(target) as picture:
         figure.savefig(picture, format="png", metadata={"Software": None})
         with Image.open(picture) as image:

@@ -51,7 +51,7 @@ def push_apart(parts: SceneParts) -> SceneParts:
     """Slides free objects horizontally until neither hulls nor boxes cut walls or each other.
 
     Without dynamics, so that nothing flies."""
-    model = collide_with(build_spec(parts, inline=True), "both")
+    model = collide_with(build_spec(parts), "both")
     data = mujoco.MjData(model)
     free = {
         int(model.body(o.name).id): int(model.joint(f"{o.name}_free").qposadr[0])
@@ -106,7 +106,7 @@ def _with_poses(parts: SceneParts, model: mujoco.MjModel, data: mujoco.MjData) -
 
 def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
     """Damped simulation; doors are held."""
-    model = collide_with(build_spec(parts, inline=True), shape)
+    model = collide_with(build_spec(parts), shape)
     model.opt.timestep = 0.002
     for placed in parts.objects:
         body = int(model.body(placed.name).id)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
 from converters.geometry.faces import sample_faces
+from converters.records.visual import TexturedMesh
 
 SPACING_M = 0.04
 """Of the points on hulls and visuals."""
@@ -27,6 +28,17 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]
     faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]].astype(np.int64)
     mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
     return vertices @ turn.reshape(3, 3).T + model.geom_pos[geom], faces
+
+
+def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
+    """A textured mesh geom as MuJoCo draws it, in the body's frame."""
+    vertices, faces = geom_mesh(model, geom)
+    mesh, image = model.geom_dataid[geom], model.mat_texid[model.geom_matid[geom]][mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    corners = model.mesh_facetexcoord[model.mesh_faceadr[mesh] :][: len(faces)]
+    uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] :][corners] * [1.0, -1.0] + [0.0, 1.0]
+    shape = model.tex_height[image], model.tex_width[image], model.tex_nchannel[image]
+    pixels = model.tex_data[model.tex_adr[image] :][: np.prod(shape)].reshape(shape)
+    return TexturedMesh(vertices, faces, uv, pixels[..., :3])
 
 
 def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -> tuple[float, float]:

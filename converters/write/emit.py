@@ -13,7 +13,7 @@ import numpy as np
 
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
-from converters.geometry.boxes import Hull, OrientedBox, least_turned
+from converters.geometry.boxes import OrientedBox, least_turned
 from converters.records.visual import VisualMesh
 from converters.write.texture import as_png, quantise
 
@@ -22,6 +22,33 @@ DOOR_DAMPING = 2.0
 """N m s/rad: a pushed interior door stops after about a second."""
 DOOR_FRICTION = 0.4
 """N m: no latch, only this dry friction: keeps a door where it was left, half a newton at the handle."""
+
+
+ONE = (1.0, 1.0, 1.0)
+SAME_M = 5e-5
+"""Meshes no farther apart are one; half of what a file's last digit is."""
+HULL_DECIMALS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """Which files show a body."""
+
+    mesh: str
+    """Body after which the mesh's file is named."""
+    scale: tuple[float, float, float]
+    """Of the mesh along the body's axes."""
+    image: str
+    """Body after which the texture's file is named."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Assets:
+    """Names of the files that bodies, by name, are made from."""
+
+    looks: dict[str, Look]
+    hulls: dict[str, tuple[str, ...]]
+    """Mesh of each hull; its file has the same name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +91,7 @@ def _tidy(values: np.ndarray) -> np.ndarray:
 
 
 def _add_movable(
-    spec: mujoco.MjSpec, placed: PlacedObject, physical: Physical, visual: VisualMesh | None, inline: bool
+    spec: mujoco.MjSpec, placed: PlacedObject, physical: Physical, look: Look | None, hulls: tuple[str, ...]
 ) -> None:
     body = spec.worldbody.add_body(
         name=placed.name, pos=_tidy(placed.position_w), quat=np.round(placed.quaternion_w, 9)
@@ -91,26 +118,22 @@ def _add_movable(
             armature=0.01,
         )
     friction = [physical.friction, 0.005, 0.0001]
-    if visual is not None:
-        body.add_geom(
-            spec.find_default("visual"),
-            name=f"{placed.name}_visual",
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"{placed.name}_visual",
-            material=f"{placed.name}_material",
-        )
-        _add_textured_mesh(spec, f"{placed.name}_visual", placed.name)
+    if look is not None:
+        _add_look(spec, body, placed.name, look)
     for i, (hull, box) in enumerate(zip(placed.hulls_b, placed.boxes_b, strict=True)):
-        mesh = spec.add_mesh(name=f"{placed.name}_hull_{i}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-        if inline:
-            mesh.uservert = _tidy(hull.vertices).reshape(-1)
-        else:
-            mesh.file = f"{placed.name}_hull_{i}.obj"
+        name = f"{placed.name}_hull_{i}"
+        own = hulls[i] if hulls else name
+        if own == name:
+            mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+            if hulls:
+                mesh.file = f"{name}.obj"
+            else:
+                mesh.uservert = _tidy(hull.vertices).reshape(-1)
         body.add_geom(
             spec.find_default("hull"),
-            name=f"{placed.name}_hull_{i}",
+            name=name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=mesh.name,
+            meshname=own,
             friction=friction,
         )
         body.add_geom(
@@ -124,30 +147,73 @@ def _add_movable(
         )
 
 
-def _add_textured_mesh(spec: mujoco.MjSpec, mesh_name: str, stem: str) -> None:
-    spec.add_mesh(name=mesh_name, file=f"{mesh_name}.obj", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    spec.add_texture(name=f"{stem}_texture", file=f"{stem}.png", type=mujoco.mjtTexture.mjTEXTURE_2D)
-    material = spec.add_material(name=f"{stem}_material", specular=0.1, shininess=0.1)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"{stem}_texture"
+def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Look) -> None:
+    """A textured visual geom; meshes, textures and materials that another body brought are used again."""
+    mesh_name = f"{name}_visual" if look.scale != ONE else f"{look.mesh}_visual"
+    if mesh_name == f"{name}_visual":
+        spec.add_mesh(
+            name=mesh_name, file=f"{look.mesh}_visual.obj", scale=look.scale,
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )  # fmt: skip
+    if look.image == name:
+        spec.add_texture(name=f"{name}_texture", file=f"{name}.png", type=mujoco.mjtTexture.mjTEXTURE_2D)
+        material = spec.add_material(name=f"{name}_material", specular=0.1, shininess=0.1)
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"{name}_texture"
+    body.add_geom(
+        spec.find_default("visual"),
+        name=f"{name}_visual",
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=mesh_name,
+        material=f"{look.image}_material",
+    )
 
 
-def build_spec(parts: SceneParts, inline: bool) -> mujoco.MjSpec:
+def _scale_between(first: VisualMesh, other: VisualMesh) -> tuple[float, float, float] | None:
+    """What turns the first mesh into the other, an axis; None where no scale does."""
+    size, wanted = (np.ptp(m.vertices, axis=0) for m in (first, other))
+    scale = np.round(np.where(size > 1e-6, wanted / np.maximum(size, 1e-6), 1.0), 6)
+    if np.abs(first.vertices * scale - other.vertices).max() > SAME_M:
+        return None
+    return float(scale[0]), float(scale[1]), float(scale[2])
+
+
+def share_assets(parts: SceneParts) -> Assets:
+    """Which files show and bound each body: equal ones are written once, under the first body's name.
+
+    Args:
+        parts: with visuals.
+    """
+    looks, meshes, images, solids, hulls = {}, {}, {}, {}, {}
+    drawn = [(o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
+    for name, visual in [*drawn, *([("structure", parts.structure_visual)] if parts.structure_visual else [])]:
+        image = images.setdefault((visual.exact, visual.image.shape, visual.image.tobytes()), name)
+        key = tuple(np.ascontiguousarray(v).tobytes() for v in (visual.faces, visual.uv, visual.uv_faces))
+        first, mesh = meshes.setdefault(key, (name, visual))
+        scale = _scale_between(mesh, visual)
+        looks[name] = Look(name, ONE, image) if scale is None else Look(first, scale, image)
+    for placed in parts.objects:
+        for i, hull in enumerate(placed.hulls_b):
+            key = (np.round(hull.vertices, HULL_DECIMALS) + 0.0).tobytes(), hull.faces.tobytes()
+            hulls.setdefault(placed.name, []).append(solids.setdefault(key, f"{placed.name}_hull_{i}"))
+    return Assets(looks, {name: tuple(names) for name, names in hulls.items()})
+
+
+def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec:
     """The scene as an `MjSpec`.
 
     Args:
         parts: of the scene.
-        inline: True keeps hulls inside the spec and leaves visuals out (settling); False names files in
-        `assets/`.
+        assets: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
     """
     spec = _empty_spec(parts.name)
     _add_surroundings(spec, parts.walls, parts.structure_visual is not None and parts.structure_visual.exact)
-    _add_structure(spec, parts)
+    assets = assets or Assets({}, {})
+    _add_structure(spec, parts, assets.looks.get("structure"))
     # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
     for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
         spec.add_text(name=f"class_{body}", data=category)
-    visuals = parts.object_visuals or (None,) * len(parts.objects)
-    for placed, physical, visual in zip(parts.objects, parts.physical, visuals, strict=True):
-        _add_movable(spec, placed, physical, visual, inline)
+    for placed, physical in zip(parts.objects, parts.physical, strict=True):
+        _add_movable(spec, placed, physical, assets.looks.get(placed.name), assets.hulls.get(placed.name, ()))
     return spec
 
 
@@ -188,18 +254,11 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
         spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.3] * 3, [0.1] * 3
 
 
-def _add_structure(spec: mujoco.MjSpec, parts: SceneParts) -> None:
+def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) -> None:
     """The cleaned scan as a picture, and the wall boxes."""
     structure = spec.worldbody.add_body(name="structure")
-    if parts.structure_visual is not None:
-        _add_textured_mesh(spec, "structure_visual", "structure")
-        structure.add_geom(
-            spec.find_default("visual"),
-            name="structure_visual",
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname="structure_visual",
-            material="structure_material",
-        )
+    if look is not None:
+        _add_look(spec, structure, "structure", look)
     for i, wall in enumerate(parts.walls):
         structure.add_geom(
             spec.find_default("structure"),
@@ -220,12 +279,13 @@ def write_obj(
     uv_faces: np.ndarray | None = None,
     decimals: int = 4,
 ) -> None:
-    """Writes a triangle mesh as OBJ, 0.1 mm by default."""
-    lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
+    """Writes a triangle mesh as OBJ, 0.1 mm by default; one with texture coordinates without trailing zeros."""
     if uv is None or uv_faces is None:
+        lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     else:
-        lines += [f"vt {u:.4f} {v:.4f}" for u, v in uv]
+        lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.round(vertices, decimals) + 0.0]
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in np.round(uv, 4) + 0.0]
         lines += [f"f {a}/{i} {b}/{j} {c}/{k}" for (a, b, c), (i, j, k) in zip(faces + 1, uv_faces + 1, strict=True)]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
@@ -238,30 +298,23 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
         folder: of the scene.
         palette: colours of a texture.
     """
-    assets = folder / "assets"
+    assets, shared = folder / "assets", share_assets(parts)
     assets.mkdir()
-    meshes = [(f"{o.name}_visual", o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
-    if parts.structure_visual is not None:
-        meshes.append(("structure_visual", "structure", parts.structure_visual))
-    for mesh_name, stem, visual in meshes:
-        write_obj(
-            assets / f"{mesh_name}.obj",
-            visual.vertices,
-            visual.faces,
-            visual.uv,
-            visual.uv_faces,
-            decimals=3 if stem == "structure" else 4,
-        )
-        image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
-        image.save(assets / f"{stem}.png", optimize=True)
+    drawn = dict(zip((o.name for o in parts.objects), parts.object_visuals, strict=True))
+    for name, look in shared.looks.items():
+        visual = parts.structure_visual if name == "structure" else drawn[name]
+        assert visual is not None
+        if look.mesh == name:
+            mesh = visual.vertices, visual.faces, visual.uv, visual.uv_faces
+            write_obj(assets / f"{name}_visual.obj", *mesh, decimals=3 if name == "structure" else 4)
+        if look.image == name:
+            image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
+            image.save(assets / f"{name}.png", optimize=True)
     for placed in parts.objects:
-        for i, hull in enumerate(placed.hulls_b):
-            _write_hull(assets / f"{placed.name}_hull_{i}.obj", hull)
-    spec = build_spec(parts, inline=False)
+        for i, (hull, name) in enumerate(zip(placed.hulls_b, shared.hulls[placed.name], strict=True)):
+            if name == f"{placed.name}_hull_{i}":
+                write_obj(assets / f"{name}.obj", hull.vertices, hull.faces, decimals=HULL_DECIMALS)
+    spec = build_spec(parts, shared)
     spec.modelfiledir = str(folder)
     spec.compile()
     (folder / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")
-
-
-def _write_hull(path: Path, hull: Hull) -> None:
-    write_obj(path, hull.vertices, hull.faces, decimals=5)
