@@ -6,6 +6,7 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -25,12 +26,13 @@ from scipy.spatial import ConvexHull
 
 from converters.bodies.objects import PlacedObject
 from converters.check.object_preview import draw_object, view
-from converters.check.surfaces import geom_mesh, geom_surface
+from converters.check.surfaces import geom_mesh
+from converters.check.views import CUT_M, EYE_M, EYE_VIEW_RAD, at_eye_height, from_above, from_the_south, world_surfaces
 from converters.geometry.boxes import convex_hull
 from converters.records.raw import RawScene
-from converters.records.visual import ColourCloud
+from converters.records.visual import TexturedMesh
 from converters.structure.cut import cut_furniture
-from converters.write.texture import colour_cloud, textured_cloud
+from converters.write.texture import colour_cloud
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
@@ -41,11 +43,10 @@ MARGIN_M = 0.3
 """Empty border around the map."""
 SURFACE_PIXELS = 480
 """Longer side of a surface's picture; a panel is about as large on the page."""
-FURNISHED_PIXELS = 800
-ELEVATION_RAD = math.radians(53.0)
-CUT_M = 1.3
-LIGHT_W = np.array([0.35, -0.45, 0.82])
-"""Where the light comes from in the view from the side."""
+COLUMNS, PANEL_IN, LEAST_WIDTH_IN = 3, 3.3, 9.0
+"""Panels beside each other, how high one is, and the page's least width."""
+SLANTWISE = 0.62
+"""Of the page's width, the view from the south; that at eye height stands beside it."""
 DPI = 100
 SURFACE_COLOURS = 64
 ALWAYS_IN_PALETTE = 10
@@ -104,6 +105,8 @@ class _Scene:
     data: mujoco.MjData
     manifest: SceneManifest
     maps: SceneMaps
+    surfaces: dict[str, TexturedMesh]
+    """What is drawn, by body, in the world."""
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -124,44 +127,32 @@ def _frame(axes: Axes, scene: _Scene, title: str) -> None:
     axes.text(left + 0.5, bottom - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
 
 
-def _draw_surface(axes: Axes, scene: _Scene, sample: Callable[[float], list[ColourCloud]], title: str) -> None:
-    """Coloured surfaces from above; `sample` is told how far apart the points may be."""
+def _draw_surface(
+    axes: Axes, scene: _Scene, seen: Callable[[np.ndarray, np.ndarray, float], np.ndarray], title: str
+) -> None:
+    """Coloured surfaces from above; `seen` is told the lower left and upper right corner and how wide a pixel is."""
     left, right, bottom, top = scene.extent
-    low = np.array([left, bottom]) - MARGIN_M
-    size_m = np.array([right - left, top - bottom]) + 2 * MARGIN_M
-    pixel_m = float(size_m.max()) / SURFACE_PIXELS
-    clouds = sample(0.9 * pixel_m)
-    shape = (int(np.ceil(size_m[1] / pixel_m)), int(np.ceil(size_m[0] / pixel_m)))
-    points, colours = np.vstack([c.points for c in clouds]), np.vstack([c.colours for c in clouds])
-    seen = view(points, colours.astype(np.uint8), low, shape, pixel_m)
-    extent = (low[0], low[0] + shape[1] * pixel_m, low[1], low[1] + shape[0] * pixel_m)
-    axes.imshow(seen, origin="lower", extent=extent, interpolation="nearest")
+    low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
+    pixel_m = float((high - low).max()) / SURFACE_PIXELS
+    image = seen(low, high, pixel_m)
+    extent = (low[0], low[0] + image.shape[1] * pixel_m, low[1], low[1] + image.shape[0] * pixel_m)
+    axes.imshow(image, extent=extent, interpolation="nearest")
     _frame(axes, scene, title)
 
 
-def _draw_furnished(axes: Axes, scene: _Scene) -> None:
-    """Everything at rest, seen slantwise from the south: walls are cut at `CUT_M`, and no wall is seen from behind."""
+def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float) -> None:
+    """Everything at rest, seen from the south and by somebody who stands there."""
     left, right, bottom, top = scene.extent
-    sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
-    axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
-    low = np.array([left - MARGIN_M, sin * (bottom - MARGIN_M)])
-    size_m = np.array([right + MARGIN_M, sin * (top + MARGIN_M) + cos * CUT_M]) - low
-    pixel_m = float(size_m[0]) / FURNISHED_PIXELS
-    shape = (int(np.ceil(size_m[1] / pixel_m)), FURNISHED_PIXELS)
-    seen: list[ColourCloud] = []
-    for stem in ("structure", *(item.name for item in scene.manifest.objects)):
-        cloud = _visual_cloud(scene, stem, 0.9 * pixel_m)
-        keep = np.ones(len(cloud.points), bool)
-        if stem == "structure":
-            keep = (cloud.points[:, 2] < CUT_M) & (cloud.normals @ axes_w[2] >= 0.0)
-        light = 0.6 + 0.4 * np.abs(cloud.normals[keep] @ LIGHT_W)
-        seen.append(
-            ColourCloud(cloud.points[keep] @ axes_w.T, cloud.normals[keep], cloud.colours[keep] * light[:, None])
-        )
-    points, colours = np.vstack([c.points for c in seen]), np.vstack([c.colours for c in seen])
-    axes.imshow(view(points, colours.astype(np.uint8), low, shape, pixel_m)[::-1], interpolation="nearest")
-    axes.set_title(f"furnished, from the south; walls cut at {CUT_M:g} m", fontsize=10)
-    axes.axis("off")
+    low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
+    wide = int(SLANTWISE * width_in * DPI)
+    slantwise.imshow(from_the_south(scene.surfaces, scene.maps, low, high, wide), interpolation="nearest")
+    slantwise.set_title(f"furnished, from the south; walls cut at {CUT_M:g} m", fontsize=10)
+    wide = int((1 - SLANTWISE) * width_in * DPI)
+    eye = at_eye_height(scene.model, scene.data, scene.surfaces, scene.maps, (int(0.75 * wide), wide))
+    standing.imshow(eye, interpolation="nearest")
+    standing.set_title(f"from {EYE_M:g} m, {math.degrees(EYE_VIEW_RAD):.0f} degrees wide", fontsize=10)
+    for axes in (slantwise, standing):
+        axes.axis("off")
 
 
 def _draw_ground(axes: Axes, scene: _Scene) -> None:
@@ -178,15 +169,14 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
     """Each movable object's CAD surface in its category's colour, lit from above, with its name."""
     _draw_ground(axes, scene)
     for item in scene.manifest.objects:
-        vertices, faces = geom_mesh(scene.model, scene.model.geom(f"{item.name}_visual").id)
-        body = scene.model.body(item.name).id
-        corners = (vertices @ scene.data.xmat[body].reshape(3, 3).T + scene.data.xpos[body])[faces]
+        surface = scene.surfaces[item.name]
+        corners = surface.vertices[surface.faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         light = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
         order = np.argsort(corners[:, :, 2].max(axis=1), kind="stable")
         colours = np.outer(0.55 + 0.45 * light, CATEGORIES[item.category].preview_colour)[order]
         axes.add_collection(
-            PolyCollection(corners[order, :, :2], facecolors=colours, edgecolors=colours, linewidth=0.2)
+            PolyCollection(list(corners[order, :, :2]), facecolors=colours, edgecolors=colours, linewidth=0.2)
         )
     for item in scene.manifest.objects:
         x, y = scene.data.body(item.name).xipos[:2]
@@ -238,14 +228,6 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
     return tuple(found)
 
 
-def _visual_cloud(scene: _Scene, stem: str, spacing_m: float) -> ColourCloud:
-    """World points on a textured mesh of the scene."""
-    cloud = textured_cloud(geom_surface(scene.model, scene.model.geom(f"{stem}_visual").id), spacing_m)
-    body = scene.model.body(stem).id
-    turn = scene.data.xmat[body].reshape(3, 3).T
-    return ColourCloud(cloud.points @ turn + scene.data.xpos[body], cloud.normals @ turn, cloud.colours)
-
-
 def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
     """Reads the raw folder that a scene was made from.
 
@@ -272,22 +254,24 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
 
 
 def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
-    """Draws the panels: scan and cut where the raw scene is given; filled, objects, hulls and boxes.
+    """Draws two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes.
 
     Returns:
         The figure, and a palette that suits it.
     """
     left, right, bottom, top = scene.extent
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
-    columns, height = (3, 4.6) if raw is not None else (2, 4.2)
-    width = max(columns * height * ratio, 7.0)  # the legend's
-    tall = width * (0.8 / ratio + 0.12)  # of the view from the side, as wide as the page
-    figure = plt.figure(figsize=(width, tall + 2 * height + 0.7), dpi=DPI)
-    places = figure.add_gridspec(3, columns, height_ratios=(tall, height, height))
-    furnished = figure.add_subplot(places[0, :])
-    panels = [figure.add_subplot(places[row, column]) for row in (1, 2) for column in range(columns)]
-    views = [furnished, *panels[: 2 * columns - 3]]
-    _draw_furnished(furnished, scene)
+    rows = 2 if raw is not None else 1
+    width = max(COLUMNS * PANEL_IN * ratio, LEAST_WIDTH_IN)
+    tall = width * SLANTWISE * (0.8 / ratio + 0.12) + 0.3  # of the view from the south
+    panel = width / COLUMNS / ratio + 0.3
+    figure = plt.figure(figsize=(width, tall + rows * panel + 0.7), dpi=DPI)
+    places = figure.add_gridspec(1 + rows, COLUMNS, height_ratios=(tall, *[panel] * rows))
+    top_row = places[0, :].subgridspec(1, 2, width_ratios=(SLANTWISE, 1 - SLANTWISE))
+    slantwise, standing = figure.add_subplot(top_row[0]), figure.add_subplot(top_row[1])
+    panels = [figure.add_subplot(places[row, column]) for row in range(1, 1 + rows) for column in range(COLUMNS)]
+    views = [slantwise, standing, *panels[:-3]]
+    _draw_views(slantwise, standing, scene, width)
 
     if raw is not None:
         vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
@@ -297,14 +281,16 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
             (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
             (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
         ):
-            faces = raw.scan.faces
 
-            def sample(spacing_m: float, chosen: np.ndarray = chosen, faces: np.ndarray = faces) -> list[ColourCloud]:
-                return [colour_cloud(raw.scan, vertices_w, faces, chosen, spacing_m)]
+            def seen(low: np.ndarray, high: np.ndarray, pixel_m: float, chosen: np.ndarray = chosen) -> np.ndarray:
+                cloud = colour_cloud(raw.scan, vertices_w, raw.scan.faces, chosen, 0.9 * pixel_m)
+                columns, rows = np.ceil((high - low) / pixel_m).astype(int).tolist()
+                return view(cloud.points, cloud.colours.astype(np.uint8), low, (rows, columns), pixel_m)[::-1]
 
-            _draw_surface(axes, scene, sample, title)
-    filled, objects, hulls, boxes = panels
-    _draw_surface(filled, scene, lambda m: [_visual_cloud(scene, "structure", m)], "filled: the static structure")
+            _draw_surface(axes, scene, seen, title)
+        structure = functools.partial(from_above, scene.surfaces["structure"])
+        _draw_surface(panels.pop(0), scene, structure, "filled: the static structure")
+    objects, hulls, boxes = panels
     _draw_objects(objects, scene)
     _draw_collision(hulls, scene, "hull")
     _draw_collision(boxes, scene, "box")
@@ -356,7 +342,7 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    figure, palette = draw(_Scene(model, data, manifest, maps), raw)
+    figure, palette = draw(_Scene(model, data, manifest, maps, world_surfaces(model, data)), raw)
     with whole_file(target) as picture:
         figure.savefig(picture, format="png", metadata={"Software": None})
         with Image.open(picture) as image:

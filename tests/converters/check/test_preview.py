@@ -29,7 +29,7 @@ def test_a_source_adds_scan_and_cut(tiny_scene, pristine, tmp_path):
     preview(folder, tmp_path / "four.png")
     assert main(["preview", str(folder), "-o", str(tmp_path / "six.png"), "--source", str(pristine / "gibson")]) == 0
     four, six = colours(tmp_path / "four.png"), colours(tmp_path / "six.png")
-    assert six.shape[1] > 1.3 * four.shape[1]  # three columns, not two
+    assert six.shape[0] > 1.2 * four.shape[0] and six.shape[1] == four.shape[1]  # three panels more, in a row
     for picture in (four, six):
         # The traversable area is drawn in its own colour, 0.85 0.94 0.85.
         near = np.abs(picture.astype(int) - [217, 240, 217]).max(axis=2) <= 6
@@ -86,7 +86,7 @@ def test_the_view_from_the_side_shows_furniture_in_its_own_colours(scene):
     before, after = (colours(scene / f"{name}.png").astype(int) for name in ("before", "after"))
     magenta = [(p[..., 0] > 90) & (p[..., 2] > 90) & (p[..., 1] < 40) for p in (before, after)]
     rows = np.flatnonzero(magenta[1].sum(1) > magenta[0].sum(1))
-    assert magenta[1].sum() > magenta[0].sum() + 15 and rows.max() < 0.5 * len(after)
+    assert magenta[1].sum() > magenta[0].sum() + 15 and rows.max() < 0.6 * len(after)
 
 
 @pytest.mark.parametrize(

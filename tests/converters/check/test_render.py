@@ -1,0 +1,89 @@
+"""Pictures of quads whose pixels one can work out, and of a scene whose objects must be seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from converters.check.render import Camera, Picture, looking_at
+from converters.check.views import at_eye_height, from_the_south, world_surfaces
+from converters.records.visual import TexturedMesh
+from scenes_mjcf.schema import load_maps
+
+RED, BLUE, MAGENTA = (200, 0, 0), (0, 0, 200), (255, 0, 255)
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Looks along +y, x to the right."""
+
+
+def wall(y_m: float, half_m: float, texture: np.ndarray) -> TexturedMesh:
+    """A square about (0, y, 0) that looks along -y; the texture's left is at -x."""
+    vertices = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * half_m + [0, y_m, 0]
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return TexturedMesh(vertices, faces, uv[faces], texture)
+
+
+def plain(colour: tuple[int, int, int]) -> np.ndarray:
+    return np.tile(np.array(colour, np.uint8), (4, 4, 1))
+
+
+def hue(picture: np.ndarray) -> np.ndarray:
+    """(rows, columns) 'r', 'b' or '.' where it is white."""
+    return np.where(picture.min(axis=2) == 255, ".", np.where(picture[..., 0] > picture[..., 2], "r", "b"))
+
+
+def test_the_nearer_wall_hides_the_farther_as_perspective_has_it():
+    """Focal length 20: a half metre two metres off is 5 pixels from the middle, two metres four metres off are 10."""
+    picture = Picture(Camera(np.zeros(3), UPRIGHT, (40, 40), 20.0))
+    picture.draw(wall(2.0, 0.5, plain(RED)))
+    picture.draw(wall(4.0, 2.0, plain(BLUE)))
+    seen = hue(picture.image)
+    assert (seen[15:25, 15:25] == "r").all() and (seen == "r").sum() == 100
+    assert (seen[10:30, 10:30] != ".").all() and (seen == "b").sum() == 300
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_texels_stand_where_their_coordinates_say(parallel):
+    texture = np.array([[RED, BLUE], [BLUE, BLUE]], np.uint8)  # red at the upper left
+    picture = Picture(Camera(np.zeros(3), UPRIGHT, (20, 20), 8.0, parallel))
+    picture.draw(wall(1.0, 1.0, texture))
+    seen = hue(picture.image)
+    assert (seen[2:8, 2:8] == "r").all() and (seen[12:18, 2:18] == "b").all() and (seen[2:8, 12:18] == "b").all()
+
+
+def test_a_face_seen_from_behind_is_left_out_where_sides_matter_and_none_above_the_cut():
+    away = wall(2.0, 1.0, plain(RED))
+    away = dataclasses.replace(away, faces=away.faces[:, ::-1])
+    for one_sided, below_m, count in ((True, np.inf, 0), (False, np.inf, 400), (False, 0.0, 200)):
+        picture = Picture(Camera(np.zeros(3), UPRIGHT, (40, 40), 20.0))
+        picture.draw(away, one_sided, below_m)
+        assert (hue(picture.image) == "r").sum() == count
+
+
+def test_a_floor_that_passes_under_the_eye_fills_the_lower_half():
+    corners = np.array([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]])
+    floor = dataclasses.replace(wall(0.0, 1.0, plain(RED)), vertices=corners)
+    picture = Picture(looking_at(np.array([0.0, 0, 1.5]), np.array([1.0, 0, 1.5]), (30, 40), math.radians(75)))
+    picture.draw(floor, one_sided=True)
+    seen = hue(picture.image)
+    assert (seen[17:] == "r").all() and (seen[:15] == ".").all()
+
+
+def test_both_views_of_a_scene_show_an_object(tiny_scene):
+    folder = tiny_scene[0]
+    model, maps = mujoco.MjModel.from_xml_path(str(folder / "scene.xml")), load_maps(folder)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    surfaces = world_surfaces(model, data)
+    marked = {k: v if k == "structure" else dataclasses.replace(v, texture=plain(MAGENTA)) for k, v in surfaces.items()}
+    low, high = (getattr(surfaces["structure"].vertices, f)(axis=0)[:2] for f in ("min", "max"))
+    for picture in (
+        from_the_south(marked, maps, low, high, 120),
+        at_eye_height(model, data, marked, maps, (90, 120)),
+    ):
+        shown = (picture[..., 0] > 150) & (picture[..., 2] > 150) & (picture[..., 1] < 60)
+        assert picture.shape[1] == 120 and 0.01 < shown.mean() < 0.6
