@@ -28,7 +28,7 @@ from interactive_nav_common.progress import stage_progress, warn_once
 from scenes_mjcf.schema import CATEGORIES
 
 FORMATS = (
-    *("gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf"),
+    *("gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf", "sh3d"),
     *("scannet", "scannetpp", "arkitscenes", "3rscan", "multiscan", "matterport3d"),
 )
 """`READERS` of `converters.read.source`, which need not be imported to say so."""

@@ -96,12 +96,13 @@ def scans() -> dict[str, Target]:
 
 def homes() -> dict[str, Target]:
     """Homes of other simulators."""
-    from tests.converters.read.homes import test_habitat, test_mjcf, test_sdf
+    from tests.converters.read.homes import test_habitat, test_mjcf, test_sdf, test_sh3d
 
     return {
         "sdf": _layout("sdf", fresh(test_sdf.write_world, test_sdf.ROOM + test_sdf.THINGS)),
         "habitat": _layout("habitat", fresh(test_habitat.write_home, test_habitat.SCENE_OBJECTS)),
         "mjcf": _layout("mjcf", fresh(test_mjcf.write_room), start="home.xml"),
+        "sh3d": _layout("sh3d", test_sh3d.write_home, "flat.sh3d", start="flat.sh3d"),
     }
 
 
@@ -237,7 +238,7 @@ def runs() -> dict[str, Target]:
     }
 
 
-GROUPS = {"scans": (scans, 10), "homes": (homes, 3), "scenes": (scenes, 5), "runs": (runs, 4)}
+GROUPS = {"scans": (scans, 10), "homes": (homes, 4), "scenes": (scenes, 5), "runs": (runs, 4)}
 """Name -> its targets, and how many there are."""
 
 
@@ -258,7 +259,8 @@ class Watch:
 
     def __init__(self, base: Path, root: Path):
         own = (root, sys.prefix, sys.base_prefix, ROOT, "/proc", "/sys", "/usr", "/lib", "/dev",
-               os.environ.get("JAX_COMPILATION_CACHE_DIR", ROOT))  # fmt: skip
+               os.environ.get("JAX_COMPILATION_CACHE_DIR", ROOT),
+               os.path.join(tempfile.gettempdir(), "sh3d-"))  # fmt: skip  # where drawings are unpacked
         self.allowed = tuple(f"{os.path.realpath(p)}" for p in own)
         self.looks, self.outside = False, set()
         self.secrets = [base / name for name in SECRETS]

@@ -8,6 +8,7 @@ import io
 import json
 import struct
 import xml.etree.ElementTree as ElementTree
+import zipfile
 from collections.abc import Iterator
 from typing import Any
 
@@ -140,6 +141,24 @@ def _glb(data: bytes, rng: np.random.Generator) -> bytes:
     return head + text + rest
 
 
+def _zip(data: bytes, rng: np.random.Generator) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    # Half of the time the document that all hangs on.
+    name = next((n for n in files if n.endswith(".xml") and rng.random() < 0.5), _pick(rng, list(files)))
+    kind = _pick(rng, ("change", "change", "change", "drop", "rename"))
+    content = files.pop(name)
+    if kind != "drop":
+        files[_pick(rng, WORDS) if kind == "rename" else name] = (
+            mutated(name, content, rng) if kind == "change" else content
+        )
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
 def _lines(data: bytes, rng: np.random.Generator) -> bytes:
     lines = data.split(b"\n")
     k = int(rng.integers(len(lines)))
@@ -163,7 +182,7 @@ def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 KINDS = {".json": _json, ".jsonl": _jsonl, ".yaml": _yaml, ".xml": _xml, ".world": _xml, ".sdf": _xml, ".urdf": _xml,
-         ".dae": _xml, ".npz": _npz, ".glb": _glb}  # fmt: skip
+         ".dae": _xml, ".npz": _npz, ".glb": _glb, ".sh3d": _zip}  # fmt: skip
 """Ending -> how such files are changed by structure; others line by line."""
 
 

@@ -187,6 +187,9 @@ class ObjMesh:
     materials: tuple[str, ...]
     libraries: tuple[str, ...]
     """Names of MTL files."""
+    group: np.ndarray
+    """(m,) int64 into `groups`; -1 before the first `g` or `o`."""
+    groups: tuple[str, ...]
 
 
 def read_obj(path: Path) -> ObjMesh:
@@ -199,10 +202,11 @@ def read_obj(path: Path) -> ObjMesh:
     uvs: list[str] = []
     corners: list[str] = []
     sizes: list[int] = []
-    material: list[int] = []
+    material: list[tuple[int, int]] = []
     names: dict[str, int] = {}
+    groups: dict[str, int] = {}
     libraries: list[str] = []
-    current = -1
+    current = group = -1
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
             if line.startswith("v "):
@@ -221,9 +225,11 @@ def read_obj(path: Path) -> ObjMesh:
                     words = [_from_the_end(w, len(positions) // 3, len(uvs) // 2) for w in words]
                 corners.extend(words)
                 sizes.append(len(words))
-                material.append(current)
+                material.append((current, group))
             elif line.startswith("usemtl"):
                 current = names.setdefault(line[6:].strip(), len(names))
+            elif line.startswith(("g ", "o ")):
+                group = groups.setdefault(line[2:].strip(), len(groups))
             elif line.startswith("mtllib"):
                 libraries.append(line[6:].strip())
         vertices = np.array(positions, float).reshape(-1, 3)
@@ -243,7 +249,8 @@ def read_obj(path: Path) -> ObjMesh:
         corner_uv = uv[uv_index - 1][corner]
         if not np.isfinite(corner_uv).all():
             corner_uv = np.where(np.isfinite(corner_uv), corner_uv, 0.0)
-    return ObjMesh(vertices, faces, corner_uv, np.array(material, np.int64)[face], tuple(names), tuple(libraries))
+    of = np.array(material, np.int64)[face].T
+    return ObjMesh(vertices, faces, corner_uv, of[0], tuple(names), tuple(libraries), of[1], tuple(groups))
 
 
 def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from converters.read import gibson, interactive_gibson, meshes, scan2cad
 from converters.read.datasets import scanned
-from converters.read.homes import habitat, mjcf, sdf
+from converters.read.homes import habitat, mjcf, sdf, sh3d
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 
@@ -20,12 +20,14 @@ READERS = {
     "sdf": (sdf.looks_like, sdf.read_sdf),
     "habitat": (habitat.looks_like, habitat.read_habitat),
     "mjcf": (mjcf.looks_like, mjcf.read_mjcf),
+    "sh3d": (sh3d.looks_like, sh3d.read_sh3d),
     **{name: (scanned.looks_like(name), scanned.reader(name)) for name in scanned.COLLECTIONS},
 }
 FILES = {
     (".world", ".sdf"): (sdf.root_of, sdf.read_sdf),
     (habitat.SCENE,): (habitat.root_of, habitat.read_habitat),
     (".xml",): (lambda path: path.resolve().parent, mjcf.read_mjcf),
+    (sh3d.ENDING,): (lambda path: path.resolve().parent, sh3d.read_sh3d),
 }
 """Ending of a file that says which home of a folder is meant -> its folder, its reader."""
 WITHIN = (sdf.read_sdf, mjcf.read_mjcf)
@@ -46,7 +48,8 @@ def detect_format(source: Path) -> str:
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
         f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad), worlds/*.world (sdf), "
-        f"*{habitat.SCENE} (habitat) or scene.xml (mjcf) in it, or one scene of {', '.join(scanned.COLLECTIONS)}"
+        f"*{habitat.SCENE} (habitat), scene.xml (mjcf) or *{sh3d.ENDING} (sh3d) in it, "
+        f"or one scene of {', '.join(scanned.COLLECTIONS)}"
     )
 
 

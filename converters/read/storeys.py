@@ -71,6 +71,7 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
                 floor_height_m=storey.height_m,
                 given_map=storey.given_map,
                 storeys=(),
+                picture=tuple(p for v, f in raw.picture for p in _cut(v, f, heights, k)),
                 warnings=(
                     *raw.warnings,
                     f"floor {k} of {len(heights)}, at {storey.height_m:g} m of the building's frame",
@@ -78,6 +79,17 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
             )
         )
     return tuple(scenes)
+
+
+def _cut(
+    vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[float, ...], number: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What of a drawn part belongs to a storey, as `split_storeys` has it."""
+    z = vertices[faces, 2]
+    low, of, high = (storey_of(some, heights_m) for some in (z.min(axis=1), z.mean(axis=1), z.max(axis=1)))
+    mine = (of == number) | (long_faces(vertices, faces) & (low <= number) & (number <= high))
+    used, index = np.unique(faces[mine], return_inverse=True)
+    return [(vertices[used], index.reshape(-1, 3))] if mine.any() else []
 
 
 def _base_m(raw: RawScene, index: int) -> float:

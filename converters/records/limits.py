@@ -16,6 +16,9 @@ FILES = 1_000  # MJCF files of a home: includes, and models that it attaches
 PARTS = 20_000  # models or instances of a home
 GEOMS = 100_000  # elements of an MJCF home, replicas and attached models counted
 MOVABLES = 500  # pieces of furniture that stand on a home's floor
+ENTRIES = 20_000  # files in a drawing's archive
+UNPACKED = 1 << 30  # bytes of such an archive with all within it, unpacked
+DRAWN = 3_000  # elements of a drawing: walls, rooms, pieces of furniture
 NUMBERS = 10_000_000  # that a glTF file may ask for without giving them
 
 Image.MAX_IMAGE_PIXELS = PIXELS // 2  # Pillow warns from here on, and refuses twice as many

@@ -21,12 +21,12 @@ from converters.read.gibson import read_licence
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes
-from converters.read.storeys import label_storeys
+from converters.read.storeys import label_storeys, storey_of
 from converters.read.surfaces import face_vectors, floor_level, with_own_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
-from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh
+from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, Storey
 from scenes_mjcf.categories import CATEGORIES, Category
 
 ALIASES = {
@@ -86,6 +86,16 @@ class Part:
     friction: float | None = None
     held: bool = False
     """It stays where it is whatever its name says."""
+    known_as: str = ""
+    """Category; empty: its name tells it."""
+    swing: tuple[np.ndarray, tuple[float, float]] | None = None
+    """Of a door's leaf: (3,) point of its upright hinge, own frame, and the angles (rad) that it turns by; None: they
+    are found."""
+
+    @property
+    def category(self) -> Category | None:
+        """What it is, if that is known."""
+        return CATEGORIES[self.known_as] if self.known_as else category_of(self.name)
 
 
 def category_of(name: str) -> Category | None:
@@ -103,8 +113,14 @@ def category_of(name: str) -> Category | None:
     return None
 
 
-def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
+def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[float, ...] = ()) -> RawScene:
     """The record of a home that is made of parts.
+
+    Args:
+        source: takes warnings.
+        layout: of the source.
+        parts: at least one.
+        floors_m: heights of its storeys' floors from the lowest up; empty: it has one, which is found.
 
     Raises:
         SceneRejected: nothing built in that has a floor.
@@ -113,10 +129,12 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
     whole = joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])
     if whole is None:
         raise SceneRejected(f"{source.root}: holds no part; expected a floor")
-    floor_m = floor_level(whole.vertices, _shown(whole.vertices, whole.faces), str(source.root))
-    moves = [_moves(part, low, high, floor_m) for part, (low, high) in zip(parts, bounds, strict=True)]
+    floors_m = floors_m or (floor_level(whole.vertices, _shown(whole.vertices, whole.faces), str(source.root)),)
+    floor_m = np.array(floors_m)[storey_of(np.array([low[2] for low, _ in bounds]), floors_m)]
+    moves = [_moves(part, low, high, z) for part, (low, high), z in zip(parts, bounds, floor_m, strict=True)]
     check_count(source.root, sum(moves), MOVABLES, "pieces of furniture on its floor")
-    carried = _carriers(bounds, moves, floor_m)
+    fast = [moving or part.held for moving, part in zip(moves, parts, strict=True)]
+    carried = _carriers(bounds, moves, fast, floor_m)
     structure = [p for p, moving, by in zip(parts, moves, carried, strict=True) if not moving and by is None]
     if not structure:
         raise SceneRejected(f"{source.root}: no part is built in; expected floor and walls")
@@ -124,7 +142,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
     mesh = joined(shells)
     assert mesh is not None
     mesh = with_own_corners(mesh)
-    labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
+    labels = label_storeys(mesh.vertices, mesh.faces, floors_m)
     labels[labels == UNLABELLED] = OTHER_STRUCTURE
     points, _ = sample_faces(mesh.vertices, mesh.faces, SHOWN_M)
     pairs = [
@@ -132,6 +150,25 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
         for i, (part, moving) in enumerate(zip(parts, moves, strict=True))
         if moving
     ]
+    _tell(source, parts, moves, carried)
+    grey = np.full((len(mesh.vertices), 3), 170, np.uint8) if mesh.texture is None else None
+    return RawScene(
+        name=source.root.resolve().name,
+        source_format=layout,
+        scan=ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture),
+        cads={a.cad_id: c for a, c in pairs},
+        annotations=tuple(a for a, _ in pairs),
+        floor_height_m=floors_m[0],
+        given_map=None,
+        storeys=tuple(Storey(z, None) for z in floors_m) if len(floors_m) > 1 else (),
+        licence=read_licence(source),
+        picture=tuple((shell.vertices, shell.faces) for shell in shells),
+        sources=dict(sorted(source.sha256.items())),
+        warnings=tuple(source.warnings),
+    )
+
+
+def _tell(source: SourceFolder, parts: list[Part], moves: list[bool], carried: list[int | None]) -> None:
     riders = sum(by is not None for by in carried)
     stay = [
         p.name
@@ -144,20 +181,6 @@ def home(source: SourceFolder, layout: str, parts: list[Part]) -> RawScene:
         )
     if riders:
         source.note(f"{riders} things stand on furniture and move with it")
-    grey = np.full((len(mesh.vertices), 3), 170, np.uint8) if mesh.texture is None else None
-    return RawScene(
-        name=source.root.resolve().name,
-        source_format=layout,
-        scan=ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture),
-        cads={a.cad_id: c for a, c in pairs},
-        annotations=tuple(a for a, _ in pairs),
-        floor_height_m=floor_m,
-        given_map=None,
-        licence=read_licence(source),
-        picture=tuple((shell.vertices, shell.faces) for shell in shells),
-        sources=dict(sorted(source.sha256.items())),
-        warnings=tuple(source.warnings),
-    )
 
 
 def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
@@ -186,7 +209,7 @@ def _small(mesh: TexturedMesh) -> TexturedMesh:
 
 def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> bool:
     """True for furniture that stands on the floor."""
-    category = category_of(part.name)
+    category = part.category
     if category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M:
         return False
     if part.held:
@@ -195,8 +218,10 @@ def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> boo
     return movable and abs(low[2] - floor_m) < STANDS_M
 
 
-def _carriers(bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], floor_m: float) -> list[int | None]:
-    """For each part the number of the movable one that it stands on, or lies in, if any."""
+def _carriers(
+    bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], fast: list[bool], floor_m: np.ndarray
+) -> list[int | None]:
+    """For each part the number of the movable one that it stands on, or lies in, if any; none for those `fast`."""
     carried: list[int | None] = [None] * len(bounds)
     movers = np.flatnonzero(moves)
     base, top = np.array([bounds[k] for k in movers]).reshape(-1, 2, 3).transpose(1, 0, 2) + [
@@ -204,7 +229,7 @@ def _carriers(bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], fl
         [[0, 0, RESTS_M]],
     ]
     for i, (low, high) in enumerate(bounds):
-        if moves[i] or low[2] - floor_m < RAISED_M:
+        if fast[i] or low[2] - floor_m[i] < RAISED_M:
             continue
         foot = np.array([*(low + high)[:2] / 2, low[2]])
         under = movers[((base < foot) & (foot < top)).all(axis=1)]
@@ -223,7 +248,7 @@ def _furniture(
     pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     vertices, faces, colours = clean_surface(source, part.name, vertices, faces, colours_of_faces(surface)[keep])
-    category = category_of(part.name)
+    category = part.category
     name, pose, hinge = "other" if category is None else category.name, part.pose, None
     if name == "door":
         turn = leaf_turn(vertices)
@@ -231,7 +256,10 @@ def _furniture(
         surface = dataclasses.replace(surface, vertices=surface.vertices @ turn)
         pose[:3, :3] = pose[:3, :3] @ turn
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
-        hinge = assume_hinge(vertices, pose, structure)
+        if part.swing is None:
+            hinge = assume_hinge(vertices, pose, structure)
+        else:
+            hinge = ScannedHinge(part.swing[0] @ turn, 1.0, part.swing[1])
     cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
     cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction, surface)
     none = np.zeros((0, 3))

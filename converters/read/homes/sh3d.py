@@ -1,0 +1,353 @@
+"""A home drawn in Sweet Home 3D (`.sh3d`, with the `Home.xml` of version 5.3 and later) in, `RawScene` out.
+
+Walls, rooms, and what doors and windows cut out of them become structure, levels become storeys, door leaves on hinges
+swing, furniture is what its catalogue id or its name says.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import hashlib
+import math
+import re
+import tempfile
+import unicodedata
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from converters.read.files import SourceFolder
+from converters.read.homes.parts import Part, category_of, home
+from converters.read.homes.sh3d_archive import called, metres, number, point, read_xml, unpack
+from converters.read.homes.sh3d_models import LEAF, Models, yaw_pose
+from converters.read.homes.sh3d_walls import HEIGHT_M, Room, level_parts, opening_of, read_room, read_walls, wall_part
+from converters.read.meshes import colours_of_faces
+from converters.read.obj import TexturedMesh
+from converters.records.errors import SceneRejected
+from converters.records.limits import DRAWN, UNPACKED, check_count
+from converters.records.raw import RawScene
+
+ENDING = ".sh3d"
+PIECES = ("pieceOfFurniture", "doorOrWindow", "light")
+DROPPED = {
+    "dimensionLine": "dimensions",
+    "label": "labels",
+    "polyline": "polylines",
+    "backgroundImage": "background images",
+}
+DOOR_M = (0.1, 1.5)
+"""A door's foot is lower than the first and its height more than the second; else its leaves stay shut: a window."""
+STOREY_M = 1.8
+"""Levels closer to one another are one storey."""
+LEAF_M = 0.04
+TURN_MOST_RAD = math.radians(120)
+LOW_TABLE_M = 0.5
+BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
+"""Ids, less what stands before #, of shapes that people build all kinds of things from."""
+IDS = {
+    "chest": "dresser", "tvunit": "tv_bench", "flooruplight": "floor_lamp", "floorlamp": "floor_lamp",
+    "cooker": "stove",
+    "fridgefreezer": "fridge", "clotheswasher": "washer", "dishwasher": "washer", "kitchenuppercabinet": "shelf",
+    "kitchencabinet": "counter", "toiletunit": "toilet", "fittedbath": "tub", "bath": "tub", "piano": "structure",
+    "washbasinwithcabinet": "washbasin", "crib": "bed", "cradle": "bed", "aquarium": "structure",
+    "fireplace": "structure",
+    "flowers": "pot", "spiralstaircase": "structure", "chimney": "structure", "railing": "structure",
+}  # fmt: skip
+"""Ids whose last words do not tell the category."""
+WORDS = {
+    "chair": "chaise stuhl silla sedia cadeira stoel krzeslo stol", "armchair": "fauteuil sessel sillon poltrona fotel",
+    "table": "tisch mesa tavolo tafel table stolik", "desk": "bureau schreibtisch escritorio scrivania biurko",
+    "sofa": "canape divano kanapee bank", "bed": "lit bett cama letto lozko",
+    "wardrobe": "armoire schrank armario armadio kast szafa", "dresser": "commode kommode comoda",
+    "stool": "tabouret hocker taburete sgabello", "plant": "plante pflanze pianta",
+    "nightstand": "chevet nachttisch mesilla comodino", "bookcase": "bibliotheque etagere regal estanteria libreria",
+    "floor_lamp": "lampadaire stehlampe", "bin": "poubelle mulleimer papelera cestino", "bench": "banc banco panca",
+    "fridge": "refrigerateur kuhlschrank frigorifico nevera frigorifero", "tub": "baignoire badewanne banera vasca",
+    "sink": "evier spule fregadero lavello", "washbasin": "lavabo waschbecken", "shower": "douche dusche ducha doccia",
+}  # fmt: skip
+"""Category -> what it is called in other languages, without accents."""
+FOREIGN = {word: category for category, words in WORDS.items() for word in words.split()}
+
+
+def looks_like(root: Path) -> bool:
+    """True when the folder has one drawing."""
+    return root.is_dir() and len(list(root.glob(f"*{ENDING}"))) == 1
+
+
+def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
+    """Reads the only drawing of a folder, or the chosen one.
+
+    Args:
+        root: folder, or the file.
+        strict: refuse what would be repaired with a warning.
+        chosen: file.
+
+    Raises:
+        SceneRejected: no drawing or several, a damaged archive, one too large, or a number that is none.
+    """
+    files = [chosen] if chosen else [root] if root.is_file() else sorted(root.glob(f"*{ENDING}"))
+    if len(files) != 1 or not files[0].is_file():
+        raise SceneRejected(
+            f"{root}: drawings are {', '.join(p.name for p in files) or 'none'}, expected one; give a file"
+        )
+    path = files[0]
+    with tempfile.TemporaryDirectory(prefix="sh3d-") as scratch:
+        folder = Path(scratch).resolve() / path.stem
+        folder.mkdir()
+        budget = [UNPACKED]
+        unpack(path, folder, budget)
+        source = SourceFolder(folder, strict)
+        try:
+            raw = _Drawing(source, read_xml(path, folder), budget).scene()
+        except SceneRejected as error:
+            text = str(error).replace(str(folder), str(path))
+            raise SceneRejected(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return dataclasses.replace(raw, name=path.stem, sources={path.name: digest})
+
+
+def kind_of(catalogue_id: str, name: str, height_m: float = 1.0) -> str:
+    """Category of a piece by its catalogue id, then by its name in some languages; `other` where none tells it."""
+    own = catalogue_id.rpartition("#")[2]
+    bare = re.sub("[^a-z]", "", own.lower())
+    if bare in BLOCKS or "stair" in bare:
+        return "structure"
+    found = IDS.get(bare) or next((c.name for words in (own, name) if (c := category_of(words)) is not None), None)
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
+    for word in re.findall("[a-z]{3,}", plain) if found is None else ():
+        # In compounds of German and Dutch the last part tells what it is.
+        ends = (
+            key
+            for key in sorted(FOREIGN, key=len, reverse=True)
+            if word == key or (len(key) > 4 and word.endswith(key))
+        )
+        found = found or FOREIGN.get(next(ends, ""))
+    if found == "table" and height_m < LOW_TABLE_M:
+        return "coffee_table"
+    return found or "other"
+
+
+class _Drawing:
+    """Walks a drawing; counts what it drops."""
+
+    def __init__(self, source: SourceFolder, root: ElementTree.Element, budget: list[int]) -> None:
+        self.source, self.root = source, root
+        self.models = Models(source, budget)
+        self.dropped: collections.Counter[str] = collections.Counter()
+        self.named: collections.Counter[str] = collections.Counter()
+        levels = root.findall("level")
+        self.hidden = {e.get("id") for e in levels if "false" in (e.get("visible"), e.get("viewable"))}
+        self.base_m: dict[str | None, float] = {e.get("id"): number(e, "elevation") / 100 for e in levels}
+        self.high_m = {e.get("id"): number(e, "height", 100 * HEIGHT_M) / 100 for e in levels}
+        self.base_m.setdefault(None, min(self.base_m.values(), default=0.0))
+        self.high_m.setdefault(None, number(root, "wallHeight", 100 * HEIGHT_M) / 100)
+        for tag, what in DROPPED.items():
+            self.dropped[what] += len(root.findall(tag))
+
+    def scene(self) -> RawScene:
+        """All of it."""
+        walls = read_walls(list(self._seen("wall")), self.base_m, self.source.note)
+        pieces = list(self._pieces())
+        check_count(self.source.root, len(walls) + len(pieces), DRAWN, "walls and pieces of furniture")
+        openings = [opening_of(e, self._base(e)) for e in pieces if e.tag == "doorOrWindow"]
+        parts = [part for e in pieces for part in self._piece(e)]
+        for wall in walls:
+            e = wall.element
+            looks = {side: self.models.look(e, f"{side}SideColor", f"{side}SideTexture") for side in ("left", "right")}
+            looks["top"] = self.models.look(
+                e, "topColor", "", looks["right"][0].mean(axis=(0, 1)).astype(np.uint8).reshape(1, 1, 3)
+            )
+            boards = {}
+            for board in e.findall("baseboard"):
+                side = (board.get("attribute") or "").removesuffix("SideBaseboard")
+                if side in looks and (size := metres(board, "thickness", "height", default=1.0)).min() > 0:
+                    own = self.models.look(board, "color", "texture", looks[side][0][:1, :1])
+                    boards[side] = (float(size[0]), float(size[1]), own)
+            part = wall_part(wall, openings, looks, boards)
+            parts += [] if part is None else [part]
+        rooms, floors_m = [], set()
+        for e in self._seen("room"):
+            room = read_room(e, self.models.look)
+            if room is None:
+                self.source.note(f"{called(e)}: its outline encloses nothing; it is left out")
+            else:
+                rooms.append(room)
+        shafts = {e: _footprint(e) for e in pieces if e.get("staircaseCutOutShape")}
+        for base in sorted(set(self.base_m.values())):
+            mine = [w for w in walls if w.base_m == base]
+            here = [r for r in rooms if self.base_m.get(r.level, 0.0) == base]
+            high = max([self.high_m[r.level] for r in here], default=HEIGHT_M)
+            through = [[p for e, p in shafts.items() if self._crosses(e, z)] for z in (base, base + high)]
+            made = level_parts(here, mine, openings, base, base + high, *(shapely.union_all(s) for s in through))
+            parts += made
+            if made and any(r.floor is not None for r in here or [Room("", None, None, (np.zeros(0), None), None)]):
+                floors_m.add(base)
+        for what, count in sorted(self.dropped.items()):
+            if count:
+                self.source.note(f"{count} {what}: dropped")
+        if not floors_m:
+            raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
+        return home(self.source, "sh3d", parts, _storeys(sorted(floors_m)))
+
+    def _seen(self, tag: str) -> Iterator[ElementTree.Element]:
+        for e in self.root.findall(tag):
+            if e.get("level") in self.hidden:
+                self.dropped[f"{tag}s on levels that are hidden"] += 1
+            elif e.get("level") not in self.base_m:
+                raise SceneRejected(f"{called(e)}: names a level that is not there; save the home again")
+            else:
+                yield e
+
+    def _pieces(self) -> Iterator[ElementTree.Element]:
+        """Furniture that is seen, groups taken apart."""
+        for tag in (*PIECES, "furnitureGroup"):
+            for top in self._seen(tag):
+                stack = [top]
+                while stack:
+                    e = stack.pop()
+                    if e.get("visible") == "false":
+                        self.dropped["pieces that are hidden"] += 1
+                    elif e.tag == "furnitureGroup":
+                        inner = [c for c in e if c.tag in (*PIECES, "furnitureGroup")]
+                        for child in inner:
+                            child.attrib.setdefault("level", e.get("level", ""))
+                            if not child.get("level"):
+                                del child.attrib["level"]
+                        stack += inner[::-1]
+                    else:
+                        yield e
+
+    def _base(self, e: ElementTree.Element) -> float:
+        return self.base_m.get(e.get("level"), self.base_m[None])
+
+    def _crosses(self, e: ElementTree.Element, z_m: float) -> bool:
+        foot = self._base(e) + number(e, "elevation", 0.0) / 100
+        return foot < z_m - 0.1 and foot + number(e, "height") / 100 > z_m - 0.5
+
+    def _piece(self, e: ElementTree.Element) -> list[Part]:
+        """One piece: furniture, or a door or window with its leaves apart."""
+        surface, group = self.models.surface(e)
+        if not len(surface.faces):
+            return []
+        at = np.array([*point(e), self._base(e) + number(e, "elevation", 0.0) / 100])
+        pose = yaw_pose(at, -number(e, "angle", 0.0))
+        height = float(np.ptp(surface.vertices[:, 2]))
+        name = " ".join((e.get("name") or e.get("catalogId") or "piece").split())[:60]
+        self.named[name] += 1
+        name = f"{name} {self.named[name]}"
+        if e.tag == "doorOrWindow":
+            return self._door(e, name, pose, surface, group)
+        kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
+        if e.tag == "light":
+            self.dropped["lights' shine (their lamps stay)"] += 1
+            kind = kind if kind == "floor_lamp" else "other"
+        held = e.get("movable") == "false" or kind == "structure"
+        return [Part(name, pose, surface, None, False, held=held, known_as=kind)]
+
+    def _door(
+        self, e: ElementTree.Element, name: str, pose: np.ndarray, surface: TexturedMesh, group: np.ndarray
+    ) -> list[Part]:
+        """Frame and leaves of a door, a window in one piece."""
+        sashes = e.findall("sash")
+        foot, height = number(e, "elevation", 0.0) / 100, number(e, "height") / 100
+        if not sashes or foot > DOOR_M[0] or height < DOOR_M[1]:
+            if any(str(g).startswith("sweethome3d_opening_on_rail") for g in group):
+                self.dropped["sliding leaves' motion (they stay as drawn)"] += 1
+            return [Part(name, pose, surface, None, True, held=True, known_as="structure")]
+        leaf = np.array([int(m[1]) if (m := LEAF.match(str(g))) else 0 for g in group])
+        leaf[leaf > len(sashes)] = 0
+        made = []
+        for k, sash in enumerate(sashes, 1):
+            faces = np.flatnonzero(leaf == k)
+            own = _part_of(surface, faces) if len(faces) else _plain_leaf(e, sash, surface)
+            made.append(
+                Part(f"{name} leaf {k}", pose, own, None, False, known_as="door", swing=_swing(e, sash, own.vertices))
+            )
+        if not leaf.any():
+            self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
+            return made
+        frame = np.flatnonzero(leaf == 0)
+        rest = (
+            [Part(name, pose, _part_of(surface, frame), None, True, held=True, known_as="structure")]
+            if len(frame)
+            else []
+        )
+        return rest + made
+
+
+def _storeys(floors_m: list[float]) -> tuple[float, ...]:
+    found: list[float] = []
+    for z in floors_m:
+        if not found or z - found[-1] > STOREY_M:
+            found.append(z)
+    return tuple(found)
+
+
+def _footprint(e: ElementTree.Element) -> Any:
+    width, depth = metres(e, "width", "depth") / 2
+    turn = yaw_pose(np.zeros(3), -number(e, "angle", 0.0))[:2, :2]
+    return shapely.Polygon(
+        point(e) + np.array([(-width, -depth), (width, -depth), (width, depth), (-width, depth)]) @ turn.T
+    )
+
+
+def _part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:
+    used, index = np.unique(mesh.faces[faces], return_inverse=True)
+    uv = None if mesh.corner_uv is None else mesh.corner_uv[faces]
+    return TexturedMesh(mesh.vertices[used], index.reshape(-1, 3), uv, mesh.texture)
+
+
+def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float]:
+    """Of a leaf in the door's own frame: (2,) hinge, its angles at the start and end of its swing, its width (m)."""
+    width, depth = metres(e, "width", "depth")
+    side = -1.0 if e.get("modelMirrored") == "true" else 1.0
+    at = np.array([side * (number(sash, "xAxis") - 0.5) * width, (0.5 - number(sash, "yAxis")) * depth])
+    angles = -np.array([number(sash, key, 0.0) for key in ("startAngle", "endAngle")])
+    return at, angles if side > 0 else math.pi - angles, number(sash, "width") * float(width)
+
+
+def _swing(
+    e: ElementTree.Element, sash: ElementTree.Element, leaf: np.ndarray
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """Hinge of a leaf, and the angles that it turns by from where it is drawn."""
+    at, angles, _ = _axis(e, sash)
+    middle = (leaf.min(axis=0) + leaf.max(axis=0))[:2] / 2 - at
+    drawn = math.atan2(middle[1], middle[0])
+    gaps = [abs(math.remainder(a - drawn, math.tau)) for a in angles]
+    turns = np.clip(angles - angles[int(np.argmin(gaps))], -TURN_MOST_RAD, TURN_MOST_RAD)
+    return np.array([*at, leaf[:, 2].min()]), (float(turns.min()), float(turns.max()))
+
+
+def _plain_leaf(e: ElementTree.Element, sash: ElementTree.Element, like: TexturedMesh) -> TexturedMesh:
+    """A flat leaf as wide as the sash, shut, in the model's mean colour."""
+    at, angles, width = _axis(e, sash)
+    along = np.array([math.cos(angles[0]), math.sin(angles[0])])
+    across = along[::-1] * [-LEAF_M / 2, LEAF_M / 2]
+    foot = np.array([at + across, at - across, at + along * width - across, at + along * width + across])
+    high = float(like.vertices[:, 2].max())
+    vertices = np.vstack([np.column_stack([foot, np.full(4, z)]) for z in (0.0, high)])
+    hull = shapely.Polygon(foot)
+    faces = np.array(
+        [
+            (0, 1, 5),
+            (0, 5, 4),
+            (1, 2, 6),
+            (1, 6, 5),
+            (2, 3, 7),
+            (2, 7, 6),
+            (3, 0, 4),
+            (3, 4, 7),
+            (4, 5, 6),
+            (4, 6, 7),
+            (0, 2, 1),
+            (0, 3, 2),
+        ]
+    )
+    faces = faces if hull.exterior.is_ccw else faces[:, ::-1]
+    colour = colours_of_faces(like).mean(axis=0).astype(np.uint8).reshape(1, 1, 3)
+    return TexturedMesh(vertices, faces, np.full((12, 3, 2), 0.5), np.tile(colour, (4, 4, 1)))

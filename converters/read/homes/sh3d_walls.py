@@ -1,0 +1,353 @@
+"""Walls, rooms and openings of a Sweet Home 3D drawing in, built-in parts out.
+
+Frame: metres, z up, x to the right of the plan, y against the plan's, which points down. The left side of a wall is to
+the left of one who walks from its start to its end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import shapely
+
+from converters.read.homes.parts import Part
+from converters.read.homes.sh3d_archive import called, metres, number, outline, point
+from converters.read.homes.sh3d_sheet import WHITE, Look, Sheet, fitted
+from converters.records.errors import SceneRejected
+from converters.records.limits import EXTENT_M
+
+HEIGHT_M = 2.5
+ARC_STEP_RAD = math.radians(10)
+SHORT_M, NEAR_M = 1e-3, 1e-6
+PARALLEL = 0.8
+"""Least cosine between a wall and the openings that cut it."""
+SILL_M = 0.05
+"""What begins lower is a doorway, and has a floor."""
+
+
+@dataclasses.dataclass
+class Wall:
+    """A straight wall, or a piece of a round one."""
+
+    element: ElementTree.Element
+    ends: np.ndarray
+    """(2, 2) start and end, m."""
+    thickness_m: float
+    height_m: np.ndarray
+    """(2,) at start and end."""
+    base_m: float
+    joins: list[str | None]
+    corners: np.ndarray
+    """(2, 2, 2): of the left and the right side, at start and end."""
+
+    @property
+    def along(self) -> np.ndarray:
+        """(2,) unit."""
+        run = self.ends[1] - self.ends[0]
+        return run / np.linalg.norm(run)
+
+    @property
+    def left(self) -> np.ndarray:
+        """(2,) unit, to the left."""
+        return self.along[::-1] * [-1.0, 1.0]
+
+    @property
+    def length_m(self) -> float:
+        """Between its ends."""
+        return float(np.linalg.norm(self.ends[1] - self.ends[0]))
+
+    def polygon(self) -> Any:
+        """Its footprint."""
+        return shapely.Polygon([*self.corners[0], *self.corners[1][::-1]])
+
+    def ray(self, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Away from one end: (2,) direction, (2,) points on the sides to its left and right."""
+        away = self.along if end == 0 else -self.along
+        left = away[::-1] * [-1.0, 1.0] * self.thickness_m / 2
+        return away, self.ends[end] + left, self.ends[end] - left
+
+
+def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, float], note: Any) -> list[Wall]:
+    """The walls of a drawing, mitred where they are joined.
+
+    Args:
+        elements: `<wall>`.
+        base_m: level -> height of its floor.
+        note: takes a word on what is dropped.
+
+    Raises:
+        SceneRejected: a number that is none.
+    """
+    walls: list[Wall] = []
+    pieces: dict[str, list[int]] = {}
+    for element in elements:
+        name, thick = element.get("id") or f"#{len(walls)}", number(element, "thickness", 7.5) / 100
+        start, end = point(element, "xStart", "yStart"), point(element, "xEnd", "yEnd")
+        high = metres(element, "height", default=100 * HEIGHT_M)[0]
+        tall = np.array([high, metres(element, "heightAtEnd", default=100 * high)[0]])
+        if np.linalg.norm(end - start) < SHORT_M or not 0 < thick < EXTENT_M or not 0 < tall.max() < EXTENT_M:
+            note(f"{called(element)}: has no length, thickness or height; it is left out")
+            continue
+        points = _round(start, end, number(element, "arcExtent", 0.0))
+        share = np.linspace(0, 1, len(points))
+        pieces.setdefault(name, [])
+        for k in range(len(points) - 1):
+            joins = [
+                element.get("wallAtStart") if k == 0 else name,
+                element.get("wallAtEnd") if k == len(points) - 2 else name,
+            ]
+            some = np.maximum(tall[0] + share[k : k + 2] * (tall[1] - tall[0]), 0.0)
+            wall = Wall(element, points[k : k + 2], thick, some, base_m[element.get("level")], joins, np.zeros(0))
+            wall.corners = np.stack([wall.ends + s * wall.left * thick / 2 for s in (1, -1)])
+            pieces[name].append(len(walls))
+            walls.append(wall)
+    for k, wall in enumerate(walls):
+        for end in (0, 1):
+            others = [walls[i] for i in pieces.get(wall.joins[end] or "", []) if i != k]
+            near = [
+                (float(np.linalg.norm(o.ends[e] - wall.ends[end])), n, e) for n, o in enumerate(others) for e in (0, 1)
+            ]
+            if near and min(near)[0] < max(wall.thickness_m, SHORT_M):
+                _mitre(wall, end, others[min(near)[1]], min(near)[2])
+    return walls
+
+
+def _round(start: np.ndarray, end: np.ndarray, extent: float) -> np.ndarray:
+    """(n, 2) points of a wall from start to end; a positive extent (rad) bulges to its left."""
+    extent = math.remainder(extent, 2 * math.tau)
+    if abs(extent) < math.radians(1) or abs(math.sin(extent / 2)) < NEAR_M:
+        return np.stack([start, end])
+    chord = end - start
+    right = chord[::-1] * [1.0, -1.0]
+    centre = (start + end) / 2 + right / 2 / math.tan(extent / 2)
+    angle = -extent * np.linspace(0, 1, max(math.ceil(abs(extent) / ARC_STEP_RAD), 2) + 1)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.vstack([start, (centre + np.einsum("ijk,j->ki", turn, start - centre))[1:-1], end])
+
+
+def _mitre(wall: Wall, end: int, other: Wall, other_end: int) -> None:
+    away, left, right = wall.ray(end)
+    turn, other_left, other_right = other.ray(other_end)
+    cross = away[0] * turn[1] - away[1] * turn[0]
+    if abs(cross) < 0.05:
+        return
+    for mine, own, meets in ((0, left, other_right), (1, right, other_left)):
+        gap = meets - own
+        corner = own + away * (gap[0] * turn[1] - gap[1] * turn[0]) / cross
+        if np.linalg.norm(corner - own) <= 2 * max(wall.thickness_m, other.thickness_m):
+            wall.corners[mine if end == 0 else 1 - mine, end] = corner
+
+
+@dataclasses.dataclass(frozen=True)
+class Opening:
+    """What a door or window cuts out of walls."""
+
+    footprint: Any
+    """Polygon in plan."""
+    along: np.ndarray
+    """(2,) unit, of its width."""
+    middle: np.ndarray
+    """(2,) of its footprint."""
+    width_m: float
+    bottom_m: float
+    top_m: float
+    shape: np.ndarray | None
+    """(n, 2) in the unit square, y down; None: all of it."""
+
+    def within(self, wall: Wall) -> Any:
+        """What it cuts out of a wall, in (along the wall, above its base); None: nothing."""
+        cosine = float(self.along @ wall.along)
+        if abs(cosine) < PARALLEL or self.top_m <= wall.base_m:
+            return None
+        common = shapely.intersection(self.footprint, wall.polygon())
+        if shapely.area(common) < 1e-4:
+            return None
+        low, high = self.bottom_m - wall.base_m, self.top_m - wall.base_m
+        low = -1.0 if low < SHORT_M else low
+        if self.shape is None:
+            run = (shapely.get_coordinates(common) - wall.ends[0]) @ wall.along
+            return shapely.box(run.min(), low, run.max(), high)
+        x = (self.middle - wall.ends[0]) @ wall.along + (self.shape[:, 0] - 0.5) * self.width_m * math.copysign(
+            1, cosine
+        )
+        cut = shapely.Polygon(np.stack([x, high + self.shape[:, 1] * (low - high)], axis=1))
+        return cut if shapely.is_valid(cut) else shapely.make_valid(cut)
+
+
+def wall_part(
+    wall: Wall, openings: list[Opening], looks: dict[str, Look], boards: dict[str, tuple[float, float, Look]]
+) -> Part | None:
+    """A wall without its openings, with its baseboards.
+
+    Args:
+        wall: with its corners.
+        openings: any.
+        looks: of `left`, `right` and `top`.
+        boards: side -> thickness and height, m, and look.
+    """
+    sheet = Sheet()
+    ends = np.array([0.0, wall.length_m])
+    outer = shapely.Polygon([(0, 0), (ends[1], 0), (ends[1], wall.height_m[1]), (0, wall.height_m[0])])
+    cuts = [cut for o in openings if (cut := o.within(wall)) is not None]
+    region = outer if not cuts else shapely.difference(outer, shapely.union_all(cuts))
+    sides = _side(wall, 0, 0.0), _side(wall, 1, 0.0)
+    _solid(sheet, region, sides, looks, float(wall.height_m.min()))
+    for k, name in enumerate(("left", "right")):
+        if name in boards:
+            thick, high, look = boards[name]
+            low = shapely.intersection(region, shapely.box(-1.0, 0.0, ends[1] + 1.0, high))
+            out = _side(wall, k, thick)
+            pair = (out, sides[0]) if k == 0 else (sides[1], out)
+            _solid(sheet, low, pair, {"left": look, "right": look, "top": look}, high)
+    return sheet.part(f"wall {wall.element.get('id') or ''}")
+
+
+def _side(wall: Wall, k: int, out_m: float) -> Callable[[np.ndarray], np.ndarray]:
+    """(n, 2) along and above a wall -> (n, 3) on its left (0) or right (1) side, or so far out of it."""
+    sign = 1 if k == 0 else -1
+    ends = wall.corners[k] + sign * out_m * wall.left
+    off = sign * (wall.thickness_m / 2 + out_m) * wall.left
+
+    def place(flat: np.ndarray) -> np.ndarray:
+        at = wall.ends[0] + flat[:, :1] * wall.along + off
+        at = np.where(flat[:, :1] < NEAR_M, ends[0], np.where(flat[:, :1] > wall.length_m - NEAR_M, ends[1], at))
+        return np.column_stack([at, flat[:, 1] + wall.base_m])
+
+    return place
+
+
+def _solid(sheet: Sheet, region: Any, sides: tuple[Any, Any], looks: dict[str, Look], top_m: float) -> None:
+    """What lies between two sides: both, and all edges but those that stand on the floor."""
+    for polygon in shapely.get_parts(region):
+        if shapely.get_type_id(polygon) != 3 or shapely.area(polygon) < 1e-6:
+            continue
+        area = float(shapely.area(polygon))
+        sheet.add(polygon, sides[0], fitted(looks["left"], area), turned=True)
+        sheet.add(polygon, sides[1], fitted(looks["right"], area))
+        oriented = shapely.orient_polygons(polygon)
+        for ring in (oriented.exterior, *oriented.interiors):
+            points = shapely.get_coordinates(ring)
+            left, right = sides[0](points), sides[1](points)
+            for k in range(len(points) - 1):
+                if points[k : k + 2, 1].max() < NEAR_M:
+                    continue
+                above = points[k, 0] > points[k + 1, 0] and points[k : k + 2, 1].min() > top_m - NEAR_M
+                corners = np.array([right[k], left[k], left[k + 1], right[k + 1]])
+                sheet.quad(corners, looks["top" if above else "right"])
+
+
+@dataclasses.dataclass(frozen=True)
+class Room:
+    """A room's outline and what is seen of it."""
+
+    name: str
+    level: str | None
+    plan: Any
+    floor: Look | None
+    ceiling: Look | None
+
+
+def read_room(element: ElementTree.Element, look: Callable[[ElementTree.Element, str, str], Look]) -> Room | None:
+    """A room; None where its outline encloses nothing.
+
+    Raises:
+        SceneRejected: a number that is none.
+    """
+    points = [point(e) for e in element.findall("point")]
+    plan = shapely.make_valid(shapely.Polygon(points)) if len(points) > 2 else shapely.Polygon()
+    plan = shapely.union_all([p for p in shapely.get_parts(plan) if shapely.get_type_id(p) in (3, 6)])
+    if shapely.area(plan) < 1e-4:
+        return None
+    if max(np.ptp(points, axis=0)) > EXTENT_M:
+        raise SceneRejected(f"{called(element)}: is larger than {EXTENT_M:g} m; mend the drawing")
+    seen = [element.get(f"{what}Visible", "true") == "true" for what in ("floor", "ceiling")]
+    floor, ceiling = look(element, "floorColor", "floorTexture"), look(element, "ceilingColor", "ceilingTexture")
+    return Room(
+        element.get("name") or "room",
+        element.get("level"),
+        plan,
+        floor if seen[0] else None,
+        ceiling if seen[1] else None,
+    )
+
+
+def level_parts(
+    rooms: list[Room],
+    walls: list[Wall],
+    openings: list[Opening],
+    floor_m: float,
+    ceiling_m: float,
+    shafts: Any,
+    above: Any,
+) -> list[Part]:
+    """Floors and ceilings of one level; of rooms that overlap the later one is seen.
+
+    Args:
+        rooms: of the level. Without any, what its walls enclose is one.
+        walls: of the level; doorways through them have a floor too.
+        openings: any.
+        floor_m: height.
+        ceiling_m: height.
+        shafts: plan of the stairs that come up through the floor.
+        above: plan of those that go up through the ceiling.
+    """
+    sheet, taken, tops = Sheet(), shafts, above
+
+    def level(height: float) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda flat: np.column_stack([flat, np.full(len(flat), height)])
+
+    stands = shapely.union_all([wall.polygon() for wall in walls])
+    if not rooms:
+        inside = [shapely.Polygon(ring) for p in shapely.get_parts(stands) for ring in getattr(p, "interiors", ())]
+        rooms = [Room("room", None, plan, (WHITE, None), None) for plan in inside]
+    for room in reversed(rooms):
+        if room.floor is not None:
+            plan = shapely.difference(room.plan, taken)
+            sheet.add(plan, level(floor_m), fitted(room.floor, float(shapely.area(plan))))
+            taken = shapely.union(taken, room.plan)
+        if room.ceiling is not None:
+            plan = shapely.difference(room.plan, tops)
+            sheet.add(plan, level(ceiling_m), fitted(room.ceiling, float(shapely.area(plan))), turned=True)
+            tops = shapely.union(tops, room.plan)
+    floors = [room for room in rooms if room.floor is not None]
+    for wall in walls if floors else ():
+        for opening in openings:
+            cut = opening.within(wall) if abs(opening.bottom_m - floor_m) < SILL_M else None
+            if cut is not None:
+                run = shapely.get_coordinates(cut)[:, 0]
+                corners = wall.ends[0] + np.outer(np.array([run.min(), run.max(), run.max(), run.min()]), wall.along)
+                across = np.outer([1, 1, -1, -1], wall.left * wall.thickness_m / 2)
+                sill = shapely.difference(shapely.Polygon(corners + across), taken)
+                nearest = min(floors, key=lambda room: shapely.distance(room.plan, sill) if sill.area else 0.0)
+                assert nearest.floor is not None
+                sheet.add(sill, level(floor_m), fitted(nearest.floor, float(shapely.area(sill))))
+                taken = shapely.union(taken, sill)
+    made = sheet.part("floors and ceilings")
+    return [] if made is None else [made]
+
+
+def opening_of(element: ElementTree.Element, base_m: float) -> Opening:
+    """What a `<doorOrWindow>` cuts out: the part of its depth that lies in the wall, and a little more."""
+    width, depth, height = metres(element, "width", "depth", "height")
+    angle = -number(element, "angle", 0.0)
+    along, back = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    thick, off = number(element, "wallThickness", 1.0), number(element, "wallDistance", 0.0)
+    centre = point(element)
+    middle = centre + back * depth * (0.5 - off - thick / 2)
+    reach = back * (depth * thick / 2 + 0.01)
+    side = along * width / 2
+    footprint = shapely.Polygon(
+        [middle - side - reach, middle + side - reach, middle + side + reach, middle - side + reach]
+    )
+    bottom = base_m + number(element, "elevation", 0.0) / 100
+    shape = outline(element.get("cutOutShape"))
+    if shape is not None and element.get("modelMirrored") == "true":
+        shape = shape * [-1.0, 1.0] + [1.0, 0.0]
+    if shape is not None and np.isin(np.round(shape, 3), (0, 1)).all() and len(np.unique(shape.round(3), axis=0)) == 4:
+        shape = None
+    return Opening(footprint, along, middle, float(width), bottom, bottom + float(height), shape)
