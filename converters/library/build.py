@@ -24,7 +24,7 @@ from converters.library.catalogue import Catalogue, Piece, read_catalogue, unpac
 from converters.library.store import Credit, Model, Shape, attribution, write_library
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
-from converters.read.obj import TexturedMesh
+from converters.read.obj import join_meshes
 from converters.records.errors import SceneRejected, StageFailed
 from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.errors import ConfigError
@@ -52,6 +52,13 @@ class Chosen:
     piece: Piece
     category: str
     split: str
+    riders: tuple[tuple[Catalogue, Piece], ...] = ()
+    """What stands on it."""
+
+    @property
+    def key(self) -> str:
+        """Of the piece and of what stands on it: `Scopia/desk+Scopia/lamp`."""
+        return "+".join((self.piece.key, *(piece.key for _, piece in self.riders)))
 
 
 def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> tuple[Chosen, ...]:
@@ -70,12 +77,14 @@ def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> t
             raise ConfigError(f"{path}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
         for split in sorted(of):
             for key in of[split]:
-                if key not in known:
+                found = [known.get(one) for one in key.split("+")]
+                if None in found:
                     raise ConfigError(f"{path}: {category}: no piece '{key}' in the libraries")
-                catalogue, piece = known[key]
-                if splits.setdefault(piece.creator, split) != split:
-                    raise ConfigError(f"{path}: {key}: its creator {piece.creator} has models in both splits")
-                chosen.append(Chosen(catalogue, piece, category, split))
+                (catalogue, piece), *riders = [of for of in found if of is not None]
+                for _, own in ((catalogue, piece), *riders):
+                    if splits.setdefault(own.creator, split) != split:
+                        raise ConfigError(f"{path}: {key}: its creator {own.creator} has models in both splits")
+                chosen.append(Chosen(catalogue, piece, category, split, tuple(riders)))
     return tuple(chosen)
 
 
@@ -101,6 +110,23 @@ def _standing(points: np.ndarray, foot_m: float) -> np.ndarray:
     return np.vstack([points, level])
 
 
+def _surface(catalogue: Catalogue, piece: Piece) -> TexturedMesh:
+    with tempfile.TemporaryDirectory(prefix="library-") as folder:
+        path = unpack_model(catalogue, piece, Path(folder))
+        surface = read_surface(SourceFolder(path.parent), path.name, "")
+    return as_catalogued(surface, piece, f"{catalogue.path}: {piece.model}")
+
+
+def on_top(surface: TexturedMesh, rider: TexturedMesh) -> TexturedMesh:
+    """Both as one: the rider on what is highest below its footprint, at the middle, its back near the other's."""
+    span, own = np.ptp(surface.vertices, axis=0), np.ptp(rider.vertices, axis=0)
+    back = min(0.0, own[2] / 2 + 0.03 - span[2] / 2)
+    points, _ = sample_faces(surface.vertices, surface.faces, 0.02)
+    below = (np.abs(points[:, [0, 2]] - [0.0, back]) < own[[0, 2]] / 2).all(axis=1)
+    top = float(points[below, 1].max()) if below.any() else float(span[1])
+    return join_meshes(surface, dataclasses.replace(rider, vertices=rider.vertices + [0.0, top, back]))
+
+
 def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]:
     """One model, ready to be packaged.
 
@@ -109,15 +135,16 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
         StageFailed: coacd cannot decompose it.
     """
     piece, where = chosen.piece, f"{chosen.catalogue.path}: {chosen.piece.model}"
-    with tempfile.TemporaryDirectory(prefix="library-") as folder:
-        path = unpack_model(chosen.catalogue, piece, Path(folder))
-        surface = as_catalogued(read_surface(SourceFolder(path.parent), path.name, ""), piece, where)
+    surface = _surface(chosen.catalogue, piece)
+    for rider in chosen.riders:
+        surface = on_top(surface, _surface(*rider))
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     colours = colours_of_faces(surface)[keep]
     solid = simplify_within(vertices, faces, SOLID_M)
-    made = decompose_all({piece.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
-    foot_m = FOOT_SHARE * piece.size_m[1]
-    hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in made.hulls[piece.key])
+    made = decompose_all({chosen.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
+    size_m = np.ptp(surface.vertices, axis=0)
+    foot_m = FOOT_SHARE * size_m[1]
+    hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in made.hulls[chosen.key])
     low = simplify_to(vertices, faces, MOST_FACES)
     kept, off_m = surface_loss(vertices, faces, *low)
     lost = 1 - kept
@@ -129,11 +156,14 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
         raise SceneRejected(
             f"{where}: has {len(low[1])} faces after simplification, expected {MOST_FACES}; leave it out"
         )
-    spacing_m = max(float(np.ptp(surface.vertices, axis=0).max()) / TEXELS, 1e-3)
+    spacing_m = max(float(size_m.max()) / TEXELS, 1e-3)
     visual, _ = bake_object(vertices, faces, colours, textured_cloud(surface, spacing_m), low, TEXELS)
-    credit = Credit(piece.name, piece.creator, _licence(chosen.catalogue.licence), piece.key)
-    size_m = (round(piece.size_m[0], 4), round(piece.size_m[1], 4), round(piece.size_m[2], 4))
-    model = Model(piece.key, chosen.category, chosen.split, size_m, len(visual.faces), len(hulls), credit)
+    credits = tuple(
+        Credit(of.name, of.creator, _licence(catalogue.licence), of.key)
+        for catalogue, of in ((chosen.catalogue, piece), *chosen.riders)
+    )
+    sides = tuple(float(side) for side in np.round(size_m, 4))
+    model = Model(chosen.key, chosen.category, chosen.split, sides, len(visual.faces), len(hulls), credits)
     return model, Shape(visual, hulls)
 
 
@@ -169,7 +199,7 @@ def build(
         try:
             for one, future in zip(chosen, running, strict=True):
                 done.append(future.result())
-                report(one.piece.key, len(done) / len(chosen))
+                report(one.key, len(done) / len(chosen))
         except concurrent.futures.process.BrokenProcessPool:
             raise StageFailed(
                 f"library: a process died while {jobs} models were made; try again with fewer --jobs"

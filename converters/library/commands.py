@@ -43,7 +43,8 @@ def _list(arguments: argparse.Namespace, console: Console) -> int:
         width, height, depth = model.size_m
         print(
             f"{model.name:<40} {model.category:<15} {model.split:<6} {width:.2f} x {depth:.2f} x {height:.2f} m "
-            f"{model.faces:>5} faces {model.hulls:>3} hulls  {model.credit.creator}, {model.credit.licence}"
+            f"{model.faces:>5} faces {model.hulls:>3} hulls  "
+            + "; ".join(f"{c.creator}, {c.licence}" for c in model.credits)
         )
     return 0
 

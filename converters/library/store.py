@@ -51,12 +51,13 @@ class Model:
     category: str
     split: str
     """train or test: no creator is in both."""
-    size_m: tuple[float, float, float]
+    size_m: tuple[float, ...]
     """Along x, y (up) and z."""
     faces: int
     """Of its surface."""
     hulls: int
-    credit: Credit
+    credits: tuple[Credit, ...]
+    """One each for the model and what stands on it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,8 +125,8 @@ def attribution(models: Sequence[Model]) -> str:
         "| Model | Title | Creator | Licence |",
         "|---|---|---|---|",
     ]
-    credits = [(m.credit.source, m.credit.title, m.credit.creator or "not named", m.credit.licence) for m in models]
-    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in credits)]) + "\n"
+    rows = dict.fromkeys((c.source, c.title, c.creator or "not named", c.licence) for m in models for c in m.credits)
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)]) + "\n"
 
 
 def _member(path: Path, name: str) -> bytes:
@@ -146,7 +147,7 @@ def read_index(path: Path = PACKED) -> dict[str, Model]:
     """
     found = {}
     for row in json.loads(_member(path, "index.json")):
-        values: dict[str, Any] = {**row, "size_m": tuple(row["size_m"]), "credit": Credit(**row["credit"])}
+        values: dict[str, Any] = {**row, "size_m": tuple(row["size_m"]), "credits": tuple(Credit(**one) for one in row["credits"])}
         found[row["name"]] = Model(**values)
     return found
 
