@@ -18,7 +18,7 @@ import numpy as np
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import merge_vertices
+from converters.geometry.faces import merge_vertices, sample_faces
 from converters.geometry.simplify import simplify_to, simplify_within, surface_loss
 from converters.library.catalogue import Catalogue, Piece, read_catalogue, unpack_model
 from converters.library.store import Credit, Model, Shape, attribution, write_library
@@ -26,6 +26,7 @@ from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.read.obj import join_meshes
 from converters.records.errors import SceneRejected, StageFailed
+from converters.records.visual import TexturedMesh
 from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_file, write_text

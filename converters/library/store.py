@@ -147,7 +147,8 @@ def read_index(path: Path = PACKED) -> dict[str, Model]:
     """
     found = {}
     for row in json.loads(_member(path, "index.json")):
-        values: dict[str, Any] = {**row, "size_m": tuple(row["size_m"]), "credits": tuple(Credit(**one) for one in row["credits"])}
+        credits = tuple(Credit(**one) for one in row["credits"])
+        values: dict[str, Any] = {**row, "size_m": tuple(row["size_m"]), "credits": credits}
         found[row["name"]] = Model(**values)
     return found
 

@@ -15,7 +15,7 @@ from converters.records.visual import TexturedMesh
 
 COLLISION = "collision.obj"
 """Beside a model: its collision mesh, made of convex pieces that share no vertex."""
-MOST_OWN = 6
+MOST_OWN = 8
 """Convex pieces of a model that came with its own."""
 OWN_SLACK = 0.03
 """Share of the model's bounding box that joining two of them may add: slats become a back, legs stay legs."""

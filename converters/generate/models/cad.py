@@ -2,7 +2,8 @@
 
 Frame of a CAD model: y up, front along +z (or -z where `front` says so), normalised so that the diagonal of
 the bounding box is 1. Each model is a union of overlapping convex parts, so most are not watertight as a
-whole; parts marked `open` lack their underside, as in many models that people draw.
+whole; parts marked `open` lack their underside, as in many models that people draw. Homes take the packaged library's
+models, with a surface of their own, and drawn ones of the kinds that it lacks.
 """
 
 from __future__ import annotations
@@ -14,7 +15,11 @@ import hashlib
 import numpy as np
 
 from converters.generate.models import bathroom, beds, decor, furniture, kitchen, laundry, seats, storage, things
-from converters.generate.models.parts import Drawing, Part, on_floor
+from converters.generate.models.parts import MATERIALS, Drawing, Part, on_floor
+from converters.geometry.pieces import convex_pieces
+from converters.library.store import read_index, read_shape
+from converters.read.cad import MOST_OWN, OWN_SLACK
+from converters.records.visual import VisualMesh
 from scenes_mjcf.categories import CATEGORIES
 
 
@@ -32,6 +37,8 @@ class CadModel:
     """In the normalised CAD frame."""
     unit_m: float
     """Metres per CAD unit at the model's designed size."""
+    surface: VisualMesh | None = None
+    """Of a library model, CAD frame: what is drawn; its parts are its hulls."""
 
     @functools.cached_property
     def bounds(self) -> np.ndarray:
@@ -88,10 +95,30 @@ _SPARSE: dict[str, Drawing] = {
 }
 """What sparse homes have. They draw models by their place among these names: a new one would change each home."""
 _ROOMS = (seats, beds, storage, kitchen, bathroom, laundry, things, decor)
-LIBRARY: dict[str, Drawing] = {
+_DRAWN: dict[str, Drawing] = {
     **_SPARSE,
     **{name: drawing for room in _ROOMS for name, drawing in room.DRAWINGS.items()},
 }
+
+
+def _library_parts(name: str) -> list[Part]:
+    """The hulls of a library model, as the converter joins them, in the colour nearest to the model's."""
+    shape = read_shape(name)
+    colour = shape.visual.image.reshape(-1, 3).mean(axis=0) / 255
+    material = min(MATERIALS, key=lambda m: float(np.abs(np.array(MATERIALS[m]) - colour).sum()))
+    first = np.cumsum([0, *(len(hull.vertices) for hull in shape.hulls)])
+    vertices = np.vstack([hull.vertices for hull in shape.hulls])
+    faces = np.vstack([hull.faces + k for hull, k in zip(shape.hulls, first, strict=False)])
+    pieces = convex_pieces(vertices, faces, MOST_OWN, OWN_SLACK)
+    assert pieces is not None, f"{name}: a hull is not convex"
+    return [Part(v, f, material) for v, f in pieces]
+
+
+_PACKAGED = {
+    name: Drawing(model.category, functools.partial(_library_parts, name), held_out=model.split == "test")
+    for name, model in read_index().items()
+}
+LIBRARY: dict[str, Drawing] = _DRAWN | _PACKAGED
 """Model name -> how it is drawn."""
 
 TEST_MODELS = (
@@ -103,10 +130,21 @@ TEST_MODELS = (
 TRAIN_MODELS = tuple(name for name in _SPARSE if name not in TEST_MODELS)
 """All others of sparse buildings."""
 
-HOME_TEST_MODELS = tuple(name for name, drawing in LIBRARY.items() if drawing.held_out or name in TEST_MODELS)
+
+def _home_models(test: bool) -> tuple[str, ...]:
+    """The library's models of a split, and drawn ones of the kinds that it lacks there."""
+    packaged = {name: d for name, d in _PACKAGED.items() if d.held_out == test}
+    have = {d.category for d in packaged.values()}
+    return (
+        *packaged,
+        *(n for n, d in _DRAWN.items() if d.category not in have and (d.held_out or n in TEST_MODELS) == test),
+    )
+
+
+HOME_TEST_MODELS = _home_models(test=True)
 """Held out: no furnished training home uses them."""
 
-HOME_TRAIN_MODELS = tuple(name for name in LIBRARY if name not in HOME_TEST_MODELS)
+HOME_TRAIN_MODELS = _home_models(test=False)
 """All others."""
 
 
@@ -124,7 +162,7 @@ def cad_model(name: str) -> CadModel:
         The model in its CAD frame: bounding box diagonal 1, y up.
     """
     drawing = LIBRARY[name]
-    parts = drawing.draw() if name in _SPARSE else on_floor(drawing.draw())
+    parts = drawing.draw() if name in _SPARSE or name in _PACKAGED else on_floor(drawing.draw())
     if drawing.front < 0:
         flip = np.diag([-1.0, 1.0, -1.0])
         parts = [dataclasses.replace(p, vertices=p.vertices @ flip) for p in parts]
@@ -135,7 +173,10 @@ def cad_model(name: str) -> CadModel:
     shift = (np.frombuffer(bytes.fromhex(digest)[:3], np.uint8) / 255 - 0.5) * 0.06
     move = -(low + high) / 2 / unit_m + np.round(shift, 4)
     scaled = tuple(dataclasses.replace(p, vertices=np.round(p.vertices / unit_m + move, 6)) for p in parts)
-    category = drawing.category
+    surface, category = None, drawing.category
+    if name in _PACKAGED:
+        visual = read_shape(name).visual
+        surface = dataclasses.replace(visual, vertices=visual.vertices / unit_m + move)
     return CadModel(
-        name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m
+        name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m, surface
     )

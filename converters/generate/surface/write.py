@@ -16,6 +16,7 @@ from converters.generate.models.cad import CadModel
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas
+from converters.records.visual import VisualMesh
 
 LICENCE = """CC0 1.0 Universal
 
@@ -73,6 +74,35 @@ def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
     """Writes `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL, with `pieces` its convex parts too."""
     folder = library / model.catid / model.id_cad / "models"
     folder.mkdir(parents=True, exist_ok=True)
+    if model.surface is not None:
+        _write_surface(folder, model.surface)
+    else:
+        _write_parts(folder, model)
+    if pieces:
+        first, solid = 1, []
+        for k, part in enumerate(model.parts):
+            solid += [
+                f"o part_{k}\n",
+                _rows("v %.6f %.6f %.6f\n", part.vertices),
+                _rows("f %d %d %d\n", part.faces + first),
+            ]
+            first += len(part.vertices)
+        _lines(folder / "collision.obj", solid)
+
+
+def _write_surface(folder: Path, surface: VisualMesh) -> None:
+    corners = np.stack([surface.faces + 1, surface.uv_faces + 1], axis=2).reshape(-1, 6)
+    _lines(folder / "model_normalized.obj", [
+        "mtllib model_normalized.mtl\nusemtl surface\n",
+        _rows("v %.6f %.6f %.6f\n", surface.vertices),
+        _rows("vt %.5f %.5f\n", surface.uv),
+        _rows("f %d/%d %d/%d %d/%d\n", corners),
+    ])  # fmt: skip
+    _lines(folder / "model_normalized.mtl", ["newmtl surface\nKd 1 1 1\nd 1\nillum 1\nmap_Kd texture.png\n"])
+    write_png(folder / "texture.png", surface.image)
+
+
+def _write_parts(folder: Path, model: CadModel) -> None:
     chunks, base = ["mtllib model_normalized.mtl\n"], 1
     for k, part in enumerate(model.parts):
         faces = part.faces
@@ -84,16 +114,6 @@ def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
         chunks.append(_rows("f %d %d %d\n", faces + base))
         base += len(part.vertices)
     _lines(folder / "model_normalized.obj", chunks)
-    if pieces:
-        first, solid = 1, []
-        for k, part in enumerate(model.parts):
-            solid += [
-                f"o part_{k}\n",
-                _rows("v %.6f %.6f %.6f\n", part.vertices),
-                _rows("f %d %d %d\n", part.faces + first),
-            ]
-            first += len(part.vertices)
-        _lines(folder / "collision.obj", solid)
     colours = [
         f"newmtl {name}\nKd {r:.4f} {g:.4f} {b:.4f}\nKs 0 0 0\nd 1\nillum 1\n"
         for name, (r, g, b) in MATERIALS.items()
