@@ -163,13 +163,12 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
     charts = []
     images: dict[str, np.ndarray] = {}
     for item in items:
-        label, shape = NYU40[item.model.category], getattr(item.model, "shape", None)
-        if shape is None:
+        label, visual = NYU40[item.model.category], item.model.surface
+        if visual is None:
             for part in item.model.parts:
                 paint = plain(MATERIALS[part.material])
                 charts += piece_charts(item.to_floor(part.vertices), part.faces, label, paint)
             continue
-        visual = shape.visual
         if item.model.name not in images:
             picture = np.asarray(visual.image, float)[..., :3] / 255
             h, w = (n // 2 * 2 for n in picture.shape[:2])

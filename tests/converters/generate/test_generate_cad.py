@@ -8,15 +8,27 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.generate.models.cad import LIBRARY, TEST_MODELS, TRAIN_MODELS, cad_model
+from converters.generate.models.cad import (
+    HOME_TEST_MODELS,
+    HOME_TRAIN_MODELS,
+    LIBRARY,
+    TEST_MODELS,
+    TRAIN_MODELS,
+    cad_model,
+)
 from converters.generate.models.parts import MATERIALS, bar, box
 from converters.generate.surface.texture import pack_rows
 from converters.generate.surface.volume import Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
 from converters.generate.surface.write import write_cad
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.cad import read_cad
+from converters.read.files import SourceFolder
 from scenes_mjcf.categories import CATEGORIES
 
+DRAWN = sorted(name for name in LIBRARY if "/" not in name)
 
-@pytest.mark.parametrize("name", sorted(LIBRARY))
+
+@pytest.mark.parametrize("name", [*DRAWN, *sorted(set(LIBRARY) - set(DRAWN))[::9]])
 def test_model_is_normalised_and_made_of_closed_convex_parts(name):
     model = cad_model(name)
     assert np.linalg.norm(2 * model.half_extents) == pytest.approx(1.0, abs=1e-4)
@@ -42,7 +54,7 @@ def test_model_is_normalised_and_made_of_closed_convex_parts(name):
     ],
 )
 def test_sizes_are_those_of_real_furniture(category, height_m, width_m):
-    models = [cad_model(n) for n, d in LIBRARY.items() if d.category == category]
+    models = [cad_model(n) for n in (*TRAIN_MODELS, *TEST_MODELS) if LIBRARY[n].category == category]
     assert len(models) >= 4
     for model in models:
         size_m = 2 * model.half_extents * model.unit_m
@@ -55,6 +67,29 @@ def test_held_out_models_are_apart_and_cover_all_categories_of_sparse_homes():
     for names in (TRAIN_MODELS, TEST_MODELS):
         assert {LIBRARY[n].category for n in names} == {"chair", "sofa", "table", "desk", "door"}
     assert len({cad_model(n).id_cad for n in LIBRARY}) == len(LIBRARY)
+
+
+def test_homes_take_drawn_models_only_of_kinds_that_the_library_lacks():
+    assert set(HOME_TRAIN_MODELS).isdisjoint(HOME_TEST_MODELS)
+    for names, floor_lamps in ((HOME_TRAIN_MODELS, {"Scopia/living_lamp"}), (HOME_TEST_MODELS, None)):
+        packaged = {LIBRARY[n].category for n in names if "/" in n}
+        drawn = {LIBRARY[n].category for n in names if "/" not in n}
+        assert packaged.isdisjoint(drawn) and "door" in drawn and {"chair", "sofa", "bed", "table"} <= packaged
+        if floor_lamps:
+            assert {n for n in names if LIBRARY[n].category == "floor_lamp"} == floor_lamps
+
+
+def test_a_library_model_is_written_with_its_texture_and_its_hulls(tmp_path):
+    model = cad_model("Scopia/chair")
+    write_cad(tmp_path / "cad", model, pieces=True)
+    read = read_cad(SourceFolder(tmp_path), model.catid, model.id_cad)
+    assert model.surface is not None and read.surface is not None and read.pieces is not None
+    np.testing.assert_array_equal(read.surface.texture, model.surface.image)
+    assert len(read.surface.faces) == len(model.surface.faces) and len(read.pieces) == len(model.parts)
+    for (vertices, _), part in zip(read.pieces, model.parts, strict=True):
+        np.testing.assert_allclose(
+            np.sort(vertices, axis=0), np.sort(part.vertices @ Y_UP_TO_Z_UP.T, axis=0), atol=2e-6
+        )
 
 
 def test_front_minus_z_turns_the_back_rest_to_plus_z():
