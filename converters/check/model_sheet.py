@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 
 from converters.generate.models.cad import LIBRARY, cad_model
 from converters.generate.models.parts import MATERIALS
+from converters.read.obj import texels
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
 
@@ -32,22 +33,31 @@ def camera_axes() -> np.ndarray:
 
 
 def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
-    """(pixels, pixels, 3) uint8 picture of a model, in the colours of its materials, on white.
+    """(pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white.
 
     Args:
         name: key of `LIBRARY`.
         pixels: side of the picture.
     """
     model = cad_model(name)
-    axes = camera_axes()
-    turned = [part.vertices * [model.front, 1, model.front] @ axes.T for part in model.parts]
+    axes = camera_axes() * [model.front, 1, model.front]
+    if model.surface is None:
+        turned = [part.vertices @ axes.T for part in model.parts]
+        drawn = [
+            (v[p.faces], [np.array(MATERIALS[p.material])] * len(p.faces))
+            for v, p in zip(turned, model.parts, strict=True)
+        ]
+    else:
+        turned = [model.surface.vertices @ axes.T]
+        colours = texels(model.surface.image, model.surface.uv[model.surface.uv_faces].mean(axis=1)) / 255
+        drawn = [(turned[0][model.surface.faces], colours)]
     low, high = np.concatenate(turned).min(axis=0), np.concatenate(turned).max(axis=0)
     pixel = float((high - low)[:2].max()) / (0.94 * pixels)
     corner = (low[:2] + high[:2] - pixels * pixel) / 2
     image, depth = np.ones((pixels, pixels, 3)), np.full((pixels, pixels), -np.inf)
-    for part, vertices in zip(model.parts, turned, strict=True):
-        for triangle in vertices[part.faces]:
-            _draw_triangle(image, depth, (triangle - [*corner, 0.0]) / pixel, np.array(MATERIALS[part.material]))
+    for triangles, colours in drawn:
+        for triangle, colour in zip(triangles, colours, strict=True):
+            _draw_triangle(image, depth, (triangle - [*corner, 0.0]) / pixel, colour)
     return (255 * image[::-1]).astype(np.uint8)
 
 

@@ -14,7 +14,7 @@ import hashlib
 
 import numpy as np
 
-from converters.generate.models import bathroom, beds, decor, furniture, kitchen, laundry, seats, storage, things
+from converters.generate.models import fixtures, furniture, laundry, storage, things
 from converters.generate.models.parts import MATERIALS, Drawing, Part, on_floor
 from converters.geometry.pieces import convex_pieces
 from converters.library.store import read_index, read_shape
@@ -94,7 +94,7 @@ _SPARSE: dict[str, Drawing] = {
     "door_battens": Drawing("door", furniture.door_battens),
 }
 """What sparse homes have. They draw models by their place among these names: a new one would change each home."""
-_ROOMS = (seats, beds, storage, kitchen, bathroom, laundry, things, decor)
+_ROOMS = (storage, fixtures, laundry, things)
 _DRAWN: dict[str, Drawing] = {
     **_SPARSE,
     **{name: drawing for room in _ROOMS for name, drawing in room.DRAWINGS.items()},

@@ -14,7 +14,6 @@ from converters.generate.models.parts import (
     box,
     corners,
     cushion,
-    feet,
     hull,
     oval,
     pillar,
@@ -24,88 +23,7 @@ from converters.generate.models.parts import (
     shell,
 )  # fmt: skip
 
-# -- washers -----------------------------------------------------------
-
-
-def washer_front(width=0.6, height=0.85, depth=0.58, body="enamel", trim="grey", y0=0.0) -> list[Part]:
-    """A drum behind a round window."""
-    z = depth / 2
-    parts = [
-        block((0, y0, -0.01), (width, height, depth - 0.03), body),
-        block((0, y0 + height - 0.02, 0), (width, 0.025, depth), body),
-    ]
-    middle = y0 + 0.45 * height
-    parts += [
-        bar((0, middle, z - 0.03), (0, middle, z + 0.012), 0.2, trim, 20),
-        bar((0, middle, z), (0, middle, z + 0.025), (0.155, 0.14), "black", 20),
-    ]
-    parts += [
-        box((0, y0 + height - 0.085, z - 0.02), (width - 0.02, 0.11, 0.02), trim),
-        box((-0.18, y0 + height - 0.085, z - 0.008), (0.18, 0.08, 0.016), body),
-    ]
-    parts += [bar((0.02, y0 + height - 0.085, z - 0.02), (0.02, y0 + height - 0.085, z + 0.015), 0.03, "chrome", 12)]
-    return [
-        *parts,
-        box((0.18, y0 + height - 0.085, z - 0.008), (0.14, 0.05, 0.012), "black"),
-        box((0.18, middle, z + 0.016), (0.03, 0.1, 0.014), body),
-    ]
-
-
-def washer_stack() -> list[Part]:
-    return (
-        washer_front() + washer_front(y0=0.86, trim="charcoal") + [block((0, 0.84, -0.01), (0.59, 0.03, 0.54), "black")]
-    )
-
-
-def washer_top(width=0.45, height=0.88, depth=0.6, body="enamel") -> list[Part]:
-    parts = feet(width, depth, 0.04, 0.025, "black") + [block((0, 0.03, 0), (width, height - 0.09, depth), body)]
-    panel = rectangle(0, -depth / 2 + 0.08, width, 0.16)
-    parts += [plate(panel, height - 0.07, height + 0.05, "grey", rectangle(0, -depth / 2 + 0.05, width, 0.09))]
-    parts += [
-        cushion((0, height - 0.045, 0.08), (width - 0.01, 0.05, depth - 0.18), body, 0.015),
-        box((0, height - 0.05, depth / 2), (0.14, 0.025, 0.02), "grey"),
-    ]
-    return parts + [
-        pillar((x, height + 0.0, -depth / 2 + 0.1), 0.05, 0.024, "charcoal", 10) for x in (-0.14, 0.0, 0.14)
-    ]
-
-
-def washer_cabinet(width=0.66, height=0.9, depth=0.62, wood="oak") -> list[Part]:
-    """In a frame with a worktop and a basket on it."""
-    parts = washer_front(0.6, 0.83, 0.56, "charcoal", "black")
-    parts += [block((sx * (width / 2 - 0.012), 0, 0), (0.024, height - 0.03, depth), wood) for sx in (-1, 1)]
-    parts.append(block((0, height - 0.035, 0), (width, 0.035, depth), wood))
-    return [
-        *parts,
-        *shell(rectangle(0, 0, 0.42, 0.3, 0.05), height, height + 0.2, 0.02, "wicker"),
-        cushion((0, height + 0.1, 0), (0.36, 0.16, 0.24), "white", 0.05),
-    ]
-
-
 # -- laundry baskets ---------------------------------------------------
-
-
-def basket_round(radius=0.24, height=0.42, weave="wicker", cloth="white", sides=14) -> list[Part]:
-    low, top = oval(0, 0, 0.76 * radius, 0.76 * radius, sides), oval(0, 0, radius, radius, sides)
-    parts = [
-        *shell(low, 0, height, 0.02, weave, top),
-        plate(low, 0, 0.02, weave),
-        *shell(oval(0, 0, radius + 0.012, radius + 0.012, 8), height - 0.04, height, 0.035, "leather"),
-    ]
-    return [
-        *parts,
-        ball((0.04, 0.28, 0.02), (0.15, 0.12, 0.14), cloth),
-        ball((-0.07, 0.3, -0.04), (0.1, 0.1, 0.12), "denim"),
-    ]
-
-
-def basket_oblong(width=0.6, height=0.27, depth=0.4, body="sage", cloth="cream") -> list[Part]:
-    low, top = rectangle(0, 0, width - 0.12, depth - 0.1, 0.06), rectangle(0, 0, width - 0.04, depth - 0.02, 0.08)
-    parts = [*shell(low, 0, height, 0.015, body, top), plate(low, 0, 0.015, body)]
-    parts += [cushion((sx * (width / 2 - 0.03), height - 0.02, 0), (0.06, 0.035, 0.16), body, 0.012) for sx in (-1, 1)]
-    for k, (x, z) in enumerate(((-0.12, 0.03), (0.1, -0.04), (0.0, 0.06))):
-        parts.append(ball((x, 0.19, z), (0.14, 0.1, 0.1), (cloth, "blush", "navy")[k]))
-    return parts
 
 
 def basket_hamper(width=0.44, height=0.6, depth=0.34, weave="wicker", lid="bark") -> list[Part]:
@@ -246,56 +164,6 @@ def cart_bar(width=0.7, depth=0.4, height=0.82, wood="walnut", metal="brass") ->
 # -- drying racks ------------------------------------------------------
 
 
-def rack_wings(length=1.1, depth=0.55, height=0.95, metal="white", cloth="denim") -> list[Part]:
-    """Crossed legs, a level frame, and wings that rise to both sides."""
-    parts = []
-    for sx in (-1, 1):
-        x = sx * (length / 2 - 0.03)
-        parts += [bar((x, 0.012, sz * depth / 2), (x, height, -sz * depth / 2), 0.013, metal, 6) for sz in (-1, 1)]
-        parts += [
-            bar((x, height, sz * depth / 2), (x, height + 0.12, sz * (depth / 2 + 0.3)), 0.011, metal, 6)
-            for sz in (-1, 1)
-        ]
-    rails = [(height, depth * (k / 6 - 0.5)) for k in range(7)] + [
-        (height + 0.04 * k, s * (depth / 2 + 0.1 * k)) for s in (-1, 1) for k in (1, 2, 3)
-    ]
-    parts += [rail(length / 2, y, z, 0.008, metal, 6) for y, z in rails]
-    parts += [rail(length / 2, 0.014, s * depth / 2, 0.014, metal, 6) for s in (-1, 1)]
-    return [
-        *parts,
-        block((-0.2, height - 0.45, 0.09), (0.4, 0.47, 0.02), cloth),
-        block((0.25, height - 0.3, -0.09), (0.3, 0.32, 0.02), "cream"),
-    ]
-
-
-def rack_tower(width=0.66, depth=0.6, height=1.35, metal="grey") -> list[Part]:
-    parts = [
-        pillar((sx * width / 2, 0.0, sz * depth / 2 * 0.9), height if sz < 0 else height - 0.05, 0.013, metal, 6)
-        for sx in (-1, 1)
-        for sz in (-1, 1)
-    ]
-    for tier in range(3):
-        y = 0.35 + 0.45 * tier
-        parts += [
-            bar(
-                (-width / 2, y, depth * (0.225 * k - 0.45)), (width / 2, y, depth * (0.225 * k - 0.45)), 0.008, metal, 6
-            )
-            for k in range(5)
-        ]
-        parts += [
-            bar((sx * width / 2, y, -0.45 * depth), (sx * width / 2, y, 0.45 * depth), 0.01, metal, 6) for sx in (-1, 1)
-        ]
-    parts += [
-        bar((sx * width / 2, 0.03, -0.45 * depth), (sx * width / 2, 0.03, 0.45 * depth), 0.018, metal, 6)
-        for sx in (-1, 1)
-    ]
-    return [
-        *parts,
-        block((-0.1, 0.86, 0.14), (0.34, 0.4, 0.02), "mustard"),
-        block((0.05, 0.45, -0.13), (0.44, 0.36, 0.02), "white"),
-    ]
-
-
 def rack_frame(width=0.75, depth=0.6, height=1.3, wood="birch", cloth="blush") -> list[Part]:
     """Two ladders that lean together."""
     parts = []
@@ -353,20 +221,12 @@ def rack_rail(width=1.0, height=1.5, depth=0.45, metal="black") -> list[Part]:
 
 
 DRAWINGS = {
-    "washer_front": Drawing("washer", washer_front),
-    "washer_stack": Drawing("washer", washer_stack),
-    "washer_top": Drawing("washer", washer_top, held_out=True),
-    "washer_cabinet": Drawing("washer", washer_cabinet, held_out=True),
-    "laundry_basket_round": Drawing("laundry_basket", basket_round),
-    "laundry_basket_oblong": Drawing("laundry_basket", basket_oblong),
     "laundry_basket_hamper": Drawing("laundry_basket", basket_hamper, held_out=True),
     "laundry_basket_folding": Drawing("laundry_basket", basket_folding, held_out=True),
     "cart_trays": Drawing("cart", cart_trays),
     "cart_butcher": Drawing("cart", cart_butcher),
     "cart_tea": Drawing("cart", cart_tea, held_out=True),
     "cart_bar": Drawing("cart", cart_bar, held_out=True),
-    "drying_rack_wings": Drawing("drying_rack", rack_wings, "__SYM_ROTATE_UP_2"),
-    "drying_rack_tower": Drawing("drying_rack", rack_tower),
     "drying_rack_frame": Drawing("drying_rack", rack_frame, held_out=True),
     "drying_rack_rail": Drawing("drying_rack", rack_rail, held_out=True),
 }

@@ -1,10 +1,9 @@
-"""Sizes and materials in, what things lie in or on out, of convex parts: sideboards, bookcases, tables, desks."""
+"""Sizes and materials in, storage of convex parts out: shelves, shoe racks, dressers, carts."""
 
 from __future__ import annotations
 
 import functools
 
-from converters.generate.models.beds import chest
 from converters.generate.models.parts import (
     Drawing,
     Part,
@@ -18,64 +17,9 @@ from converters.generate.models.parts import (
     oval,
     pillar,
     plate,
-    rectangle,
-    turned,
-)  # fmt: skip
+)
 
-# -- sideboards and television benches ---------------------------------
-
-
-def sideboard_mixed(width=1.5, height=0.78, depth=0.42, wood="walnut", front="walnut") -> list[Part]:
-    parts = four_legs(width - 0.2, depth - 0.04, 0.17, 0.045, wood, splay=0.04, square=False)
-    parts.append(block((0, 0.16, 0), (width, height - 0.16, depth - 0.01), wood))
-    parts += fronts((-width / 2 + 0.02, 0.18), (-width / 6, height - 0.02), depth / 2 - 0.005, 1, 1, front, "pull")
-    parts += fronts((-width / 6, 0.18), (width / 6, height - 0.02), depth / 2 - 0.005, 1, 3, front, "bar")
-    return parts + fronts((width / 6, 0.18), (width / 2 - 0.02, height - 0.02), depth / 2 - 0.005, 1, 1, front, "pull")
-
-
-def sideboard_buffet(width=1.2, height=0.9, depth=0.45, paint="cream", top="oak") -> list[Part]:
-    parts = [pillar((x, 0, z), 0.1, (0.03, 0.045), paint) for x, z in corners(width / 2 - 0.05, 0.16)]
-    parts.append(block((0, 0.09, 0), (width, height - 0.12, depth - 0.02), paint))
-    parts.append(block((0, height - 0.035, 0.01), (width + 0.06, 0.035, depth + 0.03), top))
-    z = depth / 2 - 0.01
-    parts += fronts((-width / 2 + 0.03, 0.11), (width / 2 - 0.03, 0.64), z, 3, 1, paint, "knob", "brass")
-    return parts + fronts((-width / 2 + 0.03, 0.64), (width / 2 - 0.03, height - 0.05), z, 3, 1, paint, "knob", "brass")
-
-
-def sideboard_hutch(width=1.1, height=1.75, depth=0.42, wood="pine") -> list[Part]:
-    parts = chest(width, 0.85, depth, 2, 1, wood, "pull", metal="black")
-    for sx in (-1, 0, 1):
-        parts.append(block((sx * (width / 2 - 0.02), 0.85, -0.06), (0.03, height - 0.87, depth - 0.16), wood))
-    parts.append(block((0, 0.85, -depth / 2 + 0.02), (width, height - 0.87, 0.02), wood))
-    parts += [block((0, y, -0.06), (width - 0.02, 0.025, depth - 0.16), wood) for y in (1.15, 1.45)]
-    parts.append(block((0, height - 0.04, -0.05), (width + 0.06, 0.04, depth - 0.1), wood))
-    for k in range(6):
-        parts.append(pillar((-0.4 + 0.16 * k, 1.175 + 0.3 * (k % 2), -0.06), 0.14, (0.03, 0.05), "ceramic", 10))
-    return parts
-
-
-def bench_tv_shelf(width=1.4, height=0.42, depth=0.4, wood="black", metal="steel") -> list[Part]:
-    parts = [block((0, y, 0), (width, 0.03, depth), wood) for y in (0.05, 0.22, height - 0.03)]
-    for sx in (-1, 1):
-        parts.append(block((sx * (width / 2 - 0.03), 0, 0), (0.04, height - 0.02, depth - 0.02), metal))
-    parts.append(block((0, 0.06, 0), (0.03, height - 0.08, depth - 0.06), metal))
-    parts.append(block((-0.36, 0.25, 0), (0.42, 0.06, 0.28), "charcoal"))
-    return parts
-
-
-def bench_tv_corner(width=1.2, height=0.5, depth=0.5, wood="cherry") -> list[Part]:
-    """Its back is narrower, so that it stands in corners."""
-    outline = rectangle(0, 0, width, depth)
-    outline[[0, 3]] *= [0.6, 1.0]
-    parts = [plate(outline * 0.94, 0, 0.06, "charcoal"), plate(outline, 0.05, height - 0.02, wood)]
-    parts.append(plate(outline * 1.03, height - 0.03, height, wood))
-    z = depth / 2 - 0.005
-    parts += fronts((-width / 2 + 0.02, 0.07), (width / 2 - 0.02, 0.3), z, 2, 1, wood, "knob", "brass")
-    parts.append(box((0, 0.385, depth / 2 - 0.005), (width - 0.08, 0.14, 0.02), "black"))
-    return parts
-
-
-# -- bookcases, shelves and shoe racks ---------------------------------
+_f = functools.partial
 
 
 def books(x0, x1, y, z, depth, seed) -> list[Part]:
@@ -90,17 +34,6 @@ def books(x0, x1, y, z, depth, seed) -> list[Part]:
         )  # fmt: skip
         for k in range(3 if seed % 3 else 2)
     ]
-
-
-def bookcase_tall(width=0.8, height=2.0, depth=0.28, wood="oak", shelves=5, filled=4) -> list[Part]:
-    parts = [block((0, 0, -depth / 2 + 0.01), (width, height, 0.015), wood)]
-    parts += [block((sx * (width / 2 - 0.012), 0, 0), (0.024, height, depth), wood) for sx in (-1, 1)]
-    ys = [0.06 + (height - 0.085) * k / shelves for k in range(shelves + 1)]
-    parts += [block((0, y, 0), (width - 0.02, 0.024, depth - 0.01), wood) for y in ys]
-    parts.append(block((0, 0, depth / 2 - 0.03), (width - 0.04, 0.065, 0.02), wood))
-    for k in range(filled):
-        parts += books(-width / 2 + 0.04, width / 2 - 0.1, ys[k] + 0.024, -0.01, depth, k + 1)
-    return parts
 
 
 def bookcase_cubes(columns=3, rows=3, side=0.37, depth=0.36, paint="white") -> list[Part]:
@@ -122,39 +55,6 @@ def bookcase_cubes(columns=3, rows=3, side=0.37, depth=0.36, paint="white") -> l
             )
         )
     return parts
-
-
-def bookcase_ladder(width=0.62, height=1.8, depth=0.42, wood="walnut", metal="black") -> list[Part]:
-    parts = []
-    for sx in (-1, 1):
-        x = sx * (width / 2 - 0.015)
-        parts.append(bar((x, 0, depth / 2 - 0.02), (x, height, -depth / 2 + 0.05), 0.02, metal, 4))
-        parts.append(bar((x, 0, -depth / 2 + 0.03), (x, height, -depth / 2 + 0.03), 0.02, metal, 4))
-    for k in range(5):
-        y = 0.12 + 0.38 * k
-        reach = depth - 0.08 - (depth - 0.14) * y / height
-        parts.append(block((0, y, -depth / 2 + 0.04 + reach / 2), (width - 0.03, 0.025, reach), wood))
-        if k < 3:
-            parts += books(-0.22, 0.12, y + 0.025, -depth / 2 + 0.14, 0.2, k + 1)
-    return parts
-
-
-def bookcase_low(width=1.1, height=0.85, depth=0.3, wood="cherry") -> list[Part]:
-    parts = bookcase_tall(width, height, depth, wood, 2, 2)
-    parts.append(block((0, 0.06, 0), (0.024, height - 0.08, depth - 0.01), wood))
-    parts.append(block((0, height - 0.02, 0.005), (width + 0.05, 0.03, depth + 0.03), wood))
-    return parts
-
-
-def bookcase_steps(width=1.2, depth=0.3, wood="birch") -> list[Part]:
-    """Columns of different heights, open to both sides."""
-    parts = []
-    for k, height in enumerate((0.75, 1.1, 1.45)):
-        x = width * (k - 1) / 3
-        parts.append(block((x - width / 6, 0, 0), (0.024, height, depth), wood))
-        parts += [block((x, y, 0), (width / 3, 0.024, depth), wood) for y in (0.0, 0.35, 0.7, 1.05, 1.42) if y < height]
-        parts += books(x - 0.15, x + 0.12, 0.374, 0, depth, k + 1)
-    return [*parts, block((width / 2, 0, 0), (0.024, 1.45, depth), wood)]
 
 
 def shelf_unit(width=1.6, height=2.2, depth=0.34, wood="pine", metal="pine", levels=5, goods=True) -> list[Part]:
@@ -249,133 +149,37 @@ def shoe_rack_slats(width=0.7, depth=0.3, wood="birch", tiers=2) -> list[Part]:
     ]
 
 
-# -- tables ------------------------------------------------------------
+def chest(
+    width, height, depth, columns, rows, wood, handle="bar", front="", legs=0.0, metal="steel", top=""
+) -> list[Part]:
+    """A carcass on legs, or on a plinth where they are 0, with drawers or doors and a top that juts out."""
+    parts = [block((0, 0, -0.015), (width - 0.04, 0.06, depth - 0.05), "charcoal")]
+    if legs:
+        parts = four_legs(width - 0.02, depth - 0.02, legs + 0.01, 0.045, top or wood, splay=0.02, square=False)
+    under = legs or 0.05
+    parts.append(block((0, under, 0), (width, height - under - 0.02, depth - 0.01), wood))
+    parts.append(block((0, height - 0.025, 0.008), (width + 0.02, 0.025, depth + 0.016), top or wood))
+    low, high = (-width / 2 + 0.015, under + 0.015), (width / 2 - 0.015, height - 0.035)
+    return parts + fronts(low, high, depth / 2 - 0.005, columns, rows, front or wood, handle, metal)
 
 
-def coffee_shelf(width=1.05, depth=0.6, height=0.44, wood="walnut") -> list[Part]:
-    parts = four_legs(width, depth, height - 0.02, 0.045, wood)
-    parts.append(block((0, height - 0.035, 0), (width + 0.02, 0.035, depth + 0.02), wood))
-    parts.append(block((0, 0.14, 0), (width - 0.06, 0.022, depth - 0.06), wood))
-    parts += [
-        block((-0.2, 0.162, 0.05), (0.3, 0.03, 0.22), "red"),
-        block((-0.2, 0.192, 0.05), (0.26, 0.03, 0.2), "cream"),
-    ]
-    return parts
+def dresser_tall(width=0.55, height=1.2, depth=0.42, wood="pine") -> list[Part]:
+    parts = [plate_foot(width, depth, sx) for sx in (-1, 1)]
+    parts.append(block((0, 0.08, 0), (width, height - 0.1, depth - 0.01), wood))
+    parts.append(block((0, height - 0.03, 0.01), (width + 0.05, 0.03, depth + 0.03), wood))
+    parts += fronts((-width / 2 + 0.02, 0.1), (width / 2 - 0.02, 0.92), depth / 2 - 0.005, 1, 4, wood, "knob", "black")
+    return parts + fronts((-width / 2 + 0.02, 0.92), (width / 2 - 0.02, height - 0.04), depth / 2 - 0.005, 2, 1, wood,
+                          "knob", "black")  # fmt: skip
 
 
-def coffee_round(radius=0.42, height=0.4, top="marble", metal="brass") -> list[Part]:
-    parts = [pillar((0, height - 0.03, 0), 0.03, radius, top, 20), pillar((0, 0, 0), 0.02, 0.7 * radius, metal, 20)]
-    for sx, sz in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        parts.append(
-            bar(
-                (0.62 * radius * sx, 0.01, 0.62 * radius * sz),
-                (-0.62 * radius * sz, height - 0.02, 0.62 * radius * sx),
-                0.014,
-                metal,
-                8,
-            )
-        )
-    return parts
+def plate_foot(width, depth, side) -> Part:
+    """A foot along the depth, narrower at the floor."""
+    x = side * (width / 2 - 0.03)
+    low = oval(x, 0, 0.03, depth / 2 - 0.03, 8)
+    return plate(low, 0, 0.09, "pine", oval(x, 0, 0.035, depth / 2 - 0.01, 8))
 
 
-def coffee_trunk(width=1.0, depth=0.55, height=0.45, wood="leather", metal="brass") -> list[Part]:
-    parts = [
-        block((0, 0.02, 0), (width, height - 0.12, depth), wood),
-        block((0, height - 0.11, 0), (width + 0.01, 0.11, depth + 0.01), wood),
-    ]
-    parts += [block((x, 0, z), (0.06, height, 0.06), metal) for x, z in corners(width / 2 - 0.02, depth / 2 - 0.02)]
-    parts += [block((0.28 * sx, 0.03, 0), (0.05, height - 0.02, depth + 0.024), "black") for sx in (-1, 1)]
-    return [*parts, block((0, height - 0.17, depth / 2), (0.1, 0.1, 0.02), metal)]
-
-
-def coffee_nest(wood="birch", metal="black") -> list[Part]:
-    parts = []
-    for x, z, radius, height in ((-0.12, -0.05, 0.34, 0.46), (0.3, 0.16, 0.25, 0.36)):
-        parts.append(pillar((x, height - 0.025, z), 0.025, radius, wood, 18))
-        for dx, dz in ((0, -1), (0.87, 0.5), (-0.87, 0.5)):
-            parts.append(
-                bar(
-                    (x + 0.9 * radius * dx, 0, z + 0.9 * radius * dz),
-                    (x + 0.5 * radius * dx, height - 0.02, z + 0.5 * radius * dz),
-                    0.014,
-                    metal,
-                    6,
-                )
-            )
-    return parts
-
-
-def coffee_slab(width=1.1, depth=0.6, height=0.34, top="oak", stone="grey") -> list[Part]:
-    parts = [plate(rectangle(0, 0, width, depth, 0.1), height - 0.06, height, top)]
-    parts += [plate(oval(sx * 0.3, 0, 0.1, 0.22, 14), 0, height - 0.055, stone) for sx in (-1, 1)]
-    return parts
-
-
-def table_oval(width=1.38, depth=0.9, height=0.75, top="cherry", leg="cherry") -> list[Part]:
-    parts = [plate(oval(0, 0, width / 2, depth / 2, 24), height - 0.035, height, top)]
-    parts += turned((0, 0.1, 0), [(0.09, 0), (0.11, 0.12), (0.05, 0.3), (0.08, height - 0.14)], leg)
-    for sx, sz in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
-        parts.append(bar((0, 0.2, 0), (sx * 0.34, 0.03, sz * 0.26), (0.05, 0.035), leg, 8))
-        parts.append(pillar((sx * 0.34, 0, sz * 0.26), 0.04, 0.035, leg, 8))
-    return parts
-
-
-def table_cross(width=1.35, depth=0.8, height=0.74, top="pine", metal="black") -> list[Part]:
-    parts = [block((0, height - 0.035, depth * (k - 2) / 5), (width, 0.035, depth / 5 - 0.006), top) for k in range(5)]
-    for sx in (-1, 1):
-        x = sx * (width / 2 - 0.2)
-        for sz in (-1, 1):
-            parts.append(
-                bar((x, 0.0, sz * (depth / 2 - 0.06)), (x, height - 0.03, -sz * (depth / 2 - 0.1)), 0.035, metal, 4)
-            )
-    parts.append(bar((-width / 2 + 0.2, height / 2, 0), (width / 2 - 0.2, height / 2, 0), 0.024, metal, 8))
-    return parts
-
-
-def desk_trestles(width=1.38, depth=0.68, height=0.74, top="glass", wood="birch") -> list[Part]:
-    parts = [block((0, height - 0.025, 0), (width, 0.025, depth), top)]
-    for sx in (-1, 1):
-        x = sx * (width / 2 - 0.25)
-        for dx in (-1, 1):
-            for sz in (-1, 1):
-                foot = (x + 0.13 * dx, 0, sz * (depth / 2 - 0.06))
-                parts.append(bar(foot, (x + 0.02 * dx, height - 0.05, sz * (depth / 2 - 0.1)), 0.022, wood, 4))
-        parts.append(block((x, height - 0.07, 0), (0.07, 0.05, depth - 0.1), wood))
-        parts += [box((x + 0.1 * dx, 0.2, 0), (0.02, 0.05, depth - 0.16), wood) for dx in (-1, 1)]
-    return parts
-
-
-def desk_bookcase(width=1.3, depth=0.6, height=0.75, wood="birch", metal="black") -> list[Part]:
-    parts = [block((0, height - 0.03, 0), (width, 0.03, depth), wood)]
-    parts += [
-        block((width / 2 - 0.02, 0, sz * (depth / 2 - 0.03)), (0.04, height - 0.03, 0.04), metal) for sz in (-1, 1)
-    ]
-    parts.append(box((width / 2 - 0.02, 0.05, 0), (0.04, 0.04, depth - 0.06), metal))
-    x = -width / 2 + 0.17
-    parts += [block((x + sx * 0.155, 0, 0), (0.03, height - 0.03, depth - 0.04), wood) for sx in (-1, 1)]
-    parts += [block((x, y, 0), (0.3, 0.02, depth - 0.05), wood) for y in (0.04, 0.38)]
-    parts += books(x - 0.13, x + 0.1, 0.4, 0.05, 0.3, 2) + books(x - 0.13, x + 0.1, 0.06, 0.05, 0.3, 1)
-    parts.append(box((0.15, height - 0.2, -depth / 2 + 0.04), (width - 0.45, 0.3, 0.02), wood))
-    return parts
-
-
-_f = functools.partial
 DRAWINGS = {
-    "sideboard_mixed": Drawing("sideboard", sideboard_mixed),
-    "sideboard_buffet": Drawing("sideboard", sideboard_buffet),
-    "sideboard_doors": Drawing(
-        "sideboard", _f(chest, 1.6, 0.72, 0.4, 4, 1, "white", "", legs=0.15, top="oak"), held_out=True
-    ),
-    "sideboard_hutch": Drawing("sideboard", sideboard_hutch, held_out=True),
-    "tv_bench_shelf": Drawing("tv_bench", bench_tv_shelf),
-    "tv_bench_drawers": Drawing("tv_bench", _f(chest, 1.6, 0.45, 0.42, 3, 1, "oak", "", "white", legs=0.14)),
-    "tv_bench_corner": Drawing("tv_bench", bench_tv_corner, held_out=True),
-    "tv_bench_cubes": Drawing("tv_bench", _f(bookcase_cubes, 4, 1, 0.37, 0.38, "birch"), held_out=True),
-    "bookcase_tall": Drawing("bookcase", bookcase_tall),
-    "bookcase_cubes": Drawing("bookcase", bookcase_cubes),
-    "bookcase_low": Drawing("bookcase", bookcase_low),
-    "bookcase_ladder": Drawing("bookcase", bookcase_ladder, held_out=True),
-    "bookcase_steps": Drawing("bookcase", bookcase_steps, held_out=True),
     "shelf_pantry": Drawing("shelf", shelf_unit),
     "shelf_builtin": Drawing("shelf", shelf_builtin),
     "shelf_metal": Drawing("shelf", _f(shelf_unit, 1.0, 1.9, 0.45, "steel", "steel", 4), held_out=True),
@@ -384,14 +188,9 @@ DRAWINGS = {
     "shoe_rack_bench": Drawing("shoe_rack", shoe_rack_bench),
     "shoe_rack_tilting": Drawing("shoe_rack", shoe_rack_tilting, held_out=True),
     "shoe_rack_slats": Drawing("shoe_rack", shoe_rack_slats, held_out=True),
-    "coffee_table_shelf": Drawing("coffee_table", coffee_shelf),
-    "coffee_table_round": Drawing("coffee_table", coffee_round, "__SYM_ROTATE_UP_4"),
-    "coffee_table_trunk": Drawing("coffee_table", coffee_trunk),
-    "coffee_table_nest": Drawing("coffee_table", coffee_nest, held_out=True),
-    "coffee_table_slab": Drawing("coffee_table", coffee_slab, "__SYM_ROTATE_UP_2", held_out=True),
-    "table_oval": Drawing("table", table_oval, "__SYM_ROTATE_UP_2"),
-    "table_cross": Drawing("table", table_cross, "__SYM_ROTATE_UP_2", held_out=True),
-    "desk_trestles": Drawing("desk", desk_trestles, held_out=True),
-    "desk_bookcase": Drawing("desk", desk_bookcase),
+    "dresser_tall": Drawing("dresser", dresser_tall, held_out=True),
+    "dresser_nine": Drawing(
+        "dresser", _f(chest, 1.1, 0.86, 0.42, 3, 3, "sage", "knob", "cream", top="oak"), held_out=True
+    ),
 }
 """Model name -> how it is drawn."""
