@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from converters.furniture_library import add_library
 from converters.generating import Commands, add_generate, add_generate_scenes, add_launcher, add_models, positive
-from converters.library.commands import add_library
 from converters.records.errors import StageFailed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import refuse_unused
@@ -161,11 +161,14 @@ def _preview(arguments: argparse.Namespace, console: Console) -> int:
 
 def _propose(arguments: argparse.Namespace, console: Console) -> int:
     from converters.propose.report import propose
+    from converters.propose.retrieval import read_library
     from converters.read.source import read_source
 
-    library = (arguments.library or arguments.source) if arguments.auto_align or arguments.library else None
     with stage_progress(console) as report:
-        raw = read_source(arguments.source, arguments.format)
+        raw, library = read_source(arguments.source, arguments.format), None
+        if arguments.auto_align or arguments.library:
+            own = arguments.source if (arguments.source / "cad").is_dir() else None
+            library = read_library(arguments.library or own)
         found = propose(raw, arguments.output, library, report)
     for table in proposal_tables(found):
         console.print(table)
@@ -239,7 +242,12 @@ def _add_convert(commands: Commands) -> None:
         action="store_true",
         help="also fit library models to labelled furniture that has no annotation",
     )
-    command.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ for --auto-align (default: SRC)")
+    command.add_argument(
+        "--library",
+        type=Path,
+        metavar="DIR",
+        help="folder with cad/ for --auto-align (default: SRC, else the packaged furniture)",
+    )
 
 
 def _add_propose(commands: Commands) -> None:
@@ -250,7 +258,9 @@ def _add_propose(commands: Commands) -> None:
     command.add_argument(
         "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
     )
-    command.add_argument("--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC)")
+    command.add_argument(
+        "--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC, else the packaged furniture)"
+    )
     command.set_defaults(run=_propose, writes=("{}/proposals.*",))
 
 

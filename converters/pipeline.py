@@ -79,7 +79,7 @@ class ConvertConfig:
     auto_align: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
     """Fits library models to labelled furniture that has no annotation."""
     library: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
-    """Folder with `cad/` for that; None: the source folder."""
+    """Folder with `cad/` for that; None: the source folder, or the packaged furniture where it has none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Converted:
 
 
 def with_retrieved(
-    raw: RawScene, library_root: Path, progress: Callable[[float], None]
+    raw: RawScene, library_root: Path | None, progress: Callable[[float], None]
 ) -> tuple[RawScene, dict[int, float]]:
     """Adds what `--auto-align` finds to the annotations.
 
@@ -194,7 +194,7 @@ def _with_alignments(
 ) -> tuple[RawScene, list[Alignment], list[dict[str, Any]]]:
     """The scene with what `--auto-align` adds, and `align_objects` of it."""
     retrieved: dict[int, float] = {}
-    if config.auto_align and config.library is not None:
+    if config.auto_align:
         raw, retrieved = with_retrieved(raw, config.library, progress)
     placements, rows = align_objects(raw)
     for k, confidence in retrieved.items():
@@ -359,7 +359,7 @@ def _convert(
         if warn is not None:
             for warning in raw.warnings:
                 warn(warning)
-        if config.auto_align and config.library is None:
+        if config.auto_align and config.library is None and (source / "cad").is_dir():
             config = dataclasses.replace(config, library=source)
         if floors is not None and len(scenes) != floors:
             raise SceneRejected(f"{source}: has {len(scenes)} floors, expected {floors}; use convert_building")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import matplotlib
@@ -23,10 +23,9 @@ from converters.propose.retrieval import (
     annotated_vertices,
     auto_align,
     compare_retrieval,
-    read_library,
 )
 from converters.records.errors import SceneRejected
-from converters.records.raw import CEILING, RawScene
+from converters.records.raw import CEILING, CadModel, RawScene
 from converters.structure.floor import fit_floor
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import CATEGORIES
@@ -117,7 +116,7 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
 def propose(
     raw: RawScene,
     target: Path,
-    library_root: Path | None = None,
+    library: Mapping[str, CadModel] | None = None,
     report: Callable[[str, float], None] | None = None,
 ) -> Proposed:
     """Finds instances, with a library also their models, and writes both files into `target`.
@@ -125,11 +124,11 @@ def propose(
     Args:
         raw: the read source.
         target: folder, made if absent; on failure older files in it stay as they were.
-        library_root: folder that holds `cad/`; None: boxes only.
+        library: models to choose from, by id; None: boxes only.
         report: progress, (stage, share).
 
     Raises:
-        SceneRejected: no labelled furniture, or no library.
+        SceneRejected: no labelled furniture.
         FileError: the folder cannot be written.
     """
     say = report or (lambda stage, share: None)
@@ -139,9 +138,8 @@ def propose(
         raise SceneRejected(f"{raw.name}: no furniture label in the scan, expected NYU40 ids 5, 6, 7, 8, 14 or 39")
     retrieved: dict[int, Retrieval] = {}
     comparisons = []
-    if library_root is not None:
+    if library is not None:
         floor = floor_of(raw)
-        library = read_library(library_root)
         retrieved = auto_align(proposals, library, floor, lambda share: say("retrieve", 0.1 + 0.8 * share))
         for k, annotation in enumerate(raw.annotations):
             at = _nearest_proposal(raw, proposals, k)

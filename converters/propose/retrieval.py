@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -18,12 +19,16 @@ from scipy.spatial import KDTree
 
 from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
 from converters.bodies.placement import PoseDifference, pose_difference, upright
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.library.store import read_index, read_shape
 from converters.propose.pieces import SIZES_M
 from converters.propose.proposals import Proposal, bounds, box_iou
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder
+from converters.read.obj import texels
 from converters.records.errors import SceneRejected
 from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel
+from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
 N_YAWS = 24
@@ -60,12 +65,38 @@ class Retrieval:
     """(cad_id, cost in m) of every model tried, best first."""
 
 
-def read_library(root: Path) -> dict[str, CadModel]:
+def _packaged() -> dict[str, CadModel]:
+    """The packaged furniture of classes that are looked for, by id."""
+    library = {}
+    for name, model in read_index().items():
+        if model.category not in SIZES_M:
+            continue
+        visual, hulls = (shape := read_shape(name)).visual, shape.hulls
+        corner_uv = visual.uv[visual.uv_faces]
+        turned = visual.vertices @ Y_UP_TO_Z_UP.T
+        library[re.sub("[^A-Za-z0-9_-]", "_", name)] = CadModel(
+            model.category,
+            re.sub("[^A-Za-z0-9_-]", "_", name),
+            turned,
+            visual.faces,
+            texels(visual.image, corner_uv.mean(axis=1)),
+            tuple((hull.vertices @ Y_UP_TO_Z_UP.T, hull.faces) for hull in hulls),
+            surface=TexturedMesh(turned, visual.faces, corner_uv, visual.image),
+        )
+    return library
+
+
+def read_library(root: Path | None) -> dict[str, CadModel]:
     """Every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
+
+    Args:
+        root: folder that holds `cad/`; None: the packaged furniture.
 
     Raises:
         SceneRejected: no model there, or a damaged one.
     """
+    if root is None:
+        return _packaged()
     source = SourceFolder(root)
     found = sorted((root / "cad").glob("*/*/models/model_normalized.obj"))
     library = {}

@@ -45,8 +45,8 @@ def test_a_sheet_holds_whole_categories_and_single_models(tmp_path, capsys):
     assert model_sheet(tmp_path / "sheet.png", ["shoe_rack", "fridge_american"]) == 5
     with Image.open(tmp_path / "sheet.png") as image:
         assert image.size == (5 * PIXELS, PIXELS + LABEL_PIXELS)
-    assert main(["models", "drying_rack", "-o", str(tmp_path / "racks.png")]) == 0
-    assert "racks.png: picture of 2 models" in capsys.readouterr().out.replace("\n", "")
+    assert main(["models", "cart", "-o", str(tmp_path / "carts.png")]) == 0
+    assert "carts.png: picture of 4 models" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_a_wrong_name_is_one_line_and_nothing_is_written(tmp_path, capsys):

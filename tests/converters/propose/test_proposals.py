@@ -254,3 +254,17 @@ def test_propose_refuses_a_scan_without_furniture_labels(gibson_raw, tmp_path, c
     assert main(["propose", str(gibson_raw), "-o", str(tmp_path / "p")]) == 2
     assert "no furniture label" in capsys.readouterr().err
     assert not (tmp_path / "p").exists()
+
+
+def test_a_library_chair_is_found_again_among_the_packaged_ones():
+    library = read_library(None)
+    assert {cad.category for cad in library.values()} >= {"chair", "table", "sofa", "desk"}
+    chairs = {k: c for k, c in library.items() if c.category == "chair"}
+    few = dict(sorted(chairs.items())[:5]) | {"Scopia_chair": chairs["Scopia_chair"]}
+    true = few["Scopia_chair"]
+    assert true.pieces is not None and true.surface is not None
+    mesh = trimesh.Trimesh(true.vertices, true.faces, process=False)
+    mesh.apply_translation([2.0, 1.0, 0.0])
+    (proposal,) = propose_instances(scan_of((mesh.subdivide(), 5)))
+    found = retrieve(proposal, few, 0.0)
+    assert found is not None and found.cad.cad_id == "Scopia_chair" and found.residual_m < 0.02
