@@ -34,7 +34,7 @@ from converters.read.storeys import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.gate import Gate
-from converters.records.raw import CATEGORY_LABELS, RawScene
+from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene
 from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
 from converters.structure.floor import LIFT_M, level_floor
@@ -44,7 +44,7 @@ from converters.write.drawn import Drawn, as_it_is, draw_objects
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest, scene_objects
 from converters.write.texture import bake_structure, colour_cloud
-from interactive_nav_common.files import check_name, part_folder, publish
+from interactive_nav_common.files import check_name, part_folder, publish, write_text
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
 PARALLEL_OBJECTS = 8
@@ -286,6 +286,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=visuals)
         write_scene(parts, folder)
         save_maps(maps, folder)
+        if raw.attribution:
+            write_text(folder / ATTRIBUTION, raw.attribution)
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows))

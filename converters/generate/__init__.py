@@ -21,7 +21,9 @@ from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
 from converters.generate.surface.write import LICENCE, write_cad, write_json, write_png, write_scan
-from interactive_nav_common.files import part_folder, publish
+from converters.library.store import attribution, read_index
+from converters.records.raw import ATTRIBUTION
+from interactive_nav_common.files import part_folder, publish, write_text
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
@@ -168,4 +170,9 @@ def _write(
     if building.uses:
         about |= {"rooms": list(building.uses), "measured": building.measured}
     write_json(folder / "generator.json", about)
-    (folder / "LICENCE").write_text(LICENCE, encoding="ascii")
+    names = {item.model.name for item in (*items, *building.plan.built_in)}
+    used = [model for name, model in read_index().items() if name in names]
+    if used:
+        write_text(folder / ATTRIBUTION, attribution(used))
+    of_others = f"Of others, under their licences: the furniture that {ATTRIBUTION} lists.\n\n" if used else ""
+    (folder / "LICENCE").write_text(of_others + LICENCE, encoding="ascii")

@@ -18,7 +18,7 @@ from converters.read.obj import GREY, TexturedMesh, read_scan_obj
 from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_upright, with_own_corners
 from converters.records.errors import SceneRejected
-from converters.records.raw import FLOOR, GivenMap, RawScene, ScanMesh, Storey
+from converters.records.raw import ATTRIBUTION, FLOOR, GivenMap, RawScene, ScanMesh, Storey
 
 MESH = "mesh_z_up.obj"
 LABELS = "mesh_z_up.labels.npz"
@@ -88,6 +88,7 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
     floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
     maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
     licence = read_licence(source)
+    attribution = source.use(ATTRIBUTION, "").read_text(encoding="utf-8") if source.has(ATTRIBUTION) else ""
     return RawScene(
         name=source.root.resolve().name,
         source_format=layout,
@@ -102,6 +103,7 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
         sources=dict(sorted(source.sha256.items())),
         storeys=tuple(Storey(h, m) for h, m in zip(heights, maps, strict=True)) if len(heights) > 1 else (),
         warnings=tuple(source.warnings),
+        attribution=attribution,
     )
 
 

@@ -15,6 +15,8 @@ from converters.records.cache import NOT_HASHED
 from converters.records.visual import TexturedMesh
 from scenes_mjcf.categories import TABLE
 
+ATTRIBUTION = "ATTRIBUTION.md"
+"""Whose models a source, and the scene made of it, has."""
 SYNSETS = {category.synset: category.name for category in TABLE if category.synset}
 """ShapeNet synset -> category."""
 
@@ -143,3 +145,5 @@ class RawScene:
     """Vertices (n, 3) and faces (m, 3) of the parts that a modelled structure is drawn with, in place of the scan."""
     warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """What the reader repaired or found missing, for scene.json."""
+    attribution: str = dataclasses.field(default="", metadata=NOT_HASHED)
+    """Whose the models are, for a file beside it; empty: there is none."""

@@ -154,6 +154,40 @@ def plant_cactus(height=0.95) -> list[Part]:
     return parts
 
 
+def lamp_shade(height=1.55, foot=0.17, metal="black", shade="lampshade", top=0.11, low=0.16) -> list[Part]:
+    parts = turned((0, 0, 0), [(foot, 0), (foot, 0.035), (0.5 * foot, 0.055)], metal, 18)
+    parts.append(pillar((0, 0.05, 0), height - 0.28, 0.013, metal, 8))
+    return [
+        *parts,
+        pillar((0, height - 0.22, 0), 0.22, (low, top), shade, 18),
+        bar((0.05, height - 0.3, 0), (0.05, height - 0.22, 0), 0.004, metal, 4),
+    ]
+
+
+def lamp_tripod(height=1.5, wood="oak", shade="white") -> list[Part]:
+    """Its legs carry a tray, which keeps their hulls apart and its weight low."""
+    parts = [
+        pillar((0, height - 0.27, 0), 0.22, (0.16, 0.13), shade, 18),
+        pillar((0, height - 0.4, 0), 0.14, 0.03, "black", 10),
+    ]
+    for a in (math.pi / 2, math.pi * 7 / 6, math.pi * 11 / 6):
+        c, s = math.cos(a), math.sin(a)
+        parts += [bar((0.32 * c, 0, 0.32 * s), (0.02 * c, height - 0.36, 0.02 * s), (0.032, 0.022), wood, 8)]
+        parts += [pillar((0.32 * c, 0, 0.32 * s), 0.05, 0.045, wood, 10)]
+    return [*parts, pillar((0, 0.42, 0), 0.03, 0.25, wood, 18)]
+
+
+def lamp_uplighter(height=1.75, foot=0.15, metal="steel", shade="ceramic") -> list[Part]:
+    parts = turned((0, 0, 0), [(foot, 0), (foot, 0.05), (0.03, 0.07)], metal, 18)
+    parts.append(pillar((0, 0.06, 0), height - 0.14, 0.014, metal, 8))
+    parts += turned((0, height - 0.1, 0), [(0.03, 0), (0.14, 0.08), (0.16, 0.1)], shade, 18)
+    parts += [
+        bar((0.01, 1.15, 0), (0.16, 1.25, 0.1), 0.008, metal, 6),
+        bar((0.15, 1.27, 0.09), (0.2, 1.2, 0.13), (0.02, 0.05), shade, 10),
+    ]
+    return parts
+
+
 def lamp_arc(height=1.7, reach=0.45, metal="chrome", stone="marble") -> list[Part]:
     """Bends over from a heavy foot."""
     parts = [
@@ -208,6 +242,9 @@ DRAWINGS = {
     "suitcase_vintage": Drawing("suitcase", suitcase_vintage),
     "plant_monstera": Drawing("plant", plant_monstera, held_out=True),
     "plant_cactus": Drawing("plant", plant_cactus, held_out=True),
+    "floor_lamp_shade": Drawing("floor_lamp", lamp_shade, "__SYM_ROTATE_UP_INF"),
+    "floor_lamp_tripod": Drawing("floor_lamp", lamp_tripod),
+    "floor_lamp_uplighter": Drawing("floor_lamp", lamp_uplighter),
     "floor_lamp_arc": Drawing("floor_lamp", lamp_arc, held_out=True),
     "floor_lamp_column": Drawing("floor_lamp", lamp_column, "__SYM_ROTATE_UP_4", held_out=True),
     "pouf_beanbag": Drawing("pouf", pouf_beanbag, held_out=True),

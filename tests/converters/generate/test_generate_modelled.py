@@ -7,7 +7,6 @@ import functools
 import io
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from converters.generate import GENERATOR_VERSION, Building, GenerationError, de
 from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan, Rect
 from converters.generate.homes.config import HomeConfig, home_config
-from converters.generate.models.cad import CadModel
 from converters.generate.surface.annotate import annotate_items
 from converters.generate.surface.charts import assemble, polygon
 from converters.generate.surface.light import space_of
@@ -32,6 +30,7 @@ from converters.read.gibson import read_gibson
 from converters.recipes import building_of
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, WALL, WINDOW, RawScene
+from converters.records.visual import VisualMesh
 from scenes_mjcf.categories import CATEGORIES
 
 SEED = 5
@@ -137,7 +136,8 @@ def test_labels_are_of_structure_and_built_in_furniture_and_nothing_movable_is_d
     assert any(CATEGORIES[i.model.category].is_object for i in home().items) and (scan.owner == -1).all()
     # What stands on the floor is in its place.
     for item in home().plan.built_in:
-        placed = item.to_floor(np.concatenate([p.vertices for p in item.model.parts]))
+        shape = item.model.surface
+        placed = item.to_floor(shape.vertices if shape else np.concatenate([p.vertices for p in item.model.parts]))
         own = scan.vertices[scan.labels == NYU40[item.model.category]]
         assert min(np.linalg.norm(own - placed[0], axis=1)) < 1e-6
 
@@ -224,11 +224,6 @@ def test_the_same_seed_paints_the_same_bytes():
     assert (again[1].uv == made()[1].uv).all()
 
 
-@dataclasses.dataclass(frozen=True)
-class Shaped(CadModel):
-    shape: object = None
-
-
 def test_a_built_in_models_own_picture_is_drawn_once_for_all_that_have_it():
     plain_model = home().plan.built_in[0].model
     image = np.zeros((256, 256, 3), np.uint8)
@@ -236,9 +231,7 @@ def test_a_built_in_models_own_picture_is_drawn_once_for_all_that_have_it():
     corners = np.array([[-0.2, -0.1, 0.1], [0.2, -0.1, 0.1], [0.2, 0.1, 0.1], [-0.2, 0.1, 0.1]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
-    visual = SimpleNamespace(vertices=corners, faces=faces, uv=uv, uv_faces=faces, image=image)
-    fields = {f.name: getattr(plain_model, f.name) for f in dataclasses.fields(CadModel)}
-    model = Shaped(**fields, shape=SimpleNamespace(visual=visual))
+    model = dataclasses.replace(plain_model, surface=VisualMesh(corners, faces, uv, faces, image))
     built = tuple(Instance(model, np.ones(3), 0.0, np.array([x, 0.0, 0.5])) for x in (0.0, 1.0))
     plan = dataclasses.replace(home().plan, built_in=built)
     scan, atlas = model_building(plan, home().items, home().uses, np.random.default_rng(0))
