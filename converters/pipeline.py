@@ -47,6 +47,8 @@ from converters.write.texture import bake_structure, colour_cloud
 from interactive_nav_common.files import check_name, part_folder, publish, write_text
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
+MODELLED = 10**6, 4096
+"""Faces, and pixels a side, up to which a structure without furniture is drawn as it is: somebody modelled it."""
 PARALLEL_OBJECTS = 8
 """From so many objects on, starting processes for their textures pays."""
 
@@ -142,7 +144,8 @@ def _structure_visual(
     # As the levelled floor of a scan: above the plane that collides. A generated structure brings that with it.
     lift = np.array([0.0, 0.0, LIFT_M if raw.scan.furnished else 0.0])
     own = TexturedMesh(vertices_w + lift, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
-    small = as_it_is(own, config.structure_faces, config.structure_texture)
+    most = (config.structure_faces, config.structure_texture) if raw.scan.furnished else MODELLED
+    small = as_it_is(own, *most)
     if small is not None and keep.all() and not raw.picture:
         return small
     kept = np.flatnonzero(keep)

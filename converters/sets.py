@@ -30,7 +30,7 @@ RECIPES = "recipes.yaml"
 SEEDS = 100_000
 """First seed of a set where none is given; scenes that are committed have smaller ones."""
 TEST_SHARE = 0.2
-CONVERSION = {"structure_faces": 40000, "object_faces": 3000, "structure_texture": 2048, "object_texture": 256}
+CONVERSION = {"structure_faces": 16000, "object_faces": 3000, "structure_texture": 1024, "object_texture": 256}
 """How large meshes and textures are."""
 
 
