@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 from converters.geometry.simplify import loose_parts, simplify_within, surface_distance
-from converters.library.build import MOST_FACES, SELECTION, as_catalogued, make_model, read_selection
+from converters.library.build import MOST_FACES, SELECTION, as_catalogued, make_model, on_top, read_selection
 from converters.library.catalogue import Piece, read_catalogue
 from converters.library.store import ATTRIBUTION, PACKED, attribution, read_index, read_shape, write_library
 from converters.read.obj import TexturedMesh
@@ -26,17 +27,19 @@ def test_the_selection_is_what_is_packaged():
     chosen = yaml.safe_load(SELECTION.read_text())
     listed = {(key, c, split) for c, of in chosen.items() for split, keys in of.items() for key in keys}
     assert listed == {(m.name, m.category, m.split) for m in INDEX.values()} and len(INDEX) >= 150
-    assert {m.category for m in INDEX.values()} <= set(CATEGORIES) and len({m.category for m in INDEX.values()}) == 32
+    assert {m.category for m in INDEX.values()} <= set(CATEGORIES) and len({m.category for m in INDEX.values()}) == 34
     counts = Counter(m.category for m in INDEX.values())
-    assert min(counts[c] for c in ("chair", "table", "sofa", "bed", "desk", "armchair")) >= 4
+    assert min(counts[c] for c in ("chair", "table", "sofa", "desk", "armchair", "stool", "counter")) >= 4
     assert PACKED.stat().st_size < 8 * 2**20
 
 
 def test_no_creator_is_in_both_splits_and_all_are_credited():
-    by_split = {split: {m.credit.creator for m in INDEX.values() if m.split == split} for split in ("train", "test")}
+    credits = [(m.split, credit) for m in INDEX.values() for credit in m.credits]
+    by_split = {split: {c.creator for of, c in credits if of == split} for split in ("train", "test")}
     assert by_split["train"].isdisjoint(by_split["test"])
-    assert {m.credit.licence for m in INDEX.values()} == {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
-    assert all(m.credit.creator and m.credit.title for m in INDEX.values() if m.credit.licence != "CC0 1.0")
+    assert {c.licence for _, c in credits} == {"CC0 1.0", "CC BY 3.0", "CC BY 3.0 US"}
+    assert all(c.creator and c.title for _, c in credits if c.licence != "CC0 1.0")
+    assert all("+".join(c.source for c in m.credits) == m.name for m in INDEX.values())
     assert ATTRIBUTION.read_text() == attribution(list(INDEX.values()))
 
 
@@ -74,8 +77,6 @@ def test_packing_twice_gives_the_same_bytes_and_a_damaged_archive_is_one_line(tm
 
 def box_of_boxes() -> tuple[np.ndarray, np.ndarray]:
     """A finely cut ball of 0.4 m, and beside it a rod of 6 mm that a count alone would take away."""
-    import trimesh
-
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.4)
     rod = trimesh.creation.cylinder(radius=0.003, height=1.0, sections=48)
     whole = trimesh.util.concatenate([ball, rod.apply_translation([0.8, 0, 0])])
@@ -109,9 +110,21 @@ def test_a_model_is_made_from_a_catalogue(tmp_path, hull_cache):
     selection.write_text("chair: {train: [Small/chair]}")
     (chosen,) = read_selection([catalogue], selection)
     model, shape = make_model(chosen, hull_cache)
-    assert model.category == "chair" and model.size_m == (0.5, 0.9, 0.605) and model.credit.licence == "CC0 1.0"
+    assert model.category == "chair" and model.size_m == (0.5, 0.9, 0.605) and model.credits[0].licence == "CC0 1.0"
     points = np.vstack([hull.vertices for hull in shape.hulls])
     assert abs(points[:, 1].min()) < 0.05 and model.hulls == len(shape.hulls) >= 1
+
+
+def test_what_stands_on_a_model_is_part_of_it():
+    table = trimesh.creation.box((1.0, 0.7, 0.6), trimesh.transformations.translation_matrix([0, 0.35, 0]))
+    lamp = trimesh.creation.box((0.2, 0.4, 0.2), trimesh.transformations.translation_matrix([0, 0.2, 0]))
+    both = on_top(*(TexturedMesh(np.asarray(m.vertices), np.asarray(m.faces), None, None) for m in (table, lamp)))
+    rider = both.vertices[8:]
+    # On the top, 3 cm before the table's back edge.
+    np.testing.assert_allclose([rider.min(axis=0), rider.max(axis=0)], [[-0.1, 0.7, -0.27], [0.1, 1.1, -0.07]])
+    assert len(both.faces) == 24
+    composed = [m for m in INDEX.values() if "+" in m.name]
+    assert len(composed) >= 10 and all(len(m.credits) == 2 for m in composed)
 
 
 @pytest.mark.parametrize(

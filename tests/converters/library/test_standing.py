@@ -1,0 +1,60 @@
+"""Every packaged model that moves stands where it is put, on its hulls and on its boxes, in whatever proportions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from converters.bodies.alignment import Alignment
+from converters.bodies.objects import place_object
+from converters.bodies.physical import physical_properties
+from converters.check.gates import LIMITS, collide_with, physical_values
+from converters.check.settle import settle
+from converters.generate.models.cad import cad_model
+from converters.geometry.boxes import Hull
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.library.store import read_index
+from converters.records.raw import Annotation, CadModel
+from converters.write.emit import SceneParts, build_spec
+from scenes_mjcf.categories import CATEGORIES
+
+MOVABLE = sorted(n for n, m in read_index().items() if CATEGORIES[m.category].is_object)
+SCALES = (np.array([1.07, 0.95, 1.02]), np.array([0.94, 1.05, 0.97]))
+
+
+def turned_and_tilted(name: str, scale: np.ndarray) -> None:
+    """Checks that a model at rest stays so for the gates' five seconds."""
+    model = cad_model(name)
+    pieces = tuple((p.vertices @ Y_UP_TO_Z_UP.T, p.faces) for p in model.parts)
+    vertices = np.vstack([v for v, _ in pieces])
+    none = np.zeros((0, 3))
+    cad = CadModel(model.category, "model", vertices, np.zeros((0, 3), int), np.zeros((0, 3), np.uint8), pieces)
+    annotation = Annotation(model.category, "model", np.eye(4), "__SYM_NONE", none, none)
+    pose = Alignment(scale * model.unit_m, np.zeros(3), 0.7, 0.0)
+    placed = place_object("it", annotation, cad, tuple(Hull(*p) for p in pieces), pose, 0.0, 0.0)
+    settled = settle(SceneParts("it", (placed,), (physical_properties(model.category, placed.hulls_b),), ())).parts
+    turn = settled.objects[0].quaternion_w
+    tilt_deg = math.degrees(math.acos(1 - 2 * float(turn[1] ** 2 + turn[2] ** 2)))
+    assert tilt_deg < 3.0, f"{name}: leans by {tilt_deg:.1f} degrees once it rests"
+    for shape in ("hull", "box"):
+        model_at_rest = collide_with(build_spec(settled), shape)
+        model_at_rest.opt.timestep = 0.005
+        for quantity, value in physical_values(model_at_rest).items():
+            kind = "hulls" if shape == "hull" else "boxes"
+            limit = LIMITS["finite" if quantity == "finite" else f"{quantity}_{kind}"]
+            assert limit.least is None or value >= limit.least, (name, shape, quantity, value)
+            assert limit.most is None or value <= limit.most, (name, shape, quantity, value)
+
+
+@pytest.mark.parametrize("name", MOVABLE[::12])
+def test_a_model_stands(name):
+    turned_and_tilted(name, SCALES[0])
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", MOVABLE)
+@pytest.mark.parametrize("scale", SCALES, ids=("wide", "tall"))
+def test_every_model_stands(name, scale):
+    turned_and_tilted(name, scale)
