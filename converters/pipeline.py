@@ -289,8 +289,6 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=visuals)
         write_scene(parts, folder)
         save_maps(maps, folder)
-        if raw.attribution:
-            write_text(folder / ATTRIBUTION, raw.attribution)
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows))
@@ -377,6 +375,8 @@ def _convert(
         done = []
         for scene, (folder, final) in zip(scenes, folders.items(), strict=True):
             result = convert_raw(scene, folder, config, clock, cache or cache_folder())
+            if scene.attribution:
+                write_text(folder / ATTRIBUTION, scene.attribution)
             done.append(dataclasses.replace(result, folder=final, stage_s=clock.seconds))
         publish(folders, config.overwrite)
     return tuple(done)
