@@ -68,32 +68,58 @@ class Shape:
     hulls: tuple[Hull, ...]
 
 
-def _packed(values: np.ndarray, low: np.ndarray, span: np.ndarray) -> np.ndarray:
+def _packed(values: np.ndarray, low: np.ndarray | float, span: np.ndarray | float) -> np.ndarray:
     return np.rint((values - low) / span * STEPS).astype(np.uint16)
 
 
-def _png(image: np.ndarray) -> bytes:
+def _webp(image: np.ndarray) -> bytes:
     buffer = io.BytesIO()
-    quantise(image, COLOURS).save(buffer, "PNG", optimize=True)
+    quantise(image, COLOURS).convert("RGB").save(buffer, "WEBP", lossless=True, method=6)
     return buffer.getvalue()
+
+
+def _planes(table: np.ndarray) -> np.ndarray:
+    """(2, columns, rows) bytes of the steps from row to row of a table (rows, columns): they pack to less."""
+    steps = np.diff(table.T, axis=1, prepend=np.uint16(0))
+    return np.stack([steps & 255, steps >> 8]).astype(np.uint8)
+
+
+def _table(planes: np.ndarray) -> np.ndarray:
+    steps = planes[0].astype(np.uint16) | planes[1].astype(np.uint16) << 8
+    return np.cumsum(steps, axis=1, dtype=np.uint16).T
+
+
+def _by_use(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the order in which faces name them, and of each corner how far it lies behind the next new point."""
+    flat = faces.ravel()
+    first = np.unique(flat, return_index=True)[1]
+    order = flat[np.sort(first)]
+    place = np.zeros(len(points), np.int64)
+    place[order] = np.arange(len(order))
+    new = np.isin(np.arange(len(flat)), first)
+    behind = (np.cumsum(new) - new) - place[flat]
+    return points[order], behind.astype(np.uint16).reshape(-1, 1)
+
+
+def _faces(behind: np.ndarray) -> np.ndarray:
+    flat = behind.ravel().astype(np.int64)
+    new = flat == 0
+    return ((np.cumsum(new) - new) - flat).reshape(-1, 3)
 
 
 def _arrays(shape: Shape) -> bytes:
     visual = shape.visual
     points = np.vstack([visual.vertices, *(hull.vertices for hull in shape.hulls)])
     low, span = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
-    arrays = {
-        "bounds": np.stack([low, span]),
-        "vertices": _packed(visual.vertices, low, span),
-        "faces": visual.faces.astype(np.uint16),
-        "uv": np.rint(np.clip(visual.uv, 0, 1) * STEPS).astype(np.uint16),
-        "uv_faces": visual.uv_faces.astype(np.uint16),
-        "hull_vertices": _packed(np.vstack([h.vertices for h in shape.hulls]), low, span),
-        "hull_faces": np.vstack([h.faces for h in shape.hulls]).astype(np.uint16),
-        "hull_counts": np.array([(len(h.vertices), len(h.faces)) for h in shape.hulls], np.uint16),
-    }
+    tables = (
+        *_by_use(_packed(visual.vertices, low, span), visual.faces),
+        *_by_use(_packed(np.clip(visual.uv, 0, 1), 0.0, 1.0), visual.uv_faces),
+        _packed(np.vstack([h.vertices for h in shape.hulls]), low, span),
+        np.vstack([h.faces for h in shape.hulls]).astype(np.uint16),
+        np.array([(len(h.vertices), len(h.faces)) for h in shape.hulls], np.uint16),
+    )
     buffer = io.BytesIO()
-    for array in arrays.values():
+    for array in (np.stack([low, span]), *map(_planes, tables)):
         np.lib.format.write_array(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
@@ -109,7 +135,7 @@ def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
         put("index.json", json.dumps(index, indent=1, sort_keys=True).encode())
         for model, shape in models:
             put(f"{model.name}.arrays", _arrays(shape))
-            put(f"{model.name}.png", _png(shape.visual.image))
+            put(f"{model.name}.webp", _webp(shape.visual.image))
 
 
 def attribution(models: Sequence[Model]) -> str:
@@ -166,10 +192,9 @@ def read_shape(name: str, path: Path = PACKED) -> Shape:
     """
     buffer = io.BytesIO(_member(path, f"{name}.arrays"))
     try:
-        bounds, vertices, faces, uv, uv_faces, hull_vertices, hull_faces, counts = (
-            np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8)
-        )
-        with Image.open(io.BytesIO(_member(path, f"{name}.png"))) as picture:
+        bounds, *planes = (np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8))
+        vertices, behind, uv, uv_behind, hull_vertices, hull_faces, counts = map(_table, planes)
+        with Image.open(io.BytesIO(_member(path, f"{name}.webp"))) as picture:
             image = np.asarray(picture.convert("RGB"))
     except (OSError, ValueError, EOFError) as error:
         raise FileError(f"{path}: {name} is damaged ({' '.join(str(error).split())}); install it again") from None
@@ -179,5 +204,5 @@ def read_shape(name: str, path: Path = PACKED) -> Shape:
 
     at = np.cumsum(counts.astype(int), axis=0)
     solid = np.split(metres(hull_vertices), at[:-1, 0]), np.split(hull_faces.astype(np.int64), at[:-1, 1])
-    visual = VisualMesh(metres(vertices), faces.astype(np.int64), uv / STEPS, uv_faces.astype(np.int64), image)
+    visual = VisualMesh(metres(vertices), _faces(behind), uv / STEPS, _faces(uv_behind), image)
     return Shape(visual, tuple(Hull(v, f) for v, f in zip(*solid, strict=True)))
