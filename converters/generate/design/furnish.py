@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -211,10 +212,13 @@ def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generat
     return None
 
 
-def _hang_leaves(state: _Room, count: int, cfg: BuildingConfig, rng: np.random.Generator) -> bool:
-    """Hangs leaves into doorways; False where fewer than `count` fit."""
+def _hang_leaves(
+    state: _Room, count: int, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = ()
+) -> bool:
+    """Hangs leaves into doorways, those of rooms `first` before others; False where fewer than `count` fit."""
     leaves = 0
-    for k in rng.permutation(len(state.plan.doorways)):
+    order = rng.permutation(len(state.plan.doorways))
+    for k in sorted(order, key=lambda k: not set(first) & set(state.plan.doorways[k].rooms)):
         if leaves == count:
             break
         if state.plan.doorways[k].width_m <= 1.1:
@@ -223,16 +227,22 @@ def _hang_leaves(state: _Room, count: int, cfg: BuildingConfig, rng: np.random.G
 
 
 def hang_doors(
-    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator
+    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = ()
 ) -> tuple[list[tuple[Instance, int]], list[shapely.Polygon]] | None:
-    """Hangs `cfg.n_doors` leaves, or as many of these as a plan has doorways for.
+    """Hangs as many leaves as a plan has doorways for, up to the higher number of `cfg.n_doors`.
+
+    Args:
+        plan: the floor plan.
+        cfg: leaves and how they hang.
+        rng: random stream.
+        first: rooms whose doorways get theirs before others.
 
     Returns:
         Each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.
     """
     state = _Room(plan, Effort())
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
-    if not _hang_leaves(state, int(rng.integers(low, high + 1)), cfg, rng) and len(state.placed) < low:
+    if not _hang_leaves(state, high, cfg, rng, first) and len(state.placed) < low:
         return None
     return list(zip(state.placed, state.room_of, strict=True)), state.kept_free[len(plan.doorways) :]
 

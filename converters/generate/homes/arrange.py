@@ -12,6 +12,7 @@ import functools
 import itertools
 import math
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import shapely
@@ -124,6 +125,17 @@ class Showroom:
         model, scale = self.draw(category, rng)
         return Piece(model, scale, 0.0, 0.0, 0.0)
 
+    def set_of(self, rng: np.random.Generator) -> Callable[[str], Piece]:
+        """As `piece`, but each category of one model and size, as a table's chairs are; of boxes no two."""
+        drawn: dict[str, Piece] = {}
+
+        def piece(category: str) -> Piece:
+            if category not in drawn or category == "box":
+                drawn[category] = self.piece(category, rng)
+            return drawn[category]
+
+        return piece
+
 
 def apart(a: Instance, b: Instance, gap_m: float = TOUCH_M) -> bool:
     """True where no part of one is nearer than a gap to a part of the other; a seat may be under a top."""
@@ -191,7 +203,12 @@ def _seats(host: Piece, count: int, at_wall: bool, rng: np.random.Generator) -> 
 
 
 def _satellites(
-    satellite: Satellite, count: int, host: Piece, row: list[Piece], show: Showroom, rng: np.random.Generator
+    satellite: Satellite,
+    count: int,
+    host: Piece,
+    row: list[Piece],
+    draw: Callable[[str], Piece],
+    rng: np.random.Generator,
 ) -> list[Piece]:
     """The satellites of one kind, in the frame of the group."""
 
@@ -202,7 +219,7 @@ def _satellites(
     sides = list(rng.permutation([1, -1]))
     seats = _seats(host, count, host.v > 0, rng) if satellite.relation == "around" else []
     for k in range(len(seats) or count):
-        piece, gap = show.piece(satellite.category, rng), float(rng.uniform(*satellite.gap_m))
+        piece, gap = draw(satellite.category), float(rng.uniform(*satellite.gap_m))
         width, _, depth = piece.size_m
         if satellite.relation == "beside":
             sign = float(sides[k % 2])
@@ -248,7 +265,8 @@ def arrange(name: str, show: Showroom, rng: np.random.Generator, fewer: int = 0)
     group = GROUPS.get(name) or Group(name, "anywhere", most=99)
     if not show.has(group.anchor):
         return None
-    anchor = show.piece(group.anchor, rng)
+    draw = show.set_of(rng)
+    anchor = draw(group.anchor)
     gap = 0.005 if anchor.built_in else float(rng.uniform(*WALL_GAP_M))
     turn = 0.0 if anchor.built_in else float(rng.normal(0, 0.012))
     turn = float(rng.uniform(-math.pi, math.pi)) if group.at == "anywhere" else turn
@@ -261,7 +279,7 @@ def arrange(name: str, show: Showroom, rng: np.random.Generator, fewer: int = 0)
         count = int(rng.integers(satellite.count[0], satellite.count[1] + 1))
         if not (hosts and count and show.has(satellite.category) and rng.random() < satellite.share):
             continue
-        made = _satellites(satellite, count, hosts[0], row, show, rng)
+        made = _satellites(satellite, count, hosts[0], row, draw, rng)
         made = [dataclasses.replace(p, needed=satellite.needed) for p in made]
         pieces += made
         row += made if satellite.relation == "next" else []

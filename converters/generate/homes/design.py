@@ -15,7 +15,7 @@ from converters.generate.homes.furnish import WIDE_M, Full, furnish_home
 from converters.generate.homes.passages import adjust
 from converters.generate.homes.rooms import home_plan
 
-MOST_PLANS = 5
+MOST_PLANS = 8
 """Plans furnished before giving up."""
 MOST_FULL, LARGE_M2 = 2, 150.0
 """Of these, plans into which less fits than asked for: one is enough where it is so large, for each takes its time."""

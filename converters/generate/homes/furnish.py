@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
 from converters.generate.design.config import GenerationError
 from converters.generate.design.furnish import hang_doors
 from converters.generate.design.plan import Plan, Rect
-from converters.generate.homes.arrange import Arrangement, Showroom, arrange, on_floor, stand
+from converters.generate.homes.arrange import Arrangement, Piece, Showroom, arrange, on_floor, stand
 from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
 from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
-from converters.generate.homes.groups import ALIKE, GROUPS, ROOM_SETS, RoomSet
+from converters.generate.homes.groups import GROUPS, MOST, PLENTY_M2, ROOM_SETS, RoomSet
 from converters.geometry.density import ROBOTS
 
 LOOKS = 8
@@ -23,8 +24,16 @@ REDRAWS = 3
 """Times that a group is drawn anew, with other models, before it is left out; rows get shorter too."""
 FEWEST = 4
 """Pieces that a row may do without."""
+MOST_BASES = 3
+"""Times that a plan's rooms are furnished until each has what it needs."""
+NEEDS_FROM = 0.2
+"""Share of the floor from which rooms have what they need; less may not suffice."""
+PRIVATE = ("bathroom", "bedroom", "office")
+"""Rooms that get their doors first."""
 MOST_ADDED = 500
 """Times that something is added to meet a share."""
+CLUTTER_SHARE = 0.1
+"""Of what is added: small things that lie about."""
 WIDE_M = max(disc.radius_m for disc in ROBOTS.values()) + 0.02
 """Disc that gets past what a room's use asks for; past what is added, the disc of the settings does."""
 
@@ -52,6 +61,25 @@ class Home:
     def count(self, group: str, room: int) -> int:
         """How many anchors of a group stand in a room."""
         return sum(s.group == group and s.room == room for s in self.floor.standing)
+
+    def takes(self, categories: Sequence[str], room: int) -> bool:
+        """True where these pieces more are not more of a kind than a room and a home have."""
+        larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)
+        for category, more in Counter(c for c in categories if c in MOST).items():
+            here = [s.room == room for s in self.floor.standing if s.item.model.category == category]
+            in_room, in_home = MOST[category]
+            if sum(here) + more > in_room or len(here) + more > in_home * larger:
+                return False
+        return True
+
+    def lacking(self) -> str:
+        """The first room without what it needs, and what that is; empty where there is none."""
+        for room, use in enumerate(self.uses):
+            have = {s.item.model.category for s in self.floor.standing if s.room == room}
+            without = [c for c in ROOM_SETS[use].needs if self.show.has(c) and c not in have]
+            if without:
+                return f"the {use} of {self.plan.rooms[room].area_m2:.1f} m2 has no place for: {', '.join(without)}"
+        return ""
 
 
 def _preference(
@@ -128,16 +156,30 @@ def _stand_group(
         floor.front[floor.cells(_on_floor(way.front, origin, side))] = True
 
 
+def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
+    """A group without the pieces that are too many of a kind; None where it needs one of them."""
+    kept: list[Piece] = []
+    for piece in arrangement.pieces:
+        if home.takes([p.model.category for p in (*kept, piece)], room):
+            kept.append(piece)
+        elif piece.needed:
+            return None
+    return dataclasses.replace(arrangement, pieces=tuple(kept))
+
+
 def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
     """Tries to stand a group in a room, with several models and shorter rows.
 
     Returns:
-        False where it does not fit, or is more than the share asked for.
+        False where it does not fit, or is more than the share asked for or than rooms have of a kind.
     """
+    if not home.takes([GROUPS[name].anchor if name in GROUPS else name], room):
+        return False
     rows = any(s.relation == "next" for s in GROUPS[name].satellites) if name in GROUPS else False
     most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
     for fewer in range(FEWEST + 1 if rows else REDRAWS if name in GROUPS else 1):
         arrangement = arrange(name, home.show, home.rng, fewer if rows else 0)
+        arrangement = arrangement and _few(home, arrangement, room)
         if arrangement is None:
             return False
         area_m2 = sum(p.size_m[0] * p.size_m[2] for p in arrangement.pieces)
@@ -193,8 +235,7 @@ def stand_clutter(home: Home) -> None:
 
 def clutter_category(home: Home, room: int) -> str | None:
     """A category of what lies about in a room; None where there are no models of any."""
-    here = Counter(s.item.model.category for s in home.floor.standing if s.room == room)
-    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c) and here[c] < ALIKE.get(c, 4)]
+    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c) and home.takes([c], room)]
     if not odds:
         return None
     weights = np.array([w for _, w in odds])
@@ -214,6 +255,7 @@ def grow(home: Home) -> None:
     """
     rng, cfg, floor = home.rng, home.cfg, home.floor
     tired: set[tuple[int, str]] = set()
+    radius_m = WIDE_M
     for _ in range(MOST_ADDED):
         if floor.share >= cfg.furniture_share - SHARE_TOLERANCE / 2:
             return
@@ -222,19 +264,22 @@ def grow(home: Home) -> None:
             chosen = _room_set(home, room)
             groups = [(g, w) for g, w in (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
                       if (room, g) not in tired and home.count(g, room) < GROUPS[g].most]  # fmt: skip
-            if not groups and (room, "clutter") in tired:
+            more_clutter = (room, "clutter") not in tired
+            if not groups and (radius_m == WIDE_M or not more_clutter):
                 continue
-            if not groups or (rng.random() < 0.3 and (room, "clutter") not in tired):
+            if not groups or (rng.random() < CLUTTER_SHARE and more_clutter):
                 if not any(_clutter(home, room) for _ in range(4)):
                     tired.add((room, "clutter"))
                 break
             weights = np.array([w for _, w in groups])
             name = groups[rng.choice(len(groups), p=weights / weights.sum())][0]
-            if not (try_group(home, name, room, WIDE_M) or try_group(home, name, room, home.narrow_m)):
+            if not try_group(home, name, room, radius_m):
                 tired.add((room, name))
             break
         else:
-            break
+            if radius_m < WIDE_M:
+                break
+            radius_m, tired = home.narrow_m, set()
     if abs(floor.share - cfg.furniture_share) > SHARE_TOLERANCE:
         fullest = min(range(len(home.uses)), key=lambda k: floor.room_share(k) / ROOM_SETS[home.uses[k]].appetite)
         without = ", ".join(sorted(name for room, name in tired if room == fullest)) or "anything"
@@ -258,16 +303,21 @@ def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Ge
         The home, its furniture on its floor.
 
     Raises:
-        GenerationError: too few doors hang, or the share is not met.
+        GenerationError: too few doors hang, a room lacks what it needs, or the share is not met.
     """
-    doors = hang_doors(plan, cfg.shell, rng)
-    if doors is None:
-        raise GenerationError(f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at")
-    leaves, sweeps = doors
-    home = Home(cfg, plan, uses, Floor(plan, sweeps), Showroom(cfg.shell.models, cfg.shell.scale_jitter), rng)
-    for leaf, room in leaves:
-        home.floor.add(leaf, room, "door")
-    stand_base(home)
-    stand_clutter(home)
-    grow(home)
-    return home
+    lacking = ""
+    for _ in range(MOST_BASES):
+        doors = hang_doors(plan, cfg.shell, rng, [k for k, use in enumerate(uses) if use in PRIVATE])
+        if doors is None:
+            raise GenerationError(f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at")
+        leaves, sweeps = doors
+        home = Home(cfg, plan, uses, Floor(plan, sweeps), Showroom(cfg.shell.models, cfg.shell.scale_jitter), rng)
+        for leaf, room in leaves:
+            home.floor.add(leaf, room, "door")
+        stand_base(home)
+        lacking = home.lacking() if cfg.furniture_share >= NEEDS_FROM else ""
+        if not lacking:
+            stand_clutter(home)
+            grow(home)
+            return home
+    raise GenerationError(f"{lacking}; ask for fewer rooms or more area")

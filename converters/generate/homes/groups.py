@@ -58,6 +58,8 @@ class RoomSet:
     """(category, weight) of what lies about."""
     appetite: float = 1.0
     """How much of its floor is covered, against the other rooms."""
+    needs: tuple[str, ...] = ()
+    """Categories without which it is no such room."""
 
 
 def _row(*categories: str) -> tuple[Satellite, ...]:
@@ -94,6 +96,10 @@ GROUPS: dict[str, Group] = {
     "dining table": Group("table", "free", (Satellite("chair", "around", (3, 6), (-0.16, 0.02), 15),)),
     "small table": Group("table", "wall", (Satellite("chair", "around", (2, 3), (-0.16, 0.02), 15),)),
     "kitchen row": Group("fridge", "corner", _row("counter", "sink", "counter", "stove", "counter"), 0.75),
+    "sink row": Group("sink", "wall", _row("counter", "stove", "counter"), 0.6),
+    "fridge": Group("fridge", "wall", (), 0.6),
+    "sink": Group("sink", "wall", (), 0.6),
+    "stove": Group("stove", "wall", (), 0.6),
     "counter": Group("counter", "wall", _row("counter"), 0.6, most=2),
     "counter alone": Group("counter", "wall", (), 0.6),
     # To work.
@@ -129,47 +135,53 @@ ROOM_SETS: dict[str, RoomSet] = {
         (("television", 1.0), ("bookcase", 0.8), ("sideboard", 0.6), ("reading corner", 0.5), ("plant", 0.8),
          ("lamp", 0.4), ("desk", 0.2)),
         (("sofa", 1.0), ("bookcase", 2.0), ("sideboard", 1.5), ("reading corner", 1.5), ("plant", 1.5), ("lamp", 1.0),
-         ("dresser", 0.7), ("small table", 0.7), ("desk", 0.5), ("stored boxes", 0.5)),
-        (("box", 1.0), ("bag", 1.0), ("pouf", 1.5), ("stool", 0.7), ("chair", 0.7), ("cart", 0.4), ("plant", 0.5),
-         ("laundry_basket", 0.3), ("suitcase", 0.3)),
+         ("dresser", 0.7), ("small table", 0.7), ("desk", 0.5), ("stored boxes", 0.5), ("chair aside", 0.7)),
+        (("box", 1.0), ("bag", 0.7), ("pouf", 1.5), ("stool", 0.5), ("cart", 0.4), ("plant", 0.5), ("suitcase", 0.2)),
+        needs=("sofa", "tv_bench"),
     ),
     "dining": RoomSet(
         (("dining table", 1.0), ("sideboard", 0.9), ("plant", 0.6), ("bookcase", 0.3)),
         (("sideboard", 1.5), ("bookcase", 1.5), ("plant", 1.5), ("chair aside", 1.5), ("dresser", 0.7),
          ("reading corner", 0.7), ("bench", 0.5)),
-        (("chair", 1.5), ("box", 0.7), ("bag", 1.0), ("cart", 1.0), ("stool", 0.7), ("plant", 0.4)),
+        (("box", 1.0), ("bag", 0.7), ("cart", 1.0), ("stool", 0.7), ("plant", 0.7)),
     ),
     "kitchen": RoomSet(
-        (("kitchen row", 1.0), ("counter", 0.6), ("small table", 0.8), ("waste", 0.9)),
+        (("kitchen row", 1.0), ("sink row", 1.0), ("fridge", 1.0), ("sink", 1.0), ("stove", 1.0), ("counter", 0.6),
+         ("small table", 0.8), ("waste", 0.9)),
         (("counter", 1.5), ("counter alone", 1.0), ("dining table", 1.0), ("small table", 1.0), ("shelf", 0.7),
          ("washer", 0.5), ("chair aside", 0.7), ("waste", 0.7), ("plant", 0.4)),
-        (("bin", 1.0), ("bag", 1.5), ("box", 1.0), ("stool", 1.5), ("chair", 1.0), ("cart", 1.0)),
+        (("bin", 1.0), ("bag", 1.0), ("box", 1.0), ("stool", 1.5), ("cart", 1.0)),
+        needs=("fridge", "sink", "stove"),
     ),
     "bedroom": RoomSet(
         (("bed", 1.0), ("wardrobe", 0.9), ("dresser", 0.7), ("desk", 0.4), ("laundry", 0.4), ("plant", 0.3)),
         (("wardrobe", 1.5), ("dresser", 1.5), ("desk", 1.0), ("bookcase", 1.2), ("second bed", 0.8),
          ("reading corner", 1.0), ("shelf", 0.4), ("laundry", 1.0), ("plant", 0.7), ("lamp", 0.7),
-         ("stored boxes", 0.7), ("bench", 0.4)),
-        (("laundry_basket", 1.0), ("box", 1.0), ("bag", 1.5), ("suitcase", 1.0), ("drying_rack", 0.7), ("chair", 0.8),
-         ("pouf", 0.8), ("stool", 0.5)),
+         ("stored boxes", 0.7), ("bench", 0.4), ("chair aside", 0.8)),
+        (("laundry_basket", 1.0), ("box", 1.0), ("bag", 1.0), ("suitcase", 1.0), ("drying_rack", 0.7), ("pouf", 0.8),
+         ("stool", 0.3)),
         1.15,
+        ("bed",),
     ),
     "bathroom": RoomSet(
-        (("tub", 0.6), ("shower", 0.5), ("toilet", 1.0), ("washbasin", 1.0), ("washer", 0.5), ("laundry", 0.5)),
+        (("toilet", 1.0), ("washbasin", 1.0), ("tub", 0.6), ("shower", 0.5), ("washer", 0.5), ("laundry", 0.5)),
         (("shower", 1.0), ("washer", 1.0), ("shelf", 1.0), ("laundry", 1.0), ("waste", 1.0), ("washbasin", 0.3)),
-        (("laundry_basket", 1.0), ("stool", 1.0), ("bin", 1.0), ("drying_rack", 0.5), ("bag", 0.3)),
+        (("laundry_basket", 1.0), ("stool", 1.0), ("bin", 1.0), ("drying_rack", 0.5)),
+        needs=("toilet", "washbasin"),
     ),
     "office": RoomSet(
         (("desk", 1.0), ("bookcase", 0.9), ("reading corner", 0.5), ("shelf", 0.3), ("waste", 0.5)),
         (("bookcase", 2.0), ("second desk", 1.2), ("sofa", 0.7), ("shelf", 1.0), ("dresser", 0.7),
-         ("stored boxes", 1.0), ("plant", 1.0), ("lamp", 0.7), ("reading corner", 0.7)),
-        (("box", 2.0), ("bag", 1.5), ("chair", 1.0), ("bin", 0.7), ("pouf", 0.5), ("cart", 0.4)),
+         ("stored boxes", 1.0), ("plant", 1.0), ("lamp", 0.7), ("reading corner", 0.7),
+         ("chair aside", 1.0)),
+        (("box", 2.0), ("bag", 1.0), ("bin", 0.7), ("pouf", 0.5), ("cart", 0.4)),
+        needs=("desk",),
     ),
     "hall": RoomSet(
         (("shoe rack", 0.9), ("bench", 0.3), ("dresser", 0.3), ("stored boxes", 0.3)),
         (("shoe rack", 1.5), ("sideboard", 0.6), ("plant", 1.0), ("stored boxes", 1.0), ("stored suitcase", 0.7),
          ("bookcase", 0.7), ("chair aside", 0.7)),
-        (("box", 1.5), ("bag", 1.5), ("suitcase", 0.7), ("cart", 0.4), ("stool", 0.7), ("shoe_rack", 0.5)),
+        (("box", 1.5), ("bag", 1.5), ("suitcase", 0.7), ("cart", 0.4), ("stool", 0.7)),
         0.45,
     ),
     "storage": RoomSet(
@@ -180,8 +192,15 @@ ROOM_SETS: dict[str, RoomSet] = {
     ),
 }  # fmt: skip
 """Use of a room -> what it has. A home without a dining room may have its table in the living room."""
-ALIKE = {"laundry_basket": 1, "drying_rack": 1, "bin": 1, "cart": 1, "shoe_rack": 1, "plant": 2, "chair": 3}
-"""Category -> most that lie about in one room; of others, four."""
+MOST: dict[str, tuple[int, int]] = {
+    "bag": (2, 4), "box": (4, 8), "bin": (2, 4), "cart": (1, 2), "drying_rack": (1, 1), "laundry_basket": (1, 3),
+    "plant": (3, 6), "pouf": (2, 3), "shoe_rack": (1, 2), "stool": (2, 3), "suitcase": (2, 3), "floor_lamp": (2, 4),
+    "chair": (8, 14), "armchair": (3, 5), "sofa": (2, 3), "coffee_table": (2, 3), "table": (2, 3), "tv_bench": (1, 2),
+    "fridge": (1, 1), "sink": (1, 1), "stove": (1, 1), "tub": (1, 2), "shower": (1, 2), "toilet": (1, 2),
+    "washbasin": (2, 3), "washer": (1, 2),
+}  # fmt: skip
+"""Category -> most in one room and in a home of `PLENTY_M2`; more in a larger one. Of others, as `Group.most` says."""
+PLENTY_M2 = 110.0
 
 LIGHT = frozenset(
     ("chair", "stool", "pouf", "box", "bag", "bin", "plant", "laundry_basket", "suitcase", "cart", "drying_rack")

@@ -105,7 +105,7 @@ class Passages:
             change: changes the home; False where it could not.
         """
         floor, cfg = self.home.floor, self.home.cfg
-        shares, standing, room_m = self.shares, floor.standing, self.room_m
+        shares, standing, room_m = self.shares, list(floor.standing), self.room_m
         if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
             self.room_m = self.room_after(standing)
             self.shares = self.measure(self.room_m)
@@ -216,6 +216,8 @@ def _narrow(home: Home, passages: Passages) -> None:
     def change() -> bool:
         if piece is not None:
             floor.remove(piece)
+        if not home.takes([model.category], room):
+            return False
         window, shadow = floor.raster([item.footprint.buffer(ROUND_M)])
         free = floor.inside[window] & (floor.covered[window] == 0) & ~floor.swept[window]
         if not (free | ~shadow).all():
@@ -243,7 +245,8 @@ def _clear(home: Home, passages: Passages) -> None:
         floor.remove(piece)
         if passages.miss(passages.measure(passages.room_after(standing))) >= passages.miss() - LEAST_GAIN:
             return False
-        any(settle(home, model.category, alone, room, home.narrow_m) for room in rooms)
+        takes = (room for room in rooms if home.takes([model.category], room))
+        any(settle(home, model.category, alone, room, home.narrow_m) for room in takes)
         return True
 
     passages.trial(change)
