@@ -63,7 +63,8 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
         label = NYU40[item.model.category]
         for part in item.model.parts:
             mesh = item.to_floor(part.vertices), part.faces
-            solids.append(solid_from_mesh(*mesh, label, part.material, owner))
+            solid = solid_from_mesh(*mesh, label, part.material, owner)
+            solids.append(dataclasses.replace(solid, item=item))
     return solids
 
 

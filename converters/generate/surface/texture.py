@@ -7,18 +7,25 @@ texel knows its place in the building, and a floor board runs on across chart bo
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
 from scipy import ndimage, sparse
+from scipy.spatial import cKDTree
 
+from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Room, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
+from converters.records.visual import TexturedMesh
+from converters.write.texture import textured_cloud
 
 PAD = 2
 """Texels between charts."""
+MODEL_SPACING_M = 0.01
+"""Between coloured points of a library model."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,6 +157,29 @@ def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.ra
     return light * (1 + 0.03 * smooth_noise(points, 0.8, rng))
 
 
+@functools.cache
+def _coloured(name: str) -> tuple[cKDTree, np.ndarray]:
+    """Points of a library model's surface, CAD frame, and the colour (n, 3) of each in 0..1."""
+    model = cad_model(name)
+    surface = model.surface
+    assert surface is not None
+    mesh = TexturedMesh(surface.vertices, surface.faces, surface.uv[surface.uv_faces], surface.image)
+    cloud = textured_cloud(mesh, MODEL_SPACING_M / model.unit_m)
+    return cKDTree(cloud.points), cloud.colours / 255
+
+
+def _paint_models(scan: Scan, solid: np.ndarray, points: np.ndarray, colour: np.ndarray) -> None:
+    """Gives points whose solid is of a library model the colour of the model's nearest point, in place."""
+    items = {id(s.item): s.item for s in scan.solids if s.item is not None and s.item.model.surface is not None}
+    of = np.array([id(s.item) for s in scan.solids])[solid]
+    order = np.argsort(of, kind="stable")
+    for key, item in items.items():
+        here = order[np.searchsorted(of[order], key) : np.searchsorted(of[order], key, "right")]
+        tree, colours = _coloured(item.model.name)
+        in_cad = (points[here] - item.matrix[:3, 3]) @ np.linalg.inv(item.matrix[:3, :3]).T
+        colour[here] = colours[tree.query(in_cad)[1]]
+
+
 def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray, ids: np.ndarray,
           normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
     """Colours of points on the scan.
@@ -194,6 +224,7 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
             weave = 1 + 0.05 * np.sin(90 * p[:, 0]) * np.sin(90 * p[:, 1] + 40 * p[:, 2])
             value = np.array(MATERIALS[name]) * weave[:, None]
         colour[here] = value
+    _paint_models(scan, solid, points, colour)
     lamp = np.column_stack([centres, np.full(len(rooms), 2.2)])[room]
     light = _light(points, normals[ids], lamp, rng)
     return np.clip(colour * light[:, None], 0, 1)

@@ -10,6 +10,8 @@ import dataclasses
 
 import numpy as np
 
+from converters.generate.design.instance import Instance
+
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
@@ -29,6 +31,8 @@ class Solid:
     """Key of the palette."""
     owner: int
     """Index of the movable it belongs to; -1: static structure."""
+    item: Instance | None = None
+    """What stands there, of which it is a part; None: floor or wall."""
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """(n, 3) -> (n,) signed distance, exact inside and beside faces, a lower bound off edges."""

@@ -8,6 +8,9 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from converters.generate.design.config import BuildingConfig
+from converters.generate.design.instance import place
+from converters.generate.design.plan import make_plan
 from converters.generate.models.cad import (
     HOME_TEST_MODELS,
     HOME_TRAIN_MODELS,
@@ -17,7 +20,8 @@ from converters.generate.models.cad import (
     cad_model,
 )
 from converters.generate.models.parts import MATERIALS, bar, box
-from converters.generate.surface.texture import pack_rows
+from converters.generate.surface.scan import Scan, building_solids
+from converters.generate.surface.texture import pack_rows, paint
 from converters.generate.surface.volume import Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
 from converters.generate.surface.write import write_cad
 from converters.geometry.rotations import Y_UP_TO_Z_UP
@@ -161,3 +165,28 @@ def test_packed_rectangles_do_not_overlap(sizes):
         assert x + w <= 64 and y + h <= used
         sheet[y : y + h, x : x + w] += 1
     assert sheet.max() == 1 and sheet.sum() == table.prod(axis=1).sum()
+
+
+def test_a_scan_shows_a_library_model_in_the_colours_of_its_texture():
+    name = next(n for n in HOME_TRAIN_MODELS if cad_model(n).surface is not None)
+    model = cad_model(name)
+    surface = model.surface
+    assert surface is not None
+    plan = make_plan(BuildingConfig(), np.random.default_rng(0))
+    item = place(model, model.unit_m * np.array([1.05, 0.95, 1.0]), np.array(plan.rooms[0].centre), 0.7)
+    solids = building_solids(plan, [item])
+    own = next(k for k, s in enumerate(solids) if s.item is item)
+    points = item.to_floor(surface.vertices[surface.faces].mean(axis=1))
+    faces = np.arange(3 * len(points)).reshape(-1, 3)
+    scan = Scan(item.to_floor(surface.vertices[surface.faces].reshape(-1, 3)), faces, np.zeros(faces.size, np.uint8),
+                np.full(faces.size, own), tuple(solids))  # fmt: skip
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    rooms = [(r.x0, r.y0, r.x1, r.y1) for r in plan.rooms]
+    got = paint(scan, rooms, (), points, np.arange(len(points)), up, np.random.default_rng(0))
+    uv = surface.uv[surface.uv_faces].mean(axis=1)
+    height, width = surface.image.shape[:2]
+    at = np.clip([(1 - uv[:, 1]) * height, uv[:, 0] * width], 0, [[height - 1], [width - 1]]).astype(int)
+    want = surface.image[at[0], at[1]] / 255
+    brightness = got.sum(axis=1) / np.maximum(want.sum(axis=1), 1e-3)
+    off = np.abs(got / np.maximum(brightness, 1e-3)[:, None] - want).max(axis=1)
+    assert np.median(off) < 0.03 and 0.6 < np.median(brightness) < 1.2
