@@ -39,27 +39,45 @@ def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
     return csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
 
 
+class Surface:
+    """A triangle mesh that distances are measured to."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """Vertices (n, 3) m and faces (m, 3)."""
+        self._mesh = vertices, faces
+        self._spacing_m = max(float(np.sqrt(2 * face_areas(vertices, faces).sum() / SPREAD)), 1e-4)
+        samples, self._face = sample_faces(vertices, faces, self._spacing_m)
+        self._tree = KDTree(samples)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """(n,) distance of points, m: to the nearest of the faces whose samples are nearest.
+
+        At most the samples' spacing too large, which is a share of the mesh's size.
+        """
+        vertices, faces = self._mesh
+        index = self._tree.query(points, k=min(NEAREST, self._tree.n))[1].reshape(len(points), -1)
+        corners = vertices[faces[self._face[index]]].reshape(-1, 3, 3)
+        near = trimesh.triangles.closest_point(corners, np.repeat(points, index.shape[1], axis=0))
+        return np.linalg.norm(near.reshape(*index.shape, 3) - points[:, None], axis=2).min(axis=1)
+
+    def farthest(self, points: np.ndarray, most_m: float = 0.0) -> float:
+        """Largest distance of points, m; exact where it is beyond `most_m`."""
+        # None is farther than its nearest sample, nor nearer by more than the spacing: which can be the farthest?
+        above = np.asarray(self._tree.query(points)[0])
+        if above.max() <= most_m:
+            return float(above.max())
+        points = points[above > max(most_m, float(above.max()) - self._spacing_m)]
+        about = self.distance(points)
+        beyond = np.argsort(-about)[:WORST]
+        if about[beyond[0]] <= most_m:
+            return float(about[beyond[0]])
+        mesh = trimesh.Trimesh(*self._mesh, process=False)
+        return float(trimesh.proximity.closest_point(mesh, points[beyond])[1].max())
+
+
 def surface_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n,) distance of points to a triangle mesh, m: to the nearest of the faces whose samples are nearest.
-
-    At most the samples' spacing too large, which is a share of the mesh's size.
-    """
-    area = float(face_areas(vertices, faces).sum())
-    samples, face = sample_faces(vertices, faces, max(np.sqrt(2 * area / SPREAD), 1e-4))
-    index = KDTree(samples).query(points, k=min(NEAREST, len(samples)))[1].reshape(len(points), -1)
-    corners = vertices[faces[face[index]]].reshape(-1, 3, 3)
-    near = trimesh.triangles.closest_point(corners, np.repeat(points, index.shape[1], axis=0))
-    return np.linalg.norm(near.reshape(*index.shape, 3) - points[:, None], axis=2).min(axis=1)
-
-
-def farthest(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, most_m: float = 0.0) -> float:
-    """Largest distance of points to a triangle mesh, m; exact where it is beyond `most_m`."""
-    about = surface_distance(points, vertices, faces)
-    beyond = np.argsort(-about)[:WORST]
-    if about[beyond[0]] <= most_m:
-        return float(about[beyond[0]])
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    return float(trimesh.proximity.closest_point(mesh, points[beyond])[1].max())
+    """`Surface.distance`, for one set of points."""
+    return Surface(vertices, faces).distance(points)
 
 
 def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: float) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +85,7 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
     area = float(face_areas(vertices, faces).sum())
     points = np.vstack([vertices, sample_faces(vertices, faces, max(np.sqrt(2 * area / SAMPLES), 1e-4))[0]])
     points = points[:: max(len(points) // (2 * SAMPLES), 1)]
-    best = vertices, faces
+    best, own = (vertices, faces), Surface(vertices, faces)
     low, high = 0, len(faces)
     while high - low > max(4, high // 12):
         target = (low + high) // 2
@@ -77,8 +95,8 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
         if (
             0 < reached < len(best[1])
             and face_areas(*tried).sum() >= least * area
-            and farthest(points, *tried, most_m) <= most_m
-            and farthest(tried[0], vertices, faces, most_m) <= most_m
+            and Surface(*tried).farthest(points, most_m) <= most_m
+            and own.farthest(tried[0], most_m) <= most_m
         ):
             best, high = tried, target
         else:
@@ -127,7 +145,7 @@ def surface_loss(
 ) -> tuple[float, float]:
     """Share of a mesh's area that a simplified one has, and the farthest that the mesh lies from it, m."""
     kept = face_areas(low_vertices, low_faces).sum() / face_areas(vertices, faces).sum()
-    return float(kept), farthest(sample_faces(vertices, faces, LOSS_M)[0], low_vertices, low_faces)
+    return float(kept), Surface(low_vertices, low_faces).farthest(sample_faces(vertices, faces, LOSS_M)[0])
 
 
 def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:

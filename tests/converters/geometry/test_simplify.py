@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
-from converters.geometry.simplify import simplify_open, surface_distance
+from converters.geometry.simplify import Surface, simplify_open
 
 
 def wall() -> tuple[np.ndarray, np.ndarray]:
@@ -25,9 +26,9 @@ def test_a_windows_rim_stays_where_it_was(most):
     low = simplify_open(vertices, faces, most)
     assert 0 < len(low[1]) <= 1.05 * most
     used = vertices[np.unique(faces)]
-    assert surface_distance(used, *low).max() < 0.012
+    assert Surface(*low).distance(used).max() < 0.012
     # Nothing reaches over the window: its area is what it was.
-    assert surface_distance(low[0], vertices, faces).max() < 0.012
+    assert Surface(vertices, faces).distance(low[0]).max() < 0.012
     a, b, c = low[0][low[1]].transpose(1, 0, 2)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(4 * 2.5 - 1.5 * 1.1, abs=0.05)
 
@@ -35,3 +36,15 @@ def test_a_windows_rim_stays_where_it_was(most):
 def test_few_faces_stay():
     vertices, faces = wall()
     assert len(simplify_open(vertices, faces, len(faces))[1]) == len(faces)
+
+
+def test_the_farthest_point_is_the_one_that_all_exact_distances_name():
+    ball = trimesh.creation.icosphere(2, 0.5)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    points = np.random.default_rng(3).uniform(-0.7, 0.7, (3000, 3))
+    exact = trimesh.proximity.closest_point(ball, points)[1]
+    surface = Surface(vertices, faces)
+    assert surface.farthest(points) == pytest.approx(exact.max(), abs=1e-12)
+    assert surface.farthest(points, 0.1) == pytest.approx(exact.max(), abs=1e-12)
+    assert exact.max() <= surface.farthest(points, 1.0) <= 1.0
+    assert surface.farthest(vertices, 0.01) <= 0.01
