@@ -49,6 +49,8 @@ from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_map
 
 MODELLED = 10**6, 4096
 """Faces, and pixels a side, up to which a structure without furniture is drawn as it is: somebody modelled it."""
+TURNED_M = 0.1
+"""`bake_structure`'s word for homes that are made of parts."""
 PARALLEL_OBJECTS = 8
 """From so many objects on, starting processes for their textures pays."""
 
@@ -154,7 +156,9 @@ def _structure_visual(
     if raw.picture:
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
         drawn = drawn + (vertices_w[0] - raw.scan.vertices[0]) + lift
-        return bake_structure(drawn, faces, cloud, config.structure_texture)
+        # A home's parts touch, back to back and on top of one another: each face takes colours that look as it does.
+        turned_m = TURNED_M if raw.scan.furnished else 0.0
+        return bake_structure(drawn, faces, cloud, config.structure_texture, turned_m)
     scan = simplify_open(level, raw.scan.faces[kept], config.structure_faces)
     patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
     both = joined_clouds(cloud, patch_cloud)

@@ -6,9 +6,11 @@ import dataclasses
 import math
 
 import numpy as np
+import shapely
 
 from converters.bodies.alignment import Alignment
 from converters.geometry.boxes import Hull, OrientedBox, convex_hull, fit_box
+from converters.geometry.pieces import MAX_PIECES
 from converters.records.raw import Annotation, CadModel
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
@@ -69,6 +71,28 @@ def flatten_feet(hull: Hull) -> Hull:
     return convex_hull(np.vstack([points, feet]))
 
 
+def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]:
+    """Adds a low hull for each foot that no hull has: voxels lose legs of open surfaces, and the object would tip.
+
+    Args:
+        hulls: body frame, flat at z = 0 where they stand.
+        vertices: (n, 3) of the model, body frame.
+    """
+    stands = [h.vertices[h.vertices[:, 2] < FOOT_M, :2] for h in hulls]
+    known = shapely.union_all([shapely.MultiPoint(p).convex_hull for p in stands if len(p)])
+    base = vertices[vertices[:, 2] < FOOT_M, :2]
+    lost = base[shapely.distance(shapely.points(base), known) > FOOT_M] if not known.is_empty else base[:0]
+    columns = (
+        shapely.get_parts(shapely.union_all(shapely.buffer(shapely.points(lost), 2 * FOOT_M))) if len(lost) else []
+    )
+    feet = []
+    for column in columns:
+        inside = vertices[shapely.contains_xy(column, *vertices[:, :2].T) & (vertices[:, 2] < 5 * FOOT_M)]
+        level = inside * [1.0, 1.0, 0.0]
+        feet.append(convex_hull(np.vstack([inside, level, level + [0.0, 0.0, FOOT_M]])))
+    return (*hulls, *feet) if len(hulls) + len(feet) <= MAX_PIECES else hulls
+
+
 def _door_hinge(annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray) -> BodyHinge:
     """The door's hinge in the body frame; without an articulation, one at the leaf's edge is assumed."""
     hinge = annotation.hinge
@@ -108,6 +132,8 @@ def place_object(
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     hulls = tuple(convex_hull(h.vertices * pose.scale - base) for h in hulls_cad)
     hulls = tuple(flatten_feet(h) for h in hulls)
+    if cad.pieces is None and annotation.category != "door":
+        hulls = with_feet(hulls, vertices - base)
     # Exact pieces have exact boxes; coacd's hulls are rough, and stored scenes have theirs along the walls.
     round_fill = 1.0 if cad.pieces is None else ROUND_FILL
     position = yaw_matrix(pose.yaw) @ base + pose.translation

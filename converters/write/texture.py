@@ -181,6 +181,7 @@ def bake_structure(
     faces: np.ndarray,
     cloud: ColourCloud,
     size: int,
+    turned_m: float = 0.0,
 ) -> VisualMesh:
     """The simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
 
@@ -189,10 +190,17 @@ def bake_structure(
         faces: (m, 3).
         cloud: coloured points of scan and patches.
         size: of the texture, pixels.
+        turned_m: how much farther a point counts for each unit between its normal and the surface's: both sides of a
+            thin wall keep their colours.
     """
     uv, uv_faces = unwrap(vertices, faces, size)
-    texel, point, _ = texel_surface(vertices, faces, uv, uv_faces, size)
-    distance, index = KDTree(cloud.points).query(point, k=min(3, len(cloud.points)))
+    texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    known, sought = cloud.points, point
+    if turned_m:
+        known = np.hstack([known, turned_m * cloud.normals])
+        sought = np.hstack([point, turned_m * _unit(np.cross(b - a, c - a))[face]])
+    distance, index = KDTree(known).query(sought, k=min(3, len(known)))
     distance, index = distance.reshape(len(point), -1), index.reshape(len(point), -1)
     weight = 1.0 / (distance + 0.002)
     colours = (cloud.colours[index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)

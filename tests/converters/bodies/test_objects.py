@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.bodies.objects import flatten_feet
+from converters.bodies.objects import flatten_feet, with_feet
 from converters.geometry.boxes import Hull, convex_hull, fit_box, upright_box
 
 
@@ -43,6 +43,17 @@ def test_feet_reach_the_floor_and_nothing_goes_below():
     )
     shelf = convex_hull(box_points((0.1, 0.1, 0.1), (0, 0, 0.5)))
     np.testing.assert_allclose(flatten_feet(shelf).vertices[:, 2].min(), 0.45)
+
+
+def test_a_leg_that_decomposition_lost_gets_a_foot():
+    legs = [box_points((0.04, 0.04, 0.5), (x, y, 0.25)) for x in (-0.2, 0.2) for y in (-0.2, 0.2)]
+    top = box_points((0.5, 0.5, 0.05), (0, 0, 0.525))
+    whole = tuple(convex_hull(p) for p in (top, *legs))
+    assert with_feet(whole, np.vstack([top, *legs])) == whole
+    *kept, foot = with_feet(whole[:-1], np.vstack([top, *legs]))
+    assert tuple(kept) == whole[:-1]
+    np.testing.assert_allclose(foot.vertices.min(axis=0), (0.18, 0.18, 0.0), atol=1e-9)
+    assert foot.vertices[:, 2].max() < 0.05
 
 
 def test_upright_box_of_a_turned_rectangle_is_exact():

@@ -118,6 +118,28 @@ def test_structure_takes_the_clouds_colours():
     assert (visual.image == 90).all()
 
 
+def test_both_sides_of_a_thin_wall_keep_their_colours():
+    """The cloud's points lie nearer to the other side here and there."""
+    square = trimesh.Trimesh(SQUARE, TRIANGLES, process=False)
+    front, back = cloud_over(square, (200, 0, 0)), cloud_over(square, (0, 0, 200))
+    both = ColourCloud(
+        np.vstack([front.points, back.points]),
+        np.vstack([front.normals, -back.normals]),
+        np.vstack([front.colours, back.colours]),
+    )
+    vertices = np.vstack([SQUARE, SQUARE])
+    faces = np.vstack([TRIANGLES, TRIANGLES[:, ::-1] + 4])
+    shares = []
+    for turned_m in (0.0, 0.1):
+        visual = bake_structure(vertices, faces, both, 64, turned_m)
+        texel, _, face = texel_surface(vertices, faces, visual.uv, visual.uv_faces, 64)
+        shown = visual.image.reshape(-1, 3)[texel]
+        shares.append(
+            float((np.abs(shown - np.where((face < 2)[:, None], (200, 0, 0), (0, 0, 200))) < 2).all(1).mean())
+        )
+    assert shares[0] < 0.9 and shares[1] == 1.0
+
+
 def test_quantised_colours_stay_close():
     ramp = np.tile(np.arange(256, dtype=np.uint8)[:, None, None], (1, 8, 3)) // np.array([1, 2, 4], np.uint8)
     back = np.asarray(quantise(ramp, 64).convert("RGB")).astype(int)
