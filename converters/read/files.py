@@ -15,6 +15,9 @@ from PIL import Image
 from converters.records.errors import SceneRejected
 from interactive_nav_common.records import Reader
 
+MOST_CORNERS = 200
+"""Of a polygon that is cut with care; larger ones are fans."""
+
 
 class SourceFolder:
     """A raw scene's folder; remembers the sha256 of every file that was read through it, and what was repaired."""
@@ -240,6 +243,8 @@ def read_obj(path: Path) -> ObjMesh:
     corner, face = _fans(np.array(sizes, np.int64))
     faces = index[corner] - 1
     check_mesh(path, vertices, faces)
+    if _unfold(vertices, index - 1, corner, face):
+        faces = index[corner] - 1
     corner_uv = None
     if len(uv) and uv_index is not None:
         if uv_index.min() < 1 or uv_index.max() > len(uv):
@@ -291,6 +296,55 @@ def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     step = np.arange(len(face)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
     start = first[face]
     return np.stack([start, start + step + 1, start + step + 2], axis=1).reshape(-1, 3), face
+
+
+def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> bool:
+    """Cuts polygons anew, in place, whose fans cover what they do not: door frames, rings and other hollow outlines.
+
+    Args:
+        vertices: (n, 3).
+        index: (c,) vertex of each corner.
+        corner: (m, 3) corners of each triangle; changed.
+        face: (m,) polygon of each, rising.
+
+    Returns:
+        Whether any was.
+    """
+    a, b, c = (vertices[index[corner[:, k]]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    whole = np.stack([np.bincount(face, normal[:, k]) for k in range(3)], axis=1)
+    size = np.linalg.norm(normal, axis=1) * np.linalg.norm(whole, axis=1)[face]
+    done = False
+    for polygon in np.unique(face[np.einsum("ij,ij->i", normal, whole[face]) < -1e-6 * np.maximum(size, 1e-30)]):
+        first, end = np.searchsorted(face, (polygon, polygon + 1))
+        start, count = corner[first, 0], end - first + 2
+        axis = int(np.abs(whole[polygon]).argmax())
+        flat = np.delete(vertices[index[start : start + count]], axis, axis=1)
+        flat = flat if (whole[polygon, axis] > 0) == (axis != 1) else flat[:, ::-1]
+        ears = _ears(flat) if count <= MOST_CORNERS else None
+        if ears is not None:
+            corner[first:end], done = start + ears, True
+    return done
+
+
+def _ears(outline: np.ndarray) -> np.ndarray | None:
+    """(n - 2, 3) triangles of a simple polygon (n, 2), counter-clockwise; None where it crosses itself."""
+    left, found = list(range(len(outline))), []
+    while len(left) > 2:
+        for k in range(len(left)):
+            triple = left[k - 1], left[k], left[(k + 1) % len(left)]
+            a, b, c = outline[list(triple)]
+            others = outline[[i for i in left if i not in triple]]
+            sides = [
+                (q - p)[0] * (others - p)[:, 1] - (q - p)[1] * (others - p)[:, 0] for p, q in ((a, b), (b, c), (c, a))
+            ]
+            if (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0] >= 0 and not (np.min(sides, axis=0) > 0).any():
+                found.append(triple)
+                del left[k]
+                break
+        else:
+            return None
+    return np.array(found)
 
 
 def read_textured_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

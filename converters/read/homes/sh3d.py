@@ -45,6 +45,7 @@ DOOR_M = (0.1, 1.5)
 STOREY_M = 1.8
 """Levels closer to one another are one storey."""
 LEAF_M = 0.04
+REBATE_M = 0.012
 TURN_MOST_RAD = math.radians(120)
 LOW_TABLE_M = 0.5
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
@@ -265,6 +266,7 @@ class _Drawing:
         for k, sash in enumerate(sashes, 1):
             faces = np.flatnonzero(leaf == k)
             own = _part_of(surface, faces) if len(faces) else _plain_leaf(e, sash, surface)
+            own = _beside(own, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
             made.append(
                 Part(f"{name} leaf {k}", pose, own, None, False, known_as="door", swing=_swing(e, sash, own.vertices))
             )
@@ -309,6 +311,18 @@ def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray
     at = np.array([side * (number(sash, "xAxis") - 0.5) * width, (0.5 - number(sash, "yAxis")) * depth])
     angles = -np.array([number(sash, key, 0.0) for key in ("startAngle", "endAngle")])
     return at, angles if side > 0 else math.pi - angles, number(sash, "width") * float(width)
+
+
+def _beside(leaf: TexturedMesh, hinge: np.ndarray, others: list[np.ndarray]) -> TexturedMesh:
+    """A leaf that ends short of the middle between its hinge and the next: the rebates of double doors overlap."""
+    gaps = [other - hinge for other in others]
+    gap = min(gaps, key=lambda g: float(g @ g), default=np.zeros(2))
+    length = float(np.linalg.norm(gap))
+    if length < 2 * REBATE_M:
+        return leaf
+    along = np.array([*gap / length, 0.0])
+    beyond = np.maximum((leaf.vertices - [*hinge, 0.0]) @ along - (length / 2 - REBATE_M), 0.0)
+    return dataclasses.replace(leaf, vertices=leaf.vertices - np.outer(beyond, along))
 
 
 def _swing(

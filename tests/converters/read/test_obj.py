@@ -26,6 +26,24 @@ def test_polygons_become_fans_whatever_the_index_style(tmp_path, face):
     assert mesh.corner_uv is None
 
 
+@pytest.mark.parametrize("plane", [(0, 1, 2), (2, 0, 1), (1, 2, 0), (1, 0, 2)])
+def test_a_door_frame_of_one_polygon_stays_open(tmp_path, plane):
+    """A fan around the first corner would cover the opening."""
+    outline = np.array([(0, 0), (1, 0), (1, 20), (9, 20), (9, 0), (10, 0), (10, 21), (0, 21)], float)
+    points = np.column_stack([outline, np.zeros(8)])[:, plane]
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in points) + "f 1 2 3 4 5 6 7 8\n"
+    mesh = read_obj(obj(tmp_path, text))
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a) / 2
+    assert len(mesh.faces) == 6 and np.linalg.norm(area, axis=1).sum() == pytest.approx(50)
+    assert np.abs(area.sum(axis=0)).max() == pytest.approx(50)  # all face one way
+
+
+def test_a_polygon_that_crosses_itself_is_a_fan(tmp_path):
+    text = "v 0 0 0\nv 3 0 0\nv 1 1 0\nv 3 2 0\nv 2 -1 0\nf 1 2 3 4 5\n"
+    assert read_obj(obj(tmp_path, text)).faces.shape == (3, 3)
+
+
 def test_faces_without_texture_coordinates_leave_the_others_theirs_and_edges_are_passed_over(tmp_path):
     (tmp_path / "m.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0.5 0.5\nvt 0.25 0.75\nf 1/2 2/2 3/2\nf 1//1 3//1 4//1\nf 1 2\n"

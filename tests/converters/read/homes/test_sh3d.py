@@ -207,6 +207,24 @@ def test_a_leaf_swings_about_its_sash(raw):
     assert np.ptp(placed(raw, "Door"), axis=0) == pytest.approx([0.04, 0.9, 1.99], abs=1e-3)
 
 
+def test_leaves_of_a_double_door_part_in_the_middle(tmp_path):
+    model = "".join(
+        f"g sweethome3d_opening_on_hinge_{k}\n{cuboid((low, 0, z), (high, 200, z + 4), first)}"
+        for k, low, high, z, first in ((1, -50, 3, 0, 0), (2, -3, 50, 2, 8))
+    )
+    sashes = "".join(
+        f"<sash xAxis='{x}' yAxis='0.5' width='0.5' startAngle='{a}' endAngle='{b}'/>"
+        for x, a, b in ((0, 0, -math.pi / 2), (1, math.pi, 3 * math.pi / 2))
+    )
+    double = piece("Double", 200, -5, "100 6 200", "model='5'", sashes, "doorOrWindow")
+    raw = read_sh3d(write_home(tmp_path, [*HOME[:5], double], {"5": model}))
+    leaves = [placed(raw, f"Double_1_leaf_{k}") for k in (1, 2)]
+    assert leaves[0][:, 0].min() == pytest.approx(1.5) and leaves[1][:, 0].max() == pytest.approx(2.5)
+    assert (leaves[0][:, 0].max(), leaves[1][:, 0].min()) == pytest.approx((1.988, 2.012))
+    spans = [a.hinge.range_rad for a in raw.annotations if a.hinge is not None]
+    assert spans == [pytest.approx((0, math.pi / 2), abs=0.1), pytest.approx((-math.pi / 2, 0), abs=0.1)]
+
+
 def test_colours_are_the_drawings(raw):
     def colours(name: str) -> set[tuple[int, ...]]:
         surface = next(c.surface for k, c in raw.cads.items() if k.startswith(name))
