@@ -241,10 +241,9 @@ def read_obj(path: Path) -> ObjMesh:
     except (ValueError, OverflowError) as error:
         raise SceneRejected(f"{path}: not readable as OBJ ({error}); the file is damaged, fetch it again") from error
     corner, face = _fans(np.array(sizes, np.int64))
+    check_mesh(path, vertices, index[corner] - 1)
+    _unfold(vertices, index - 1, corner, face)
     faces = index[corner] - 1
-    check_mesh(path, vertices, faces)
-    if _unfold(vertices, index - 1, corner, face):
-        faces = index[corner] - 1
     corner_uv = None
     if len(uv) and uv_index is not None:
         if uv_index.min() < 1 or uv_index.max() > len(uv):
@@ -298,7 +297,7 @@ def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([start, start + step + 1, start + step + 2], axis=1).reshape(-1, 3), face
 
 
-def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> bool:
+def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> None:
     """Cuts polygons anew, in place, whose fans cover what they do not: door frames, rings and other hollow outlines.
 
     Args:
@@ -306,15 +305,11 @@ def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: n
         index: (c,) vertex of each corner.
         corner: (m, 3) corners of each triangle; changed.
         face: (m,) polygon of each, rising.
-
-    Returns:
-        Whether any was.
     """
     a, b, c = (vertices[index[corner[:, k]]] for k in range(3))
     normal = np.cross(b - a, c - a)
     whole = np.stack([np.bincount(face, normal[:, k]) for k in range(3)], axis=1)
     size = np.linalg.norm(normal, axis=1) * np.linalg.norm(whole, axis=1)[face]
-    done = False
     for polygon in np.unique(face[np.einsum("ij,ij->i", normal, whole[face]) < -1e-6 * np.maximum(size, 1e-30)]):
         first, end = np.searchsorted(face, (polygon, polygon + 1))
         start, count = corner[first, 0], end - first + 2
@@ -323,8 +318,7 @@ def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: n
         flat = flat if (whole[polygon, axis] > 0) == (axis != 1) else flat[:, ::-1]
         ears = _ears(flat) if count <= MOST_CORNERS else None
         if ears is not None:
-            corner[first:end], done = start + ears, True
-    return done
+            corner[first:end] = start + ears
 
 
 def _ears(outline: np.ndarray) -> np.ndarray | None:
