@@ -1,7 +1,4 @@
-"""`python -m interactive_nav.robots`: the table of robots, and their pictures.
-
-    python -m interactive_nav.robots                                # the table
-    python -m interactive_nav.robots --render pictures/             # and one PNG per robot
+"""`python -m interactive_nav.robots`: the table of robots.
 
 Exit status: 0; 2 for a question that cannot be answered, with one line that says why.
 """
@@ -10,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -55,22 +51,10 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m interactive_nav.robots", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
-    parser.add_argument("--render", metavar="DIR", type=Path, help="write one PNG per robot")
     parser.add_argument("--robots", default="all", help="names, comma between them; default all")
     args = parser.parse_args(argv)
     console = Console(width=None if sys.stdout.isatty() else 220)
-    try:
-        names = _names(args.robots)
-        for name in names:
-            get_robot(name)
-        _print_table(names, console)
-        if args.render:
-            from interactive_nav.pictures.robot import save_pictures
-
-            for path in save_pictures(names, args.render):
-                console.print(f"wrote {path}")
-    except KeyboardInterrupt:
-        return 130
+    _print_table(_names(args.robots), console)
     return 0
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from docs.studies import rooms as rooms_study
 from interactive_nav.scenes.scene import load_scene
-from topological_nav import rooms as rooms_program
 from topological_nav.__main__ import main
 from topological_nav.commands import progress
 from topological_nav.learn.localise import nearest_node
@@ -173,7 +173,7 @@ def test_a_room_classifier_judges_no_passages(made, capsys, tmp_path):
 def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(rooms, "CLUSTERED", 120)
     out = tmp_path / "rooms.png"
-    assert rooms_program.main([str(made.scene), "-o", str(out)]) == 0
+    assert rooms_study.main([str(made.scene), "-o", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines] == ["kmeans", "gmm", "spectral"]
     assert Image.open(out).size[0] > 800

@@ -1,4 +1,4 @@
-"""`python -m topological_nav.rooms SCENE... -o rooms.png`: free positions in, rooms by three kinds of clustering out.
+"""Free positions in, rooms by three kinds of clustering out.
 
 Positions are clustered by their coordinates alone. Where a scene's plan is recorded (`plans.py`: the generated
 scenes), the rooms found are compared with it by the adjusted Rand index.
@@ -7,9 +7,6 @@ scenes), the rooms found are compared with it by the adjusted Rand index.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,13 +15,12 @@ from sklearn.metrics import adjusted_rand_score, silhouette_score
 from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
-from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig
 from topological_nav.errors import SpaceError
 from topological_nav.scenes.plans import RECORDED
-from topological_nav.scenes.space import FreeSpace, free_space
+from topological_nav.scenes.space import FreeSpace
 
 METHODS = ("kmeans", "gmm", "spectral")
 MAX_ROOMS = 15
@@ -153,37 +149,6 @@ def room_of(known: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
 def agreement(rooms: Rooms, known: np.ndarray) -> float:
     """Adjusted Rand index of the rooms found with the recorded ones: 1 the same, 0 as good as chance."""
     return float(adjusted_rand_score(room_of(known, rooms.points_w), rooms.labels))
-
-
-def compare(scene_folders: Sequence[Path], seed: int = 0, clearance_m: float = 0.2) -> list[dict[str, Any]]:
-    """Rooms by every method, with their number known and chosen, for some scenes.
-
-    Returns:
-        One row a scene, method and way to choose the number: scene, method, chosen_by, count, known (number of
-        recorded rooms or None), agreement (or None), rooms (`Rooms`), space (`FreeSpace`).
-    """
-    height_m = get_robot(DataConfig().robot).height_m
-    rows = []
-    for folder in scene_folders:
-        scene = load_scene(folder)
-        space, known = free_space(scene, height_m), recorded_rooms(scene.digest)
-        for method in METHODS:
-            for given in [known, None] if known is not None else [None]:
-                rooms = find_rooms(space, method, None, given, seed, clearance_m)
-                rows.append(
-                    {
-                        "scene": Path(folder).name,
-                        "method": method,
-                        "chosen_by": rooms.chosen_by,
-                        "count": rooms.count,
-                        "known": None if known is None else len(known),
-                        "agreement": None if known is None else agreement(rooms, known),
-                        "rooms": rooms,
-                        "space": space,
-                        "recorded": known,
-                    }
-                )
-    return rows
 
 
 def _mixture(points: np.ndarray, count: int, seed: int) -> GaussianMixture:

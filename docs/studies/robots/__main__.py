@@ -2,6 +2,7 @@
 
     python -m docs.studies.robots evidence --backend warp --robots all
     python -m docs.studies.robots figure docs/robots.png
+    python -m docs.studies.robots pictures pictures/                # one PNG per robot
 
 Exit status: 0; 1 if a check failed; 2 for a question that cannot be answered, with one line that says why.
 """
@@ -16,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from docs.studies.robots.evidence import EVIDENCE, Evidence, measure
-from interactive_nav.pictures.robot import picture
+from docs.studies.robots.pictures import picture, save_pictures
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav_common.errors import reports_errors
 
@@ -95,15 +96,23 @@ def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m docs.studies.robots", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
     commands = parser.add_subparsers(dest="command", required=True)
-    for command, text in (("evidence", "measure the robots and print the checks"), ("figure", "draw all of it")):
+    for command, text in (
+        ("evidence", "measure the robots and print the checks"),
+        ("figure", "draw all of it"),
+        ("pictures", "draw each robot alone"),
+    ):
         sub = commands.add_parser(command, help=text)
         sub.add_argument("--backend", default="native", choices=("native", "jax", "warp", "auto"))
         sub.add_argument("--robots", default="all", help="names, comma between them; default all")
-        if command == "figure":
-            sub.add_argument("out", type=Path, help="PNG to write")
+        if command != "evidence":
+            sub.add_argument("out", type=Path, help="PNG to write; pictures: folder of them")
     args = parser.parse_args(argv)
     console = Console(width=None if sys.stdout.isatty() else 220)
     names = robot_names() if args.robots == "all" else tuple(name.strip() for name in args.robots.split(","))
+    if args.command == "pictures":
+        for path in save_pictures(names, args.out):
+            console.print(f"wrote {path}")
+        return 0
     kinds = {name: get_robot(name).kind for name in names}
     if args.command == "evidence":
         return 0 if _print_evidence(names, args.backend, console) else 1

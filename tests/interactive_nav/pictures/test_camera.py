@@ -10,13 +10,12 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.pictures.camera import STREAMS, Camera
-from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTES, colours, normals
+from interactive_nav.pictures.shading import PALETTES
 from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav.sensing.rays import RayRenderer
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav_common.errors import UserError
@@ -110,22 +109,6 @@ def test_what_cannot_be_drawn_is_refused(scene_and_state):
     batch = types.SimpleNamespace(pipeline_state=types.SimpleNamespace(qpos=np.zeros((3, 9))), info=state.info)
     with pytest.raises(UserError, match=r"state is a batch of shape \(3,\), expected one environment"):
         camera.frame(batch)
-
-
-def test_normals_and_colours_of_boxes(world, boxes):
-    # Scene 0, from 0.5 m before the wall x = 2, looking at it: below the horizon the floor, above it the wall.
-    lens, scene = Lens(40, 40, 100.0), jnp.zeros(1, jnp.int32)
-    qpos = jnp.asarray(world.rest_qpos[:1], jnp.float32)
-    camera = look_along(jnp.asarray([[1.5, 1.2, 0.3]]), jnp.asarray([[1.0, 0.0, 0.0]]))
-    depth, index = jax.jit(RayRenderer(boxes, lens).trace_batch)(scene, qpos, camera)
-    normal = np.asarray(normals(boxes, scene, qpos, camera, lens, depth, index))[0]
-    # Floor where the ray falls by more than 0.3 m in 0.5 m: below -31 degrees.
-    np.testing.assert_allclose(normal[-1, 20], [0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(normal[20, 20], [-1, 0, 0], atol=1e-5)
-    rgb = np.asarray(colours(boxes, scene, camera, jnp.asarray(normal)[None], index))[0]
-    # The floor is lit fully by the sun (0.9 / |l| of 0.4) and not by the lamp.
-    sun = 0.9 / np.linalg.norm([0.35, 0.25, 0.9])
-    np.testing.assert_allclose(rgb[-1, 20], 255 * np.array(FLOOR_COLOUR) * (0.45 + 0.4 * sun), atol=1)
 
 
 @pytest.mark.slow

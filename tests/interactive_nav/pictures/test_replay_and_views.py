@@ -236,7 +236,6 @@ import matplotlib
 matplotlib.use("svg")
 from matplotlib import pyplot
 import interactive_nav.topdown
-import interactive_nav.pictures.robot
 print(matplotlib.get_backend(), pyplot.get_fignums())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from docs.studies.robots import evidence
+from docs.studies.robots.pictures import stage
 from interactive_nav import robots
-from interactive_nav.pictures.robot import stage
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 

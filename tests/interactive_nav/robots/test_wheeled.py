@@ -9,8 +9,8 @@ import pytest
 from docs.studies.robots import __main__ as study
 from docs.studies.robots import evidence
 from docs.studies.robots.hall import LOADS, box, hall
+from docs.studies.robots.pictures import picture, stage
 from interactive_nav.config import NavConfig
-from interactive_nav.pictures.robot import picture, stage
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav.robots.__main__ import main
 from interactive_nav.robots.build import half_extents
@@ -375,10 +375,11 @@ def test_pictures_need_no_display():
     assert 0.05 < ink.mean() < 0.7  # a robot, on a light ground
 
 
-def test_command_prints_the_table_and_renders(tmp_path, capsys):
-    assert main(["--robots", "husky", "--render", str(tmp_path / "pictures")]) == 0
+def test_command_prints_the_table_and_the_study_renders(tmp_path, capsys):
+    assert main(["--robots", "husky"]) == 0
     text = capsys.readouterr().out
     assert "skid steer" in text and "0.67" in text and "-7.5..7.5 N m" in text
+    assert study.main(["pictures", "--robots", "husky", str(tmp_path / "pictures")]) == 0
     assert (tmp_path / "pictures" / "husky.png").stat().st_size > 1000
 
 

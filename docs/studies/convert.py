@@ -1,6 +1,6 @@
 """Cost of a conversion: a generated building in, two JSON rows (cold cache, warm cache) out.
 
-    python -m benchmarks.convert --faces 150000 --objects 25
+    python -m docs.studies.convert --faces 150000 --objects 25
 
 Generates a building of about that many scan faces and exactly so many objects, and converts it twice with one new
 cache folder, each time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident
