@@ -1,4 +1,4 @@
-"""A legged robot's MJCF, joints and gait in, one `RobotSpec` per control mode out.
+"""A legged robot's joints and gait in, one `RobotSpec` per control mode out; its body is in `mjcf/<robot>.xml`.
 
 A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
 targets are `home + reference(phase, command, base)`, a scripted stepping motion.
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 
+from interactive_nav.robots.build import FOLDER, read_file
 from interactive_nav.robots.spec import ControlLaw, RobotSpec, RobotState, TwistMap, check_mode, set_servo
 from interactive_nav_common.rotations import yaw_from_quat
 
@@ -68,18 +69,12 @@ class Legged:
     """A legged robot's body, its J driven joints and its gait."""
 
     name: str
-    mjcf: str
-    """One body with the free joint `free`; names without the robot's in front."""
     base_body: str
-    """Without the robot's name."""
+    """Of the file, with the free joint `free`; names there are without the robot's in front."""
     joints: tuple[str, ...]
     """[J] names in the model; their actuators have the same."""
     home: tuple[float, ...]
     """[J] rad."""
-    ranges: tuple[tuple[float, float], ...]
-    """[J] least and largest target, rad."""
-    torque_nm: tuple[float, ...]
-    """[J]"""
     servo: Servo
     max_speed_rad_s: float
     """Of a joint in mode `velocity`."""
@@ -92,6 +87,25 @@ class Legged:
     modes: tuple[str, ...] = ("native", "position", "velocity", "twist")
     native: str = "torque"
     """What the original's actions are: `torque` or `position` of the joints."""
+
+    def body(self) -> mujoco.MjSpec:
+        """The robot's file, parsed."""
+        return read_file(FOLDER / f"{self.name}.xml")
+
+    @functools.cached_property
+    def _joints_of_file(self) -> list[mujoco.MjsJoint]:
+        body = self.body()
+        return [body.joint(name.removeprefix(f"{self.name}_")) for name in self.joints]
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """[J] least and largest target, rad."""
+        return tuple((float(joint.range[0]), float(joint.range[1])) for joint in self._joints_of_file)
+
+    @property
+    def torque_nm(self) -> tuple[float, ...]:
+        """[J]"""
+        return tuple(float(joint.actfrcrange[1]) for joint in self._joints_of_file)
 
 
 def gait_law(legs: Legged) -> ControlLaw:
@@ -129,8 +143,7 @@ def _action_names(legs: Legged, mode: str) -> tuple[str, ...]:
 
 def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
     """Attaches the robot to a world, with one actuator per joint: torque, velocity, or position otherwise."""
-    robot = mujoco.MjSpec.from_string(legs.mjcf)
-    world.worldbody.add_frame().attach_body(robot.worldbody.first_body(), f"{legs.name}_", "")
+    world.worldbody.add_frame().attach_body(legs.body().worldbody.first_body(), f"{legs.name}_", "")
     servo = legs.servo
     for joint, torque, limits in zip(legs.joints, legs.torque_nm, legs.ranges, strict=True):
         gains = {"velocity": (0.0, servo.velocity_gain), "torque": None}.get(mode, (servo.stiffness, servo.damping))

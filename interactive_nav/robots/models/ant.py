@@ -15,63 +15,9 @@ from interactive_nav.robots.gait import Legged, Servo, legged_robot
 from interactive_nav.robots.spec import RobotCamera, RobotSpec
 
 SCALE = 0.25
-TORQUE_NM = 250.0 * SCALE**4
 HOME_ANKLE_RAD = 1.0
 JOINTS = tuple(f"ant_{part}_{i}" for i in range(1, 5) for part in ("hip", "ankle"))
 _ANKLE_SIGN = (1.0, -1.0, -1.0, 1.0)
-_HIP_RANGE = (-math.radians(40.0), math.radians(40.0))
-_ANKLE_RANGE = (math.radians(30.0), math.radians(100.0))
-
-
-def _ankle_range(sign: float) -> tuple[float, float]:
-    low, high = _ANKLE_RANGE
-    return (low, high) if sign > 0 else (-high, -low)
-
-
-def _leg(i: int, x: int, y: int) -> str:
-    stub, reach = 0.2 * SCALE, 0.4 * SCALE
-    low, high = _ankle_range(_ANKLE_SIGN[i - 1])
-    # Legs on one diagonal share an ankle axis, so that the sign of "down" alternates.
-    axis = "-1 1 0" if x == y else "1 1 0"
-    return f"""
-      <geom name="stub_{i}" class="ant_limb" fromto="0 0 0 {x * stub} {y * stub} 0"/>
-      <body name="leg_{i}" pos="{x * stub} {y * stub} 0">
-        <joint name="hip_{i}" class="ant" axis="0 0 1" range="{_HIP_RANGE[0]} {_HIP_RANGE[1]}"/>
-        <geom name="upper_{i}" class="ant_limb" fromto="0 0 0 {x * stub} {y * stub} 0"/>
-        <body name="shin_{i}" pos="{x * stub} {y * stub} 0">
-          <joint name="ankle_{i}" class="ant" axis="{axis}" range="{low} {high}"/>
-          <geom name="lower_{i}" class="ant_limb" fromto="0 0 0 {x * reach} {y * reach} 0"/>
-        </body>
-      </body>"""
-
-
-MJCF = f"""
-<mujoco model="ant">
-  <compiler angle="radian"/>
-  <default>
-    <default class="ant">
-      <joint type="hinge" armature="0.002" damping="0.01" actuatorfrcrange="{-TORQUE_NM} {TORQUE_NM}"/>
-      <geom contype="0" conaffinity="1" density="1000" friction="1.5 0.005 0.0001" group="3"/>
-      <default class="ant_limb">
-        <geom type="capsule" size="{0.08 * SCALE}"/>
-      </default>
-    </default>
-  </default>
-  <worldbody>
-    <body name="torso" childclass="ant">
-      <freejoint name="free"/>
-      <geom name="torso" type="sphere" size="{0.25 * SCALE}"/>
-      <site name="eyes" size="0.005"/>
-      <camera name="eyes" xyaxes="0 -1 0 0 0 1" fovy="120"/>
-      {_leg(1, 1, 1)}
-      {_leg(2, -1, 1)}
-      {_leg(3, -1, -1)}
-      {_leg(4, 1, -1)}
-    </body>
-  </worldbody>
-</mujoco>
-"""
-"""Limbs collide with everything but each other."""
 
 _FREQUENCY_HZ = 2.3
 _LIFT_RAD = 0.325
@@ -100,12 +46,9 @@ def _reference(phase, command, base, xp):
 
 LEGS = Legged(
     name="ant",
-    mjcf=MJCF,
     base_body="torso",
     joints=JOINTS,
     home=tuple(v for sign in _ANKLE_SIGN for v in (0.0, sign * HOME_ANKLE_RAD)),
-    ranges=tuple(r for sign in _ANKLE_SIGN for r in (_HIP_RANGE, _ankle_range(sign))),
-    torque_nm=(TORQUE_NM,) * 8,
     servo=Servo(stiffness=9.0, damping=0.4, velocity_gain=0.2),
     max_speed_rad_s=8.0,
     frequency_hz=_FREQUENCY_HZ,

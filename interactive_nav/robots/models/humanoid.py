@@ -17,108 +17,15 @@ from interactive_nav.robots.spec import RobotCamera, RobotSpec
 _THIGH_RAD, _SHIN_RAD = 0.2, 0.24
 """Thighs lean forward and shins back by this in the home pose; the soles are level then, under the centre of mass."""
 
-# name: (range in degrees, torque in N m, home in rad)
-_LEG: dict[str, tuple[tuple[float, float], float, float]] = {
-    "hip_x": ((-25, 5), 41.0, 0.0),
-    "hip_z": ((-60, 35), 41.0, 0.0),
-    "hip_y": ((-120, 20), 123.0, -_THIGH_RAD),
-    "knee": ((-160, -2), 82.0, -_THIGH_RAD - _SHIN_RAD),
+_LEG = {"hip_x": 0.0, "hip_z": 0.0, "hip_y": -_THIGH_RAD, "knee": -_THIGH_RAD - _SHIN_RAD}
+_HOME = {
+    **{"abdomen_z": 0.0, "abdomen_y": 0.0, "abdomen_x": 0.0},
+    **{f"{side}_{joint}": angle for side in ("right", "left") for joint, angle in _LEG.items()},
+    **{"right_shoulder1": 0.67, "right_shoulder2": -0.51, "right_elbow": -1.47},
+    **{"left_shoulder1": -0.67, "left_shoulder2": 0.51, "left_elbow": -1.47},
 }
-_TABLE: dict[str, tuple[tuple[float, float], float, float]] = {
-    "abdomen_z": ((-45, 45), 41.0, 0.0),
-    "abdomen_y": ((-75, 30), 41.0, 0.0),
-    "abdomen_x": ((-35, 35), 41.0, 0.0),
-    **{f"{side}_{joint}": facts for side in ("right", "left") for joint, facts in _LEG.items()},
-    "right_shoulder1": ((-85, 60), 30.75, 0.67),
-    "right_shoulder2": ((-85, 60), 30.75, -0.51),
-    "right_elbow": ((-90, 50), 30.75, -1.47),
-    "left_shoulder1": ((-60, 85), 30.75, -0.67),
-    "left_shoulder2": ((-60, 85), 30.75, 0.51),
-    "left_elbow": ((-90, 50), 30.75, -1.47),
-}
-JOINTS = tuple(f"humanoid_{name}" for name in _TABLE)
-
-
-def _joint(name: str, axis: str, pos: str = "0 0 0", kind: str = "humanoid") -> str:
-    (low, high), torque, _ = _TABLE[name]
-    return (
-        f'<joint name="{name}" class="{kind}" axis="{axis}" pos="{pos}" '
-        f'range="{math.radians(low)} {math.radians(high)}" actuatorfrcrange="{-torque} {torque}"/>'
-    )
-
-
-def _leg(side: str, y: int) -> str:
-    """`y` is -1 on the right; hips mirror their axes there, so that equal angles are mirror images."""
-    return f"""
-          <body name="{side}_thigh" pos="0 {y * 0.1} -0.04">
-            {_joint(f"{side}_hip_x", f"{-y} 0 0", kind="humanoid_hip")}
-            {_joint(f"{side}_hip_z", f"0 0 {-y}", kind="humanoid_hip")}
-            {_joint(f"{side}_hip_y", "0 1 0", kind="humanoid_hip_y")}
-            <geom name="{side}_thigh" fromto="0 0 0 0 {-y * 0.01} -0.34" size="0.06"/>
-            <body name="{side}_shin" pos="0 {-y * 0.01} -0.403">
-              {_joint(f"{side}_knee", "0 -1 0", "0 0 0.02", "humanoid_knee")}
-              <geom name="{side}_shin" fromto="0 0 0 0 0 -0.3" size="0.049"/>
-              <body name="{side}_foot" pos="0 0 -0.35" euler="0 {-_SHIN_RAD} 0">
-                <geom name="{side}_foot" fromto="-0.05 0 -0.03 0.1 0 -0.03" size="0.045" mass="1.767"/>
-              </body>
-            </body>
-          </body>"""
-
-
-def _arm(side: str, y: int) -> str:
-    return f"""
-      <body name="{side}_upper_arm" pos="0 {y * 0.17} 0.06">
-        {_joint(f"{side}_shoulder1", f"2 {-y} 1", kind="humanoid_shoulder1")}
-        {_joint(f"{side}_shoulder2", f"0 {y} 1", kind="humanoid_shoulder2")}
-        <geom name="{side}_upper_arm" fromto="0 0 0 0.16 {y * 0.16} -0.16" size="0.04"/>
-        <body name="{side}_lower_arm" pos="0.18 {y * 0.18} -0.18">
-          {_joint(f"{side}_elbow", f"0 -1 {-y}", kind="humanoid_elbow")}
-          <geom name="{side}_lower_arm" fromto="0.01 {-y * 0.01} 0.01 0.17 {-y * 0.17} 0.17" size="0.031"/>
-          <geom name="{side}_hand" type="sphere" pos="0.18 {-y * 0.18} 0.18" size="0.04"/>
-        </body>
-      </body>"""
-
-
-MJCF = f"""
-<mujoco model="humanoid">
-  <compiler angle="radian"/>
-  <default>
-    <default class="humanoid">
-      <joint type="hinge" stiffness="10" damping="5" armature="0.02"/>
-      <geom type="capsule" contype="0" conaffinity="1" density="1000" friction="1 0.005 0.0001" group="3"/>
-      <default class="humanoid_hip"><joint armature="0.01"/></default>
-      <default class="humanoid_hip_y"><joint stiffness="20" armature="0.01"/></default>
-      <default class="humanoid_knee"><joint stiffness="1" damping="1" armature="0.006"/></default>
-      <default class="humanoid_shoulder1"><joint stiffness="1" damping="1" armature="0.0068"/></default>
-      <default class="humanoid_shoulder2"><joint stiffness="1" damping="1" armature="0.0051"/></default>
-      <default class="humanoid_elbow"><joint stiffness="0" damping="1" armature="0.0028"/></default>
-    </default>
-  </default>
-  <worldbody>
-    <body name="torso" childclass="humanoid">
-      <freejoint name="free"/>
-      <geom name="torso" fromto="0 -0.07 0 0 0.07 0" size="0.07"/>
-      <geom name="head" type="sphere" pos="0 0 0.19" size="0.09"/>
-      <geom name="upper_waist" fromto="-0.01 -0.06 -0.12 -0.01 0.06 -0.12" size="0.06"/>
-      <site name="eyes" pos="0 0 0.19" size="0.01"/>
-      <camera name="eyes" pos="0 0 0.19" xyaxes="0 -1 0 0 0 1" fovy="120"/>
-      <body name="lower_waist" pos="-0.01 0 -0.26">
-        {_joint("abdomen_z", "0 0 1", "0 0 0.065").replace("/>", ' stiffness="20"/>')}
-        {_joint("abdomen_y", "0 1 0", "0 0 0.065")}
-        <geom name="lower_waist" fromto="0 -0.06 0 0 0.06 0" size="0.06"/>
-        <body name="pelvis" pos="0 0 -0.165">
-          {_joint("abdomen_x", "1 0 0", "0 0 0.1")}
-          <geom name="pelvis" fromto="-0.02 -0.07 0 -0.02 0.07 0" size="0.09"/>
-          {_leg("right", -1)}
-          {_leg("left", 1)}
-        </body>
-      </body>
-      {_arm("right", -1)}
-      {_arm("left", 1)}
-    </body>
-  </worldbody>
-</mujoco>
-"""
+"""Joint -> rad."""
+JOINTS = tuple(f"humanoid_{name}" for name in _HOME)
 
 
 class Stepping(NamedTuple):
@@ -202,7 +109,7 @@ def _reference(phase, command, base, xp):
     going = xp.clip(xp.maximum(told, forced), 0.0, 1.0)
     forward = forward + p.slip * going
     sway = going * xp.cos(phase - p.sway_phase)
-    out = {name: 0.0 * forward for name in _TABLE}
+    out = {name: 0.0 * forward for name in _HOME}
     for side, shift, left in (("right", 0.0, -1.0), ("left", math.pi, 1.0)):
         swing = going * xp.maximum(xp.sin(phase + shift), 0.0)
         stance = 1.0 - swing
@@ -224,17 +131,14 @@ def _reference(phase, command, base, xp):
         out[f"{side}_hip_z"] = left * p.turn * turn / (4.0 * p.frequency_hz) * xp.cos(phase + shift)
     out["abdomen_x"] = p.waist * sway + p.waist_roll * base.roll
     out["abdomen_y"] = p.bend * forward
-    return xp.stack([out[name] for name in _TABLE], -1)
+    return xp.stack([out[name] for name in _HOME], -1)
 
 
 LEGS = Legged(
     name="humanoid",
-    mjcf=MJCF,
     base_body="torso",
     joints=JOINTS,
-    home=tuple(home for _, _, home in _TABLE.values()),
-    ranges=tuple((math.radians(low), math.radians(high)) for (low, high), _, _ in _TABLE.values()),
-    torque_nm=tuple(torque for _, torque, _ in _TABLE.values()),
+    home=tuple(_HOME.values()),
     servo=Servo(stiffness=400.0, damping=15.0, velocity_gain=60.0),
     max_speed_rad_s=8.0,
     frequency_hz=WALK.frequency_hz,

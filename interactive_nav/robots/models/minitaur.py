@@ -19,91 +19,15 @@ from interactive_nav.robots.gait import Legged, Servo, legged_robot
 from interactive_nav.robots.spec import RobotCamera, RobotSpec
 
 UPPER_M, LOWER_M = 0.115, 0.2
-HIP_X_M, FOOT_Y_M = 0.21, 0.107
+FOOT_Y_M = 0.107
 TOE_RADIUS_M = 0.0125
-TORQUE_NM = 3.5
 HOME_RAD = math.pi / 2
 _DROP_M = math.sqrt(LOWER_M**2 - UPPER_M**2)
 _KNEE_HOME_RAD = math.atan2(_DROP_M, UPPER_M) - math.pi
-_MOTOR_RANGE = (0.5, 2.7)
-_KNEE_RANGE = (-2.95, -0.6)
 _LEGS = (("front_left", 1, 1), ("back_left", -1, 1), ("front_right", 1, -1), ("back_right", -1, -1))
 """Name, sign of x, sign of y; the original's order of motors."""
 JOINTS = tuple(f"minitaur_motor_{leg}_{link}" for leg, _, _ in _LEGS for link in ("fore", "aft"))
 
-
-def _chain(leg: str, link: str, x: int) -> str:
-    """One upper and lower link; `x` is +1 for the fore one."""
-    knee, toe = x * UPPER_M, -x * UPPER_M
-    tip = f'<geom name="toe_{leg}" class="minitaur_toe" pos="{toe} 0 {-_DROP_M}"/>' if x > 0 else ""
-    return f"""
-        <body name="upper_{leg}_{link}">
-          <joint name="motor_{leg}_{link}" class="minitaur_motor" axis="0 {-x} 0"/>
-          <geom name="upper_{leg}_{link}" class="minitaur_link" fromto="0 0 0 {knee} 0 0"/>
-          <body name="lower_{leg}_{link}" pos="{knee} 0 0">
-            <joint name="knee_{leg}_{link}" class="minitaur_knee" axis="0 {-x} 0"/>
-            <geom name="lower_{leg}_{link}" class="minitaur_link" fromto="0 0 0 {toe} 0 {-_DROP_M}"/>
-            <site name="toe_{leg}_{link}" pos="{toe} 0 {-_DROP_M}" size="0.005"/>
-            {tip}
-          </body>
-        </body>"""
-
-
-def _leg(leg: str, x: int, y: int) -> str:
-    motors = "".join(
-        f'<geom name="{leg}_motor_{place}" type="box" size="0.0434 0.013 0.0434" mass="0.25" '
-        f'pos="{x * HIP_X_M} {y * at} 0"/>'
-        for place, at in (("outer", 0.125), ("inner", 0.06))
-    )
-    return f"""
-      {motors}
-      <body name="hip_{leg}" pos="{x * HIP_X_M} {y * FOOT_Y_M} 0">
-        {_chain(leg, "fore", 1)}
-        {_chain(leg, "aft", -1)}
-      </body>"""
-
-
-def _closure(leg: str) -> str:
-    return f'<connect name="toe_{leg}" site1="toe_{leg}_fore" site2="toe_{leg}_aft"/>'
-
-
-MJCF = f"""
-<mujoco model="minitaur">
-  <compiler angle="radian"/>
-  <default>
-    <default class="minitaur">
-      <geom contype="0" conaffinity="1" friction="1 0.005 0.0001" group="3"/>
-      <equality solref="0.02 1" solimp="0.99 0.999 0.001"/>
-      <default class="minitaur_motor">
-        <joint type="hinge" ref="{HOME_RAD}" range="{_MOTOR_RANGE[0]} {_MOTOR_RANGE[1]}" armature="0.01"
-               actuatorfrcrange="{-TORQUE_NM} {TORQUE_NM}"/>
-      </default>
-      <default class="minitaur_knee">
-        <joint type="hinge" ref="{_KNEE_HOME_RAD}" range="{_KNEE_RANGE[0]} {_KNEE_RANGE[1]}" armature="0.0002"
-               damping="0.01"/>
-      </default>
-      <default class="minitaur_link"><geom type="capsule" size="0.006" mass="0.05"/></default>
-      <default class="minitaur_toe"><geom type="sphere" size="{TOE_RADIUS_M}" mass="0"/></default>
-    </default>
-  </default>
-  <worldbody>
-    <body name="chassis" childclass="minitaur">
-      <freejoint name="free"/>
-      <geom name="chassis" type="box" size="0.165 0.05 0.035" mass="1.2"/>
-      <geom name="chassis_left" type="box" size="0.085 0.05 0.025" pos="0 0.1 0" mass="0.9"/>
-      <geom name="chassis_right" type="box" size="0.085 0.05 0.025" pos="0 -0.1 0" mass="0.9"/>
-      <geom name="rail_left" type="box" size="0.17 0.04 0.02" pos="0 0.1 0" mass="0.1"/>
-      <geom name="rail_right" type="box" size="0.17 0.04 0.02" pos="0 -0.1 0" mass="0.1"/>
-      <site name="eyes" pos="0.3 0 0.05" size="0.005"/>
-      <camera name="eyes" pos="0.3 0 0.05" xyaxes="0 -1 0 0 0 1" fovy="120"/>
-      {"".join(_leg(*leg) for leg in _LEGS)}
-    </body>
-  </worldbody>
-  <equality>
-    {"".join(_closure(leg) for leg, _, _ in _LEGS)}
-  </equality>
-</mujoco>
-"""
 
 _FREQUENCY_HZ = 3.24
 _LIFT_RAD = 0.285
@@ -133,12 +57,9 @@ def _reference(phase, command, base, xp):
 
 LEGS = Legged(
     name="minitaur",
-    mjcf=MJCF,
     base_body="chassis",
     joints=JOINTS,
     home=(HOME_RAD,) * 8,
-    ranges=(_MOTOR_RANGE,) * 8,
-    torque_nm=(TORQUE_NM,) * 8,
     servo=Servo(stiffness=20.0, damping=0.35, velocity_gain=0.5),
     max_speed_rad_s=30.0,
     frequency_hz=_FREQUENCY_HZ,
@@ -156,7 +77,7 @@ def _leg_angles(command, state, xp):
     swing, extension = command[..., :4], command[..., 4:]
     middle = math.pi - 0.25 * math.pi * (extension + 1.5)
     angles = xp.stack([middle + 0.25 * math.pi * swing, middle - 0.25 * math.pi * swing], -1)
-    return xp.clip(angles.reshape((*angles.shape[:-2], 8)), *_MOTOR_RANGE)
+    return xp.clip(angles.reshape((*angles.shape[:-2], 8)), *LEGS.ranges[0])
 
 
 def minitaur(control_mode: str = "native") -> RobotSpec:

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.metrics import GRAVITY
+from interactive_nav.robots.build import FOLDER, read_file
 from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.rotations import rotate_back, yaw_from_quat
 
@@ -55,35 +56,10 @@ _MIXER = np.linalg.inv(
 """(total thrust, torque about x, y, z) to four thrusts."""
 
 
-def _body(spec: mujoco.MjSpec) -> mujoco.MjsBody:
-    base = spec.worldbody.add_body(name="quadrotor", pos=[0.0, 0.0, 0.0])
-    base.add_freejoint(name="quadrotor_free")
-    base.explicitinertial = True
-    base.mass, base.inertia, base.ipos = MASS_KG, list(INERTIA), [0.0, 0.0, 0.0]
-
-    def collide(name: str, **kwargs) -> None:
-        base.add_geom(name=name, group=3, mass=0.0, friction=[0.5, 0.005, 0.0001], contype=0, conaffinity=1, **kwargs)
-
-    collide("quadrotor_hull", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.08, 0.08, 0.04])
-    for axis, tip in (("x", [ARM_M, 0.0, 0.0]), ("y", [0.0, ARM_M, 0.0])):
-        collide(
-            f"quadrotor_arm_{axis}",
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=[-tip[0], -tip[1], 0.0, *tip],
-            size=[0.015, 0.0, 0.0],
-        )
-    for name, (x, y) in zip(ROTORS, _ROTOR_POS, strict=True):
-        # The guard of a rotor: a box of the propeller's sweep, which is half of what the arms leave.
-        collide(f"{name}_guard", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.121, 0.121, 0.02], pos=[x, y, 0.03])
-        base.add_site(name=name, pos=[x, y, 0.03], size=[0.01] * 3)
-    base.add_site(name="quadrotor_centre", size=[0.01] * 3)
-    base.add_site(name="quadrotor_eyes", pos=[0.0, 0.05, -0.05], size=[0.005] * 3)
-    base.add_camera(name="quadrotor_eyes", pos=[0.0, 0.05, -0.05], quat=[0.5, 0.5, -0.5, -0.5], fovy=120.0)
-    return base
-
-
 def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
-    base = _body(spec)
+    base = read_file(FOLDER / "quadrotor.xml").worldbody.first_body()
+    base = spec.worldbody.add_frame().attach_body(base, "quadrotor_", "")
+    base.name = "quadrotor"
     if mode == "kinematic":
         base.gravcomp = 1.0
         # Servos in the base frame; a velocity error halves within a physics step.
