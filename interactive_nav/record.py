@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,10 +89,10 @@ class Compositor:
         self._view.place(replay.bodies, replay.body_pos_w[step], replay.body_quat_w[step])
         camera = chase_camera(self._target[step], float(self._yaw[step]), height, height * 4 // 3)
         paint = FloorPaint(replay.goal_xy_w, self._goal_radius_m, _dense(replay.robot_xy_w[: step + 1]))
-        behind = self._view.look(camera, OUTSIDE, paint).colour
+        behind = self._view.look(*camera, OUTSIDE, paint).colour
         side = height // 3
         own = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
-        colour, seen = self._view.look(own[0], INSIDE).colour, self._view.look(own[1], INSIDE)
+        colour, seen = self._view.look(*own[0], INSIDE).colour, self._view.look(*own[1], INSIDE)
         small = [depth_picture(seen.depth_m), mask_picture(seen.classes, replay.segmentation_classes)]
         column = [
             colour,
@@ -176,9 +177,9 @@ def write_video(
     check_format(path)
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
     rate = 1.0 / (compositor.replay.control_dt_s * every)
-    write = _write_gif if path.suffix == ".gif" else _write_mp4
+    write = _write_gif if path.suffix == ".gif" else write_mp4
     with whole_file(path) as partial:
-        write(_counted(compositor, steps, on_progress), partial, rate, compositor.size)
+        write(_counted(compositor, steps, on_progress), partial, rate, _HOLD_S)
     return len(steps)
 
 
@@ -188,26 +189,40 @@ def _counted(compositor: Compositor, steps: list[int], on_progress: Callable[[in
         on_progress(i + 1)
 
 
-def _write_mp4(frames: Iterator[np.ndarray], path: Path, rate: float, size: tuple[int, int]) -> None:
-    output = ["-movflags", "+faststart", "-preset", "medium"]
-    rate_and_quality: dict[str, Any] = {"fps": rate, "quality": 7}
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, codec="libx264", macro_block_size=2, output_params=output, **rate_and_quality
-    )
-    writer.send(None)
+def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: float = 0.0) -> int:
+    """Writes H.264; returns the number of different frames.
+
+    Args:
+        frames: [rows, columns, 3] u8, of even numbers, one at least.
+        path: of the file.
+        rate: frames a second.
+        hold_s: the last frame stays so long.
+    """
+    count, writer, frame = 0, None, np.zeros((2, 2, 3), np.uint8)
+    settings: dict[str, Any] = {"fps": rate, "quality": 7, "codec": "libx264", "macro_block_size": 2}
+    settings["output_params"] = ["-movflags", "+faststart", "-preset", "medium"]
     try:
-        frame = np.zeros((size[1], size[0], 3), np.uint8)
         for frame in frames:
+            if writer is None:
+                writer = imageio_ffmpeg.write_frames(str(path), (frame.shape[1], frame.shape[0]), **settings)
+                with warnings.catch_warnings():
+                    # imageio-ffmpeg forks; its child becomes ffmpeg at once and never enters JAX.
+                    warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+                    writer.send(None)
             writer.send(np.ascontiguousarray(frame))
-        for _ in range(round(_HOLD_S * rate)):
+            count += 1
+        for _ in range(round(hold_s * rate)):
+            assert writer is not None
             writer.send(np.ascontiguousarray(frame))
     finally:
-        writer.close()
+        if writer is not None:
+            writer.close()
+    return count
 
 
-def _write_gif(frames: Iterator[np.ndarray], path: Path, rate: float, size: tuple[int, int]) -> None:
+def _write_gif(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s: float) -> None:
     pictures = [Image.fromarray(f).quantize(128, dither=Image.Dither.NONE) for f in frames]
-    shown_ms = [round(1000 / rate)] * (len(pictures) - 1) + [round(1000 * _HOLD_S)]
+    shown_ms = [round(1000 / rate)] * (len(pictures) - 1) + [round(1000 * hold_s)]
     pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0)
 
 

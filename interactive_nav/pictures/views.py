@@ -41,34 +41,6 @@ INSIDE = SCENE
 
 
 @dataclasses.dataclass(frozen=True)
-class Viewpoint:
-    """A pinhole camera without roll."""
-
-    pos_w: np.ndarray
-    """(3,) m."""
-    forward_w: np.ndarray
-    """(3,) unit vector."""
-    fov_rad: float
-    """Vertical field of view."""
-    rows: int
-    columns: int
-
-    @property
-    def pose(self) -> CameraPose:
-        """Where it is and how it is turned."""
-        return look_along(self.pos_w, self.forward_w)
-
-    @property
-    def lens(self) -> Lens:
-        """Its pixels."""
-        return Lens(self.columns, self.rows, math.degrees(self.fov_rad))
-
-    def rays(self) -> np.ndarray:
-        """[rows * columns, 3] directions; their component along `forward_w` is 1."""
-        return self.lens.rays(self.pose).reshape(-1, 3)
-
-
-@dataclasses.dataclass(frozen=True)
 class Image:
     """What a camera saw."""
 
@@ -103,17 +75,20 @@ class SceneView(SceneModel):
         for g in np.flatnonzero((self.model.geom_group == THINGS) & ~self._floor):
             self._colour[g] = _varied(self._colour[g], int(self.model.geom_bodyid[g]))
 
-    def look(self, camera: Viewpoint, groups: tuple[int, ...] = OUTSIDE, paint: FloorPaint | None = None) -> Image:
+    def look(
+        self, pose: CameraPose, lens: Lens, groups: tuple[int, ...] = OUTSIDE, paint: FloorPaint | None = None
+    ) -> Image:
         """Renders.
 
         Args:
-            camera: where from.
+            pose: of the camera.
+            lens: its.
             groups: `OUTSIDE` or `INSIDE`.
             paint: drawn on the floor.
         """
-        ray, geom, depth_m, normal = trace(self.model, self.data, camera.pose, camera.lens, groups)
+        ray, geom, depth_m, normal = trace(self.model, self.data, pose, lens, groups)
         hit = geom >= 0
-        points = camera.pos_w + ray * depth_m[..., None]
+        points = pose.pos_w + ray * depth_m[..., None]
         colour = np.full(ray.shape, SKY_COLOUR)
         colour[hit] = self._colour[geom[hit]]
         floor = hit & self._floor[geom]
@@ -143,25 +118,25 @@ class SceneView(SceneModel):
         return sky + 0.38 * facing * np.where(lit, 1.0, 0.15)
 
 
-def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> Viewpoint:
+def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> tuple[CameraPose, Lens]:
     """The robot's own camera, at the pose that its body has been placed at; `fov_deg` for another field of view."""
     mount = view.robot.camera
     body = mujoco.mj_name2id(view.model, mujoco.mjtObj.mjOBJ_BODY, mount.body)
     axes = view.data.xmat[body].reshape(3, 3)
     forward = axes @ [math.cos(mount.pitch_rad), 0.0, -math.sin(mount.pitch_rad)]
     pos = view.data.xpos[body] + axes @ np.asarray(mount.pos_m)
-    return Viewpoint(pos, forward, math.radians(fov_deg or mount.fov_deg), rows, columns)
+    return look_along(pos, forward), Lens(columns, rows, fov_deg or mount.fov_deg)
 
 
 def chase_camera(
     robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6
-) -> Viewpoint:
+) -> tuple[CameraPose, Lens]:
     """A camera behind and above the robot, 40 degrees down."""
     pitch = math.radians(40)
     ahead = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
     forward = math.cos(pitch) * ahead - np.array([0.0, 0.0, math.sin(pitch)])
     target = np.array([robot_pos_w[0], robot_pos_w[1], 0.15]) + 0.45 * ahead
-    return Viewpoint(target - distance_m * forward, forward, math.radians(48), rows, columns)
+    return look_along(target - distance_m * forward, forward), Lens(columns, rows, 48.0)
 
 
 class ThirdPerson:
@@ -187,7 +162,7 @@ class ThirdPerson:
         base = view.data.body(self.env.robot.base_body)
         camera = chase_camera(base.xpos, yaw_from_quat(base.xquat), self.rows, self.columns)
         paint = FloorPaint(np.asarray(goal_xy_w), self.env.success_distance_m)
-        return view.look(camera, OUTSIDE, paint).colour
+        return view.look(*camera, OUTSIDE, paint).colour
 
 
 def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:

@@ -1,14 +1,11 @@
-"""Plans, maps and paths in, pictures of episodes and a video out."""
+"""Plans, maps and paths in, pictures of episodes out."""
 
 from __future__ import annotations
 
 import io
-import warnings
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
-import imageio_ffmpeg
 import matplotlib
 
 matplotlib.use("Agg")
@@ -19,7 +16,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from interactive_nav_common.files import whole_file
 from topological_nav.figures.maps import floor_plan, room_points
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
@@ -110,28 +106,3 @@ def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height
         return (np.asarray(xy_w) - [x0, y1]) * scale
 
     return picture, pixels
-
-
-def write_video(frames: Iterable[np.ndarray], path: Path, rate: float) -> int:
-    """Writes H.264 whole or not at all; returns the number of frames."""
-    count, writer = 0, None
-    with whole_file(path) as partial:
-        named = partial.with_name(f"{partial.name}.mp4")
-        try:
-            for frame in frames:
-                if writer is None:
-                    size = (frame.shape[1], frame.shape[0])
-                    writer = imageio_ffmpeg.write_frames(
-                        str(named), size, fps=rate, codec="libx264", quality=7, macro_block_size=2  # type: ignore[arg-type]
-                    )  # fmt: skip
-                    with warnings.catch_warnings():
-                        # imageio-ffmpeg forks; its child becomes ffmpeg at once and never enters JAX.
-                        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-                        writer.send(None)
-                writer.send(np.ascontiguousarray(frame))
-                count += 1
-        finally:
-            if writer is not None:
-                writer.close()
-        named.replace(partial)
-    return count

@@ -12,12 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
+from interactive_nav.record import write_mp4
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import whole_file
 from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, play
-from topological_nav.figures.episode_figures import map_lines, plan_picture, plt, write_video
+from topological_nav.figures.episode_figures import map_lines, plan_picture, plt
 from topological_nav.figures.maps import floor_plan
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
@@ -187,4 +189,5 @@ def film(driven: Driven, path: Path) -> int:
     )
 
     steps = range(0, len(driven.time_s), every)
-    return write_video((driven.frame(step, plan, pixels) for step in steps), path, FILM_RATE)
+    with whole_file(path) as partial:
+        return write_mp4((driven.frame(step, plan, pixels) for step in steps), partial, FILM_RATE)

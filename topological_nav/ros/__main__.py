@@ -1,4 +1,4 @@
-"""`python -m topological_nav.ros all|sim|navigator|record|master`: the simulator and the navigator as ROS nodes.
+"""`python -m topological_nav.ros all|sim|navigator|record|check`: the simulator and the navigator as ROS nodes.
 
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop.
 """
@@ -67,8 +67,6 @@ def parser() -> argparse.ArgumentParser:
         _add_journey(sub)
     record = command("record", "Writes all topics into a bag until it is stopped.")
     record.add_argument("bag", type=Path)
-    alone_master = command("master", "A master on loopback; prints its address.")
-    alone_master.add_argument("--port", type=int, default=11311, metavar="N", help="0: a free one")
     command("check", "Says whether ROS can be used here.")
     return made
 
@@ -79,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     settings = [word for word in words if re.match(r"\w+=", word)]
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
-    run = {"all": _all, "sim": _sim, "navigator": _navigator, "record": _record, "master": _master, "check": _check}
+    run = {"all": _all, "sim": _sim, "navigator": _navigator, "record": _record, "check": _check}
     with stop_signals() as stops:
         try:
             _refuse_unused(arguments)
@@ -87,12 +85,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         except (UserError, SceneError) as error:
             print(f"topological_nav.ros: {error}", file=sys.stderr)
             return 2
-        return 128 + stops[0] if stops and arguments.command not in ("record", "master") else 0
+        return 128 + stops[0] if stops and arguments.command != "record" else 0
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:
     """Refuses what the chosen driver, or the command, does not look at."""
-    if arguments.command in ("record", "master", "check"):
+    if arguments.command in ("record", "check"):
         named = " ".join(word.partition("=")[0] for word in arguments.settings)
         refuse_unused(arguments, named, f"in '{arguments.command}', which has no settings")
     elif arguments.command != "sim" and arguments.driver == "heading":
@@ -206,13 +204,6 @@ def _record(arguments: argparse.Namespace, stops: list[int]) -> None:
     with _ended(ros):
         count = RecorderNode(ros, arguments.bag).run(lambda: bool(stops))
         print(f"{arguments.bag}: {count:,} messages", flush=True)
-
-
-def _master(arguments: argparse.Namespace, stops: list[int]) -> None:
-    with launch.master(debian.load(), arguments.port) as uri:
-        print(uri, flush=True)
-        while not stops:
-            time.sleep(0.1)
 
 
 def _check(arguments: argparse.Namespace, stops: list[int]) -> None:

@@ -47,8 +47,7 @@ def need_master(ros: Any) -> None:
     """Raises RosError unless a master is there."""
     if not answers(ros):
         raise RosError(
-            f"no master answers at {master_uri()}; start one (roscore, or python -m topological_nav.ros master), "
-            "or set ROS_MASTER_URI"
+            f"no master answers at {master_uri()}; start one (roscore, or rosmaster --core), or set ROS_MASTER_URI"
         )
 
 
@@ -72,16 +71,9 @@ def some_master(ros: Any, port: int | None) -> Iterator[str]:
     place = urlsplit(master_uri())
     if port is None and place.hostname not in _LOOPBACK:
         need_master(ros)
-    with master(ros, place.port or 11311 if port is None else port) as uri:
-        yield uri
-
-
-@contextlib.contextmanager
-def master(ros: Any, port: int) -> Iterator[str]:
-    """A master of our own on loopback; see `some_master`."""
     os.environ["ROS_IP"] = "127.0.0.1"
     os.environ.pop("ROS_HOSTNAME", None)
-    own = ros.rosmaster.Master(port)
+    own = ros.rosmaster.Master(place.port or 11311 if port is None else port)
     own.start()
     until = time.monotonic() + _STARTS_S
     # An error such as a port in use ends the server's thread only; the URI then never answers with our own process.

@@ -60,18 +60,6 @@ def episode_keys(seed: int, episodes: int) -> jax.Array:
     return jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
 
 
-def run_episodes(
-    env: Any,
-    policy: PolicyFn | HostPolicy,
-    keys: jax.Array,
-    record: int = 0,
-    on_progress: Callable[[int, int], None] = lambda finished, step: None,
-    starts: Any = None,
-) -> PlayedEpisodes:
-    """Plays every episode to its end, all in one batch; see `BatchPlayer.play`."""
-    return BatchPlayer(env).play(policy, keys, record, on_progress, starts)
-
-
 class BatchPlayer:
     """Plays episodes of one environment.
 

@@ -26,7 +26,6 @@ from interactive_nav.pictures.views import (
     OUTSIDE,
     FloorPaint,
     SceneView,
-    Viewpoint,
     depth_picture,
     mask_picture,
     robot_camera,
@@ -34,6 +33,7 @@ from interactive_nav.pictures.views import (
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import CATEGORIES, SEGMENTATIONS, class_id
@@ -127,18 +127,11 @@ def view(room):
 IDENTITY = [1.0, 0.0, 0.0, 0.0]
 
 
-def test_rays_of_a_camera_by_hand():
-    camera = Viewpoint(np.zeros(3), np.array([1.0, 0, 0]), math.radians(90), 2, 4)
-    # Half the field of view is 45 degrees: rows at +-0.5 of its reach, columns at +-0.5 and +-1.5.
-    np.testing.assert_allclose(camera.rays()[0], [1, 1.5, 0.5], atol=1e-12)
-    np.testing.assert_allclose(camera.rays()[-1], [1, -1.5, -0.5], atol=1e-12)
-
-
 def test_depth_and_classes_by_hand(view):
     """A room of 4 x 3 m with a cube of 0.4 m on the floor at (0.7, 0); the eye is at 0.3 m."""
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([IDENTITY]))
-    eye = Viewpoint(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0]), math.radians(90), 101, 101)
-    seen = view.look(eye, INSIDE)
+    eye = look_along(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0])), Lens(101, 101, 90.0)
+    seen = view.look(*eye, INSIDE)
     assert CLASSES[seen.classes[50, 50]] == "chair" and seen.depth_m[50, 50] == pytest.approx(1.5, abs=1e-5)
     # Beside the cube the wall, 3 m ahead of the eye: depth is along the axis, so equal over the wall.
     wall = seen.depth_m[50, 75], seen.depth_m[40, 30]
@@ -148,11 +141,11 @@ def test_depth_and_classes_by_hand(view):
     assert seen.depth_m[80, 50] == pytest.approx(0.3 * 50.5 / 30, rel=1e-5)
     # Away with the cube: the wall behind it, 0.3 m above the floor.
     view.place(("chair_0",), np.array([[0.7, 9.0, 0.2]]), np.array([IDENTITY]))
-    assert view.look(eye, INSIDE).depth_m[50, 50] == pytest.approx(3.0, abs=1e-5)
+    assert view.look(*eye, INSIDE).depth_m[50, 50] == pytest.approx(3.0, abs=1e-5)
     # Turned by 45 degrees it shows an edge: half a diagonal in front of its middle.
     turned = [math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([turned]))
-    assert view.look(eye, INSIDE).depth_m[50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
+    assert view.look(*eye, INSIDE).depth_m[50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
 
 
 def test_the_robot_is_seen_from_outside_only(view):
@@ -160,19 +153,19 @@ def test_the_robot_is_seen_from_outside_only(view):
     bodies = [b for b in range(view.model.nbody) if view.model.body(b).name == robot.base_body]
     assert len(bodies) == 1
     view.place((robot.base_body,), np.array([[-0.5, 0.3, 0.0]]), np.array([IDENTITY]))
-    camera = robot_camera(view, 33, 33)
+    camera, lens = robot_camera(view, 33, 33)
     np.testing.assert_allclose(camera.pos_w, np.array([-0.5, 0.3, 0.0]) + robot.camera.pos_m, atol=1e-9)
-    np.testing.assert_allclose(camera.forward_w, [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(camera.axes_w[:, 0], [1, 0, 0], atol=1e-9)
     index = CLASSES.index("robot")
-    assert not (view.look(camera, INSIDE).classes == index).any()
-    above = Viewpoint(np.array([-1.5, 0.3, 2.0]), np.array([math.sqrt(0.5), 0, -math.sqrt(0.5)]), 1.0, 60, 60)
-    assert (view.look(above, OUTSIDE).classes == index).sum() > 20
+    assert not (view.look(camera, lens, INSIDE).classes == index).any()
+    above = look_along(np.array([-1.5, 0.3, 2.0]), np.array([1.0, 0, -1.0])), Lens(60, 60, math.degrees(1.0))
+    assert (view.look(*above, OUTSIDE).classes == index).sum() > 20
 
 
 def test_goal_and_path_are_painted_on_the_floor(view):
-    down = Viewpoint(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0]), 0.3, 41, 41)
+    down = look_along(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0])), Lens(41, 41, math.degrees(0.3))
     paint = FloorPaint(np.array([-1.2, 0.0]), 0.2, np.array([[-1.2, 0.3]]))
-    plain, painted = view.look(down, OUTSIDE).colour, view.look(down, OUTSIDE, paint).colour
+    plain, painted = view.look(*down, OUTSIDE).colour, view.look(*down, OUTSIDE, paint).colour
     changed = (plain != painted).any(-1)
     # A disc of 0.2 m and a dot of 0.04 m, in a view of 2 * 3 m * tan(0.15).
     share = (math.pi * 0.2**2 + math.pi * 0.04**2) / (2 * 3.0 * math.tan(0.15)) ** 2

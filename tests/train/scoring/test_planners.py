@@ -15,7 +15,7 @@ from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 from train.scoring.planners import Planner
 from train.scoring.policies import make_yardstick
-from train.scoring.rollout import episode_keys, run_episodes
+from train.scoring.rollout import BatchPlayer, episode_keys
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def played(env):
     out = {}
     for name in ("avoider", "namo:0", "namo:0.9"):
         planner = make_yardstick(name, env)
-        out[name] = (planner, run_episodes(env, planner, episode_keys(0, 2), 2, starts=starts()))
+        out[name] = (planner, BatchPlayer(env).play(planner, episode_keys(0, 2), 2, starts=starts()))
     return out
 
 

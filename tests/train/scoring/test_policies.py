@@ -14,7 +14,7 @@ from interactive_nav.robots.spec import TwistMap, wheel_twist
 from interactive_nav_common.errors import UserError
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.scoring.policies import make_follower, make_random, steer
-from train.scoring.rollout import episode_keys, run_episodes
+from train.scoring.rollout import BatchPlayer, episode_keys
 
 # Wheel radius 0.05 m, track 0.2 m, action -1 .. 1 is -10 .. 30 rad/s: action = (w - 10) / 20.
 ROBOT = dataclasses.replace(
@@ -83,6 +83,6 @@ def test_random_policy_covers_the_actions():
 
 def test_follower_reaches_every_toy_goal():
     env = ToyEnv(ToyConfig(episode_steps=120))
-    played = run_episodes(env, make_follower(env), episode_keys(seed=5, episodes=64))
+    played = BatchPlayer(env).play(make_follower(env), episode_keys(seed=5, episodes=64))
     assert played.metrics["success"].mean() == 1.0
     assert played.metrics["path_efficiency"].mean() > 0.95

@@ -17,7 +17,7 @@ from interactive_nav_common.statistics import interval
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.scoring import rollout
 from train.scoring.policies import make_follower, make_random
-from train.scoring.rollout import BatchPlayer, episode_keys, run_episodes
+from train.scoring.rollout import BatchPlayer, episode_keys
 from train.scoring.row_files import EvaluationAsked, files_of_run
 from train.scoring.rows import episode_table
 
@@ -25,9 +25,9 @@ from train.scoring.rows import episode_table
 def test_an_episode_is_the_same_whatever_runs_beside_it(monkeypatch):
     """Twelve episodes, shrunk on the way, against the first five alone: equal number by number."""
     env = ToyEnv(ToyConfig(episode_steps=120))
-    many = run_episodes(env, make_random(env), episode_keys(seed=3, episodes=12), record=12)
+    many = BatchPlayer(env).play(make_random(env), episode_keys(seed=3, episodes=12), record=12)
     monkeypatch.setattr(rollout, "SHRINK", 10**9)
-    few = run_episodes(env, make_random(env), episode_keys(seed=3, episodes=5), record=5)
+    few = BatchPlayer(env).play(make_random(env), episode_keys(seed=3, episodes=5), record=5)
     for name, values in few.metrics.items():
         np.testing.assert_allclose(many.metrics[name][:5], values, rtol=1e-5)
     length = few.paths.robot_xy_w.shape[1]
@@ -36,7 +36,7 @@ def test_an_episode_is_the_same_whatever_runs_beside_it(monkeypatch):
 
 def test_paths_end_where_the_episode_ends():
     env = ToyEnv(ToyConfig(episode_steps=120))
-    played = run_episodes(env, make_follower(env), episode_keys(seed=1, episodes=6), record=4)
+    played = BatchPlayer(env).play(make_follower(env), episode_keys(seed=1, episodes=6), record=4)
     paths = played.paths
     assert paths.robot_xy_w.shape[0] == 4 and played.metrics["success"].shape == (6,)
     for i in range(4):
@@ -99,7 +99,7 @@ def test_batches_that_do_not_fit_are_halved(monkeypatch):
     played = player.play(make_random(env), keys, on_note=notes.append)
     assert sizes[:3] == [12, 6, 3] and set(sizes[3:]) == {3} and len(notes) == 2
     assert "12 episodes at a time do not fit into the device's memory, going on with 6" in notes[0]
-    whole = run_episodes(env, make_random(env), keys)
+    whole = BatchPlayer(env).play(make_random(env), keys)
     np.testing.assert_allclose(played.metrics["robot_path_m"], whole.metrics["robot_path_m"], rtol=1e-5)
 
     def broken(*_):
