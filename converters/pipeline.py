@@ -22,7 +22,6 @@ from converters.bodies.placement import compare, upright
 from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
-from converters.fill.holes import fill_holes
 from converters.geometry.boxes import Hull
 from converters.geometry.faces import simplify_parts
 from converters.geometry.simplify import simplify_open
@@ -37,6 +36,7 @@ from converters.records.gate import Gate
 from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene
 from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
+from converters.structure.fill import fill_holes, wall_planes
 from converters.structure.floor import LIFT_M, level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.structure.walls import wall_boxes
@@ -160,10 +160,10 @@ def _structure_visual(
         turned_m = TURNED_M if raw.scan.furnished else 0.0
         return bake_structure(drawn, faces, cloud, config.structure_texture, turned_m)
     scan = simplify_open(level, raw.scan.faces[kept], config.structure_faces)
-    patches, patch_cloud = fill_holes(level, raw.scan.faces[kept], raw.scan.labels, plan, annotated, cloud, scan)
-    both = joined_clouds(cloud, patch_cloud)
-    whole = np.vstack([scan[0], patches.vertices]), np.vstack([scan[1], patches.faces + len(scan[0])])
-    return bake_structure(*whole, both, config.structure_texture)
+    planes = wall_planes(level, raw.scan.faces[kept], raw.scan.labels)
+    (points, faces), clouds = fill_holes(planes, plan, annotated, cloud, scan)
+    whole = np.vstack([scan[0], points]), np.vstack([scan[1], faces + len(scan[0])])
+    return bake_structure(*whole, joined_clouds(cloud, *clouds), config.structure_texture)
 
 
 def _object_visuals(

@@ -15,7 +15,7 @@ from converters.propose.proposals import bounds, box_iou, propose_instances
 from converters.propose.report import annotated_vertices
 from converters.read.scan2cad import read_scan2cad
 from scenes_mjcf.schema import load_maps
-from tests.converters.fill.test_fill import hits
+from tests.converters.structure.test_fill import hits
 
 pytestmark = [pytest.mark.data, pytest.mark.slow]
 

@@ -1,1 +1,0 @@
-"""What furniture hid of floor and walls, covered by patches."""

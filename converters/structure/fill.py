@@ -1,0 +1,320 @@
+"""Cleaned scan and floor plan in; plane patches behind the holes that furniture left in floor and walls, out.
+
+Wall planes are found by RANSAC, as the floor's is (`converters.structure.floor`), whose waves are taken out by now. On
+a raster of each plane a cell is patched that ought to be surface and that the scan does not show. A patch
+lies behind the scan and reaches under its border on all sides, so that no crack shows from within the room.
+The picture's mesh never collides: nothing needs to be joined.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import shapely
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.faces import face_areas, face_labels, sample_faces
+from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
+from converters.records.visual import ColourCloud
+from converters.structure.floor import LIFT_M
+from converters.structure.maps import FloorPlan, label_pieces
+from converters.structure.walls import cover_rectangles
+from interactive_nav_common.rotations import yaw_matrix
+
+WALL_TOLERANCE_M, FLOOR_TOLERANCE_M = 0.04, 0.05
+"""Reconstructed surfaces wave by this much about their plane."""
+RANSAC_DRAWS, REFINED = 150, 10
+MIN_WALL_M2 = 0.5
+MAX_WALLS = 60
+BESIDE_M = 0.10
+"""Surface parallel to a plane and this near to it stands in its place."""
+OVERLAP, FREE = 5, 2
+"""Cells that a patch reaches under the scan around it, and beyond where nothing was seen (past a corner)."""
+BEHIND_M = 0.002
+"""Of a patch from the rearmost scan around it: enough for depth buffers, and above the collision floor."""
+SPACING_M = 0.03
+"""Between the coloured points on patches."""
+REACH_M = 0.6
+"""Furniture this near a wall hides it."""
+SHADOW_M = 0.15
+"""So much farther than its outline it hides floor and wall."""
+COLUMN_SEEN_M = 0.15
+"""Height of wall seen in a column from which there is wall at all: the plane may run on past its end."""
+FRONT_M = 0.15
+OPENING, CORNER = 12, 6
+"""Columns: wider stretches without wall are openings; so many may be hidden in a corner."""
+SEEN_BORDER_SHARE = 0.35
+"""Least share of a wall patch's border (its foot apart) that runs along seen wall: else it may be an opening."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plane:
+    """A plane with its own two axes."""
+
+    origin: np.ndarray
+    """(3,) m."""
+    u: np.ndarray
+    """(3,) unit; horizontal for walls."""
+    v: np.ndarray
+    """(3,) unit; up for walls."""
+
+    @property
+    def normal(self) -> np.ndarray:
+        """(3,) unit, u x v."""
+        return np.cross(self.u, self.v)
+
+    def flatten(self, points: np.ndarray) -> np.ndarray:
+        """(n, 2) coordinates in the plane of (n, 3) points."""
+        return (points - self.origin) @ np.stack([self.u, self.v], axis=1)
+
+    def lift(self, flat: np.ndarray) -> np.ndarray:
+        """(n, 3) points of the plane from (n, 2) coordinates."""
+        return self.origin + flat[:, :1] * self.u + flat[:, 1:] * self.v
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """(n,) signed distances, m."""
+        return (points - self.origin) @ self.normal
+
+
+def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, seed: int = 0) -> list[Plane]:
+    """Vertical planes of the walls by sequential RANSAC (Fischler and Bolles 1981), the largest first.
+
+    A draw is one upright face: its middle and the horizontal direction of its normal are a hypothesis; its
+    support is the area of the faces within `WALL_TOLERANCE_M` whose normals agree within 25 degrees. The best
+    of `RANSAC_DRAWS` is refined by least squares over its support, and over the support of that while it grows (Chum,
+    Matas and Kittler 2003, Locally optimized RANSAC), which is then taken out. A plane's normal looks
+    to the side that its faces look to: the room, as scans are made from inside.
+
+    Args:
+        vertices: (n, 3) m, z up.
+        faces: (m, 3) that stay.
+        labels: (n,) NYU40.
+        seed: of the draws.
+    """
+    label = face_labels(labels, faces)
+    area = face_areas(vertices, faces)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a) / np.maximum(2 * area, 1e-12)[:, None]
+    left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
+    middle = vertices[faces].mean(axis=1)
+    flat = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-9)
+    rng = np.random.default_rng(seed)
+    planes = []
+    while len(planes) < MAX_WALLS:
+        index = np.flatnonzero(left)
+        if area[index].sum() < MIN_WALL_M2:
+            break
+        best, best_support = None, 0.0
+        draws = rng.choice(index, RANSAC_DRAWS, p=area[index] / area[index].sum())
+        for d in np.unique(draws):
+            near = np.abs((middle[index, :2] - middle[d, :2]) @ flat[d]) < WALL_TOLERANCE_M
+            agree = near & (flat[index] @ flat[d] > 0.9)
+            support = float(area[index[agree]].sum())
+            if support > best_support:
+                best, best_support = index[agree], support
+        if best is None or best_support < MIN_WALL_M2:
+            break
+        # A face's normal is a poor direction for a long wall: the support of the plane through the support, and again.
+        for _ in range(REFINED):
+            weight = area[best] / area[best].sum()
+            centre = weight @ middle[best, :2]
+            spread = (middle[best, :2] - centre).T @ ((middle[best, :2] - centre) * weight[:, None])
+            x, y = np.linalg.eigh(spread)[1][:, 1]
+            if np.array([y, -x]) @ (weight @ flat[best]) < 0:  # the normal looks to where the scan's faces look
+                x, y = -x, -y
+            near = np.abs((middle[index, :2] - centre) @ [y, -x]) < WALL_TOLERANCE_M
+            again = index[near & (flat[index] @ [y, -x] > 0.9)]
+            if area[again].sum() < best_support * (1 + 1e-6):
+                break
+            best, best_support = again, float(area[again].sum())
+        planes.append(Plane(np.array([*centre, 0.0]), np.array([x, y, 0.0]), np.array([0.0, 0.0, 1.0])))
+        left[best] = False
+    return planes
+
+
+def seen_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> np.ndarray:
+    """Indices of the faces that show the plane: within `BESIDE_M` of it, and look as it does.
+
+    Panels and pillars that stand out of a wall are among them: a patch over them would be a second layer.
+    """
+    candidates = np.flatnonzero(np.abs(plane.distance(vertices))[faces].max(axis=1) < BESIDE_M)
+    corners = vertices[faces[candidates]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    along = normal @ plane.normal
+    return candidates[(along > 0.7 * np.linalg.norm(normal, axis=1)) & (along > 1e-9)]
+
+
+def _grown(mask: np.ndarray, cells: int) -> np.ndarray:
+    return np.asarray(ndimage.binary_dilation(mask, np.ones((3,) * mask.ndim), cells), bool)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What a scan shows of a plane: (rows, columns) of square cells, rows along the plane's second axis."""
+
+    plane: Plane
+    low: np.ndarray
+    """(2,) m in the plane, corner of cell [0, 0]."""
+    cell_m: float
+    seen: np.ndarray
+    """bool."""
+    depth_m: np.ndarray
+    """Of the rearmost, along the plane's normal; infinite where there is none."""
+
+    @classmethod
+    def of(cls, plane: Plane, points: np.ndarray, low: np.ndarray, shape: tuple[int, int], cell_m: float) -> Shown:
+        """Of (n, 3) points, half a cell apart."""
+        column, row = np.floor((plane.flatten(points) - low) / cell_m).astype(int).T
+        inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+        depth_m = np.full(shape, np.inf)
+        np.minimum.at(depth_m, (row[inside], column[inside]), plane.distance(points[inside]))
+        return cls(plane, low, cell_m, np.isfinite(depth_m), depth_m)
+
+    def patches(self, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
+        rearmost = ndimage.minimum_filter(self.depth_m, OVERLAP)
+        rearmost = np.where(np.isfinite(rearmost), rearmost, 0.0) - BEHIND_M
+        wide = _grown(hidden, OVERLAP) & self.seen
+        pieces, count = label_pieces(wide | _grown(hidden, FREE))
+        points, triangles, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+        for k in range(1, count + 1):
+            own = pieces == k
+            rectangles = np.array(cover_rectangles(own, own, disjoint=True))[:, [2, 0, 3, 1]] * self.cell_m
+            outline = shapely.union_all(shapely.box(*(rectangles + np.tile(self.low, 2)).T), grid_size=1e-6)
+            outline = outline.simplify(self.cell_m).segmentize(1.5 * OVERLAP * self.cell_m)
+            corners = shapely.get_coordinates(shapely.constrained_delaunay_triangles(outline)).reshape(-1, 4, 2)[:, :3]
+            a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+            turned = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
+            corners[turned] = corners[turned][:, ::-1]
+            flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+            cell = np.clip(np.floor((flat - self.low) / self.cell_m).astype(int), 0, np.array(own.shape[::-1]) - 1)
+            points.append(self.plane.lift(flat) + rearmost[cell[:, 1], cell[:, 0], None] * self.plane.normal)
+            triangles.append(index.reshape(-1, 3) + first)
+            first += len(flat)
+        return np.vstack(points), np.vstack(triangles)
+
+
+def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarray:
+    """(rows, columns) bool: floor of the plan, and around what stands on it, which may not be seen."""
+    shadow = np.zeros(plan.grid.shape, bool)
+    for placed in objects:
+        plan.grid.add_below(shadow, to_world(placed, placed.vertices_b), SHADOW_M)
+    floor = ndimage.binary_propagation(plan.floor, mask=plan.floor | (shadow & ~plan.occupied))
+    return floor | ndimage.binary_closing(floor, np.ones((5, 5)))  # what the cut left of a leg stands on floor too
+
+
+def _beside(mask: np.ndarray, plan: FloorPlan, shown: Shown, above_m: float) -> np.ndarray:
+    """(columns,) bool: a (rows, columns) mask of the plan, so far before the plane."""
+    along = shown.low[0] + (np.arange(shown.seen.shape[1]) + 0.5) * shown.cell_m
+    points = shown.plane.lift(np.column_stack([along, 0 * along])) + above_m * shown.plane.normal
+    row, column, inside = plan.grid.cells(points)
+    inside[inside] = mask[row[inside], column[inside]]
+    return inside
+
+
+def _extent(plan: FloorPlan, shown: Shown) -> np.ndarray:
+    """(rows, columns) bool: from the floor up to the seen wall's top, where wall is seen or hides in a corner.
+
+    A column in which too little is seen is as high as the lower of the seen ones beside it.
+    """
+    rows, columns = shown.seen.shape
+    known = np.flatnonzero(shown.seen.sum(axis=0) * shown.cell_m > COLUMN_SEEN_M)
+    if not len(known):
+        return np.zeros((rows, columns), bool)
+    wall = np.isin(np.arange(columns), known)
+    wall = np.asarray(ndimage.binary_closing(np.pad(wall, OPENING), np.ones(2 * OPENING + 1)), bool)[OPENING:-OPENING]
+    wall |= _grown(wall, CORNER) & _beside(plan.floor, plan, shown, FRONT_M)
+    # Where one may stand on both sides there is an opening.
+    wall &= ~np.all([_beside(plan.traversable, plan, shown, d * FRONT_M) for d in (-2, -1, 0, 1, 2)], axis=0)
+    top = rows - shown.seen[::-1].argmax(axis=0)
+    before = known[np.clip(np.searchsorted(known, np.arange(columns), side="right") - 1, 0, len(known) - 1)]
+    after = known[np.clip(np.searchsorted(known, np.arange(columns)), 0, len(known) - 1)]
+    row = np.arange(rows)[:, None]
+    # The scan's own upper edge is ragged: nothing is built there.
+    return wall & (row >= OVERLAP) & (row < np.minimum(top[before], top[after]) - 2)
+
+
+def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]) -> np.ndarray:
+    """(rows, columns) bool: what furniture hid of a wall; doors hide nothing.
+
+    The shadow of each near object on the wall, down to the floor, where there is wall; pieces that touch too little
+    seen wall are left open.
+    """
+    shadow, doors = np.zeros((2, *shown.seen.shape), bool)
+    for placed in objects:
+        points = to_world(placed, placed.vertices_b)
+        distance = shown.plane.distance(points)
+        if distance.max() < 0 or distance.min() > REACH_M or distance.mean() < -SHADOW_M:
+            continue
+        index = (shown.plane.flatten(points) - shown.low) / shown.cell_m
+        margin = SHADOW_M / shown.cell_m
+        left, right = int(max(index[:, 0].min() - margin, 0)), int(max(index[:, 0].max() + margin, 0))
+        mask = doors if placed.hinge is not None else shadow
+        mask[: int(max(index[:, 1].max() + margin, 0)) + 1, left : right + 1] = True
+    hidden = shadow & ~doors & _extent(plan, shown) & ~shown.seen
+    pieces, count = label_pieces(hidden, np.ones((3, 3)))
+    for k in range(1, count + 1):
+        border = _grown(pieces == k, 1) & (pieces == 0)
+        border[:OVERLAP] = False
+        if shown.seen[border].mean() < SEEN_BORDER_SHARE:
+            hidden &= pieces != k
+    return hidden
+
+
+def fill_holes(
+    planes: list[Plane], plan: FloorPlan, objects: tuple[PlacedObject, ...], cloud: ColourCloud,
+    scan: tuple[np.ndarray, np.ndarray],
+) -> tuple[tuple[np.ndarray, np.ndarray], list[ColourCloud]]:  # fmt: skip
+    """What furniture hid of floor and walls, and coloured points on it.
+
+    Args:
+        planes: of the walls.
+        plan: of the floor.
+        objects: as annotated.
+        cloud: coloured points of the cleaned scan; each patch takes the colours seen around it in its plane.
+        scan: vertices (n, 3) m and faces (m, 3) that are drawn.
+
+    Returns:
+        Vertices and faces of the patches; points on them.
+    """
+    cell_m, turn = plan.grid.resolution_m / 2, yaw_matrix(plan.grid.yaw)
+    ground = Plane(turn @ [*plan.grid.origin, LIFT_M], turn[:, 0], turn[:, 1])
+    done, clouds = [], []
+    for plane in (ground, *planes):
+        tolerance_m = FLOOR_TOLERANCE_M if plane is ground else WALL_TOLERANCE_M
+        points, _ = sample_faces(scan[0], scan[1][seen_in_plane(*scan, plane)], cell_m / 2)
+        if plane is ground:
+            # The scan's floor is level by now; what is drawn below it is a reflection.
+            points = points[plane.distance(points) > -1e-6]
+            floor = whole_floor(plan, objects).repeat(2, axis=0).repeat(2, axis=1)
+            shown = Shown.of(plane, points, np.zeros(2), floor.shape, cell_m)
+            patch = shown.patches(floor & ~shown.seen)
+        elif len(points):
+            flat = plane.flatten(points)
+            low = np.array([flat[:, 0].min() - (CORNER + OVERLAP) * cell_m, LIFT_M - OVERLAP * cell_m])
+            columns, rows = np.ceil((flat.max(axis=0) - low) / cell_m).astype(int) + [CORNER + OVERLAP, 1]
+            shown = Shown.of(plane, points, low, (rows, columns), cell_m)
+            patch = shown.patches(hidden_wall(plan, shown, objects))
+        else:
+            continue
+        near = np.abs(plane.distance(cloud.points)) < tolerance_m
+        seen = np.flatnonzero(near & (np.abs(cloud.normals @ plane.normal) > 0.7))
+        done.append(patch)
+        if len(patch[1]) and len(seen):
+            clouds.append(_coloured(patch, plane, ColourCloud(cloud.points[seen], cloud.normals, cloud.colours[seen])))
+    first = np.cumsum([0, *(len(points) for points, _ in done)])
+    faces = np.vstack([triangles + k for (_, triangles), k in zip(done, first, strict=False)])
+    return (np.vstack([points for points, _ in done]), faces), clouds
+
+
+def _coloured(patch: tuple[np.ndarray, np.ndarray], plane: Plane, seen: ColourCloud) -> ColourCloud:
+    """Points on a patch, coloured as what is seen of its plane around them."""
+    spots, _ = sample_faces(*patch, SPACING_M)
+    count = min(48, len(seen.points))
+    distance, index = KDTree(seen.points).query(spots, k=count)
+    weight = 1.0 / (distance.reshape(-1, count) + 0.05)
+    shade = (seen.colours[index.reshape(-1, count)] * weight[..., None]).sum(axis=1)
+    return ColourCloud(spots, np.tile(plane.normal, (len(spots), 1)), shade / weight.sum(axis=1, keepdims=True))
