@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from converters.check.render import Picture, over
 from converters.generate.models.cad import LIBRARY, cad_model
 from converters.generate.models.parts import MATERIALS
-from converters.read.obj import texels
+from converters.read.meshes import textured_by_face
+from converters.read.obj import join_meshes
+from converters.records.visual import TexturedMesh
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
 
@@ -20,8 +23,6 @@ LABEL_PIXELS = 30
 COLUMNS = 8
 AZIMUTH_RAD, ELEVATION_RAD = 0.6, 0.42
 """Where the reader stands: to the right of the front, and above."""
-LAMP = np.array([-0.45, 0.6, 0.66])
-"""Towards the lamp: right, up, towards the reader."""
 
 
 def camera_axes() -> np.ndarray:
@@ -41,43 +42,17 @@ def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
     """
     model = cad_model(name)
     axes = camera_axes() * [model.front, 1, model.front]
-    if model.surface is None:
-        turned = [part.vertices @ axes.T for part in model.parts]
-        drawn = [
-            (v[p.faces], [np.array(MATERIALS[p.material])] * len(p.faces))
-            for v, p in zip(turned, model.parts, strict=True)
-        ]
+    if (own := model.surface) is not None:
+        mesh = TexturedMesh(own.vertices, own.faces, own.uv[own.uv_faces], own.image)
     else:
-        turned = [model.surface.vertices @ axes.T]
-        colours = texels(model.surface.image, model.surface.uv[model.surface.uv_faces].mean(axis=1)) / 255
-        drawn = [(turned[0][model.surface.faces], colours)]
-    low, high = np.concatenate(turned).min(axis=0), np.concatenate(turned).max(axis=0)
-    pixel = float((high - low)[:2].max()) / (0.94 * pixels)
-    corner = (low[:2] + high[:2] - pixels * pixel) / 2
-    image, depth = np.ones((pixels, pixels, 3)), np.full((pixels, pixels), -np.inf)
-    for triangles, colours in drawn:
-        for triangle, colour in zip(triangles, colours, strict=True):
-            _draw_triangle(image, depth, (triangle - [*corner, 0.0]) / pixel, colour)
-    return (255 * image[::-1]).astype(np.uint8)
-
-
-def _draw_triangle(image: np.ndarray, depth: np.ndarray, corners: np.ndarray, colour: np.ndarray) -> None:
-    """Draws a triangle, its corners in pixels (right, up, towards the reader), where nothing is before it."""
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    if normal[2] <= 1e-9:
-        return  # seen from behind
-    x0, y0 = np.maximum(np.floor(corners[:, :2].min(axis=0)).astype(int), 0)
-    x1, y1 = np.minimum(np.ceil(corners[:, :2].max(axis=0)).astype(int), len(image))
-    x, y = np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5)
-    inside = np.ones(x.shape, bool)
-    for k in range(3):
-        (ax, ay, _), (bx, by, _) = corners[k], corners[(k + 1) % 3]
-        inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= -1e-9
-    near = corners[0, 2] - ((x - corners[0, 0]) * normal[0] + (y - corners[0, 1]) * normal[1]) / normal[2]
-    shown = inside & (near > depth[y0:y1, x0:x1])
-    depth[y0:y1, x0:x1][shown] = near[shown]
-    light = 0.42 + 0.58 * max(float(normal @ LAMP / np.linalg.norm(normal)), 0.0)
-    image[y0:y1, x0:x1][shown] = light * colour
+        colours = [np.tile(np.rint(255 * np.array(MATERIALS[p.material])), (len(p.faces), 1)) for p in model.parts]
+        parts = zip(model.parts, colours, strict=True)
+        mesh = join_meshes(*(textured_by_face(p.vertices, p.faces, colour) for p, colour in parts))
+    seen = mesh.vertices @ axes.T
+    half, middle = np.ptp(seen, axis=0)[:2].max() / 2 / 0.94, (seen.min(axis=0) + seen.max(axis=0)) / 2
+    picture = Picture(over(axes, middle - half, middle + half - 1e-9, 2 * half / pixels))
+    picture.draw(mesh, one_sided=True)
+    return picture.image
 
 
 def model_sheet(target: Path, names: Sequence[str] = ()) -> int:

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
+from converters.check.render import Picture, over
 from converters.check.surfaces import geom_surface
-from converters.write.texture import textured_cloud
 from interactive_nav_common.files import check_name
 from scenes_mjcf.schema import SCENES, SceneError
 
@@ -25,19 +25,6 @@ VIEWS = {
 """Rows: what runs to the right, what runs up, and what looks at the reader."""
 PIXELS = 260
 """Longer side of a picture of the surface; a panel is about as large on the page."""
-
-
-def view(
-    points: np.ndarray, colours: np.ndarray, low: np.ndarray, shape: tuple[int, int], pixel_m: float
-) -> np.ndarray:
-    """(rows, columns, 3) uint8 view from above: the highest point of a pixel shows; white without any."""
-    index = np.floor((points[:, :2] - low) / pixel_m).astype(int)
-    inside = (index >= 0).all(axis=1) & (index[:, 0] < shape[1]) & (index[:, 1] < shape[0])
-    flat = index[inside, 1] * shape[1] + index[inside, 0]
-    order = np.argsort(points[inside, 2], kind="stable")
-    image = np.full((shape[0] * shape[1], 3), 255, np.uint8)
-    image[flat[order]] = colours[inside][order]  # later (higher) points overwrite earlier ones
-    return image.reshape(*shape, 3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,17 +56,16 @@ def draw_object(folder: Path) -> Figure:
     surface_b = geom_surface(model, model.geom(f"{name}_visual").id)
     size_m = float(np.ptp(surface_b.vertices, axis=0).max())
     surface_w = dataclasses.replace(surface_b, vertices=surface_b.vertices @ turn.T + origin)
-    cloud = textured_cloud(surface_w, 0.9 * size_m / PIXELS)
     figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
     for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
-        points = cloud.points @ axes_w.T
-        low, high = points[:, :2].min(axis=0) - 0.1 * size_m, points[:, :2].max(axis=0) + 0.1 * size_m
+        points = surface_w.vertices @ axes_w[:2].T
+        low, high = points.min(axis=0) - 0.1 * size_m, points.max(axis=0) + 0.1 * size_m
         pixel_m = float((high - low).max()) / PIXELS
-        columns, rows = np.ceil((high - low) / pixel_m).astype(int)
-        light = 0.55 + 0.45 * np.abs(cloud.normals @ axes_w[2])  # from where the reader stands
-        seen = view(points, (cloud.colours * light[:, None]).astype(np.uint8), low, (int(rows), int(columns)), pixel_m)
+        picture = Picture(over(axes_w, low, high, pixel_m))
+        picture.draw(surface_w)
+        rows, columns = picture.image.shape[:2]
         extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)
-        surface.imshow(seen, origin="lower", extent=extent, interpolation="nearest")
+        surface.imshow(picture.image, extent=extent, interpolation="nearest")
         _draw_solids(solid, model, data, body, axes_w)
         for axes in (surface, solid):
             axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
@@ -99,19 +85,24 @@ def draw_object(folder: Path) -> Figure:
     return figure
 
 
+def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: np.ndarray) -> np.ndarray:
+    """(k, 2) m: outline of a mesh or box geom, seen along the third of the axes."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
+    else:
+        mesh = model.geom_dataid[geom]
+        first = model.mesh_vertadr[mesh]
+        corners = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w[:2].T
+    return points[ConvexHull(points).vertices]
+
+
 def _draw_solids(axes: Axes, model: mujoco.MjModel, data: mujoco.MjData, body: int, axes_w: np.ndarray) -> None:
     """Outlines of hulls, filled, and boxes, as lines."""
     for geom in np.flatnonzero(model.geom_bodyid == body):
         box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
         if not box and not model.geom_contype[geom]:
             continue  # the surface
-        if box:
-            corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
-        else:
-            mesh = model.geom_dataid[geom]
-            first = model.mesh_vertadr[mesh]
-            corners = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-        points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w.T
-        outline = points[ConvexHull(points[:, :2]).vertices, :2]
+        outline = geom_outline(model, data, int(geom), axes_w)
         fill, line = ("none", "#b03020") if box else ("#3070c040", "none")
         axes.fill(*outline.T, facecolor=fill, edgecolor=line, linewidth=0.8)

@@ -6,9 +6,8 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 
 import matplotlib
@@ -22,17 +21,16 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
-from scipy.spatial import ConvexHull
 
 from converters.bodies.objects import PlacedObject
-from converters.check.object_preview import draw_object, view
+from converters.check.object_preview import draw_object, geom_outline
 from converters.check.surfaces import geom_mesh
 from converters.check.views import CUT_M, EYE_M, EYE_VIEW_RAD, at_eye_height, from_above, from_the_south, world_surfaces
 from converters.geometry.boxes import convex_hull
-from converters.records.raw import RawScene
+from converters.read.meshes import textured_by_face
+from converters.records.raw import RawScene, ScanMesh
 from converters.records.visual import TexturedMesh
 from converters.structure.cut import cut_furniture
-from converters.write.texture import colour_cloud
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
@@ -63,18 +61,6 @@ def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
         body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])) or ""
         found.append((name, body, geom))
     return found
-
-
-def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """(k, 2) world outline of a mesh or box geom seen from above, m."""
-    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
-    else:
-        mesh = int(model.geom_dataid[geom])
-        first = int(model.mesh_vertadr[mesh])
-        corners = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])[:, :2]
-    return points[ConvexHull(points).vertices]
 
 
 def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:
@@ -127,17 +113,24 @@ def _frame(axes: Axes, scene: _Scene, title: str) -> None:
     axes.text(left + 0.5, bottom - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
 
 
-def _draw_surface(
-    axes: Axes, scene: _Scene, seen: Callable[[np.ndarray, np.ndarray, float], np.ndarray], title: str
-) -> None:
-    """Coloured surfaces from above; `seen` is told the lower left and upper right corner and how wide a pixel is."""
+def _draw_surface(axes: Axes, scene: _Scene, surface: TexturedMesh, title: str) -> None:
+    """What looks up of a surface, from above."""
     left, right, bottom, top = scene.extent
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     pixel_m = float((high - low).max()) / SURFACE_PIXELS
-    image = seen(low, high, pixel_m)
+    image = from_above(surface, low, high, pixel_m)
     extent = (low[0], low[0] + image.shape[1] * pixel_m, low[1], low[1] + image.shape[0] * pixel_m)
     axes.imshow(image, extent=extent, interpolation="nearest")
     _frame(axes, scene, title)
+
+
+def _scan_surface(scan: ScanMesh, vertices_w: np.ndarray, chosen: np.ndarray) -> TexturedMesh:
+    """Some faces of a scan, in its own colours."""
+    faces = scan.faces[chosen]
+    if scan.texture is not None and scan.corner_uv is not None:
+        return TexturedMesh(vertices_w, faces, scan.corner_uv[chosen], scan.texture)
+    assert scan.vertex_colours is not None
+    return textured_by_face(vertices_w, faces, scan.vertex_colours[faces].mean(axis=1))
 
 
 def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float) -> None:
@@ -161,7 +154,7 @@ def _draw_ground(axes: Axes, scene: _Scene) -> None:
     axes.imshow(shade, origin="lower", extent=scene.extent, interpolation="nearest")
     for name, _, geom in _geoms(scene.model):
         if name.startswith("wall_"):
-            outline = _outline(scene.model, scene.data, geom)
+            outline = geom_outline(scene.model, scene.data, geom, np.eye(3))
             axes.fill(*outline.T, facecolor=WALL, edgecolor="0.45", linewidth=0.4)
 
 
@@ -194,7 +187,7 @@ def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
     for name, body, geom in _geoms(scene.model):
         if body in category and name.startswith(f"{body}_{kind}_"):
             colour = CATEGORIES[category[body]].preview_colour
-            outline = _outline(scene.model, scene.data, geom)
+            outline = geom_outline(scene.model, scene.data, geom, np.eye(3))
             axes.fill(*outline.T, facecolor=(*colour, 0.30), edgecolor=colour, linewidth=0.6)
             count += 1
     walls = sum(name.startswith("wall_") for name, _, _ in _geoms(scene.model))
@@ -281,15 +274,8 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
             (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
             (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
         ):
-
-            def seen(low: np.ndarray, high: np.ndarray, pixel_m: float, chosen: np.ndarray = chosen) -> np.ndarray:
-                cloud = colour_cloud(raw.scan, vertices_w, raw.scan.faces, chosen, 0.9 * pixel_m)
-                columns, rows = np.ceil((high - low) / pixel_m).astype(int).tolist()
-                return view(cloud.points, cloud.colours.astype(np.uint8), low, (rows, columns), pixel_m)[::-1]
-
-            _draw_surface(axes, scene, seen, title)
-        structure = functools.partial(from_above, scene.surfaces["structure"])
-        _draw_surface(panels.pop(0), scene, structure, "filled: the static structure")
+            _draw_surface(axes, scene, _scan_surface(scan, vertices_w, chosen), title)
+        _draw_surface(panels.pop(0), scene, scene.surfaces["structure"], "filled: the static structure")
     objects, hulls, boxes = panels
     _draw_objects(objects, scene)
     _draw_collision(hulls, scene, "hull")

@@ -10,7 +10,8 @@ from PIL import Image
 
 from converters.records.visual import TexturedMesh
 
-NEAR_M = 0.05
+NEAR_M, FAR_M = 0.05, 100.0
+"""Nothing nearer is drawn; rays that are parallel begin so far off."""
 LAMP_W = np.array([0.35, -0.45, 0.82])
 """Where the little light comes from that is not even."""
 EVEN = 0.72
@@ -51,6 +52,20 @@ def looking_at(eye_w: np.ndarray, at_w: np.ndarray, shape: tuple[int, int], view
     right = np.cross([0.0, 0.0, 1.0], toward)
     right /= np.linalg.norm(right)
     return Camera(eye_w, np.stack([right, np.cross(toward, right), toward]), shape, shape[1] / 2 / np.tan(view_rad / 2))
+
+
+def over(axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, pixel_m: float) -> Camera:
+    """A camera of parallel rays over a rectangle.
+
+    Args:
+        axes_w: (3, 3) as a `Camera` has them.
+        low: (2 or 3,) m along these axes, lower left corner of the picture.
+        high: its opposite.
+        pixel_m: width of a pixel; the picture is some whole pixels large, from the lower left corner on.
+    """
+    columns, rows = np.ceil((high - low)[:2] / pixel_m).astype(int).tolist()
+    middle = low[:2] + np.array([columns, rows]) * pixel_m / 2
+    return Camera(np.array([*middle, FAR_M]) @ axes_w, axes_w, (rows, columns), 1 / pixel_m, True)
 
 
 class Picture:

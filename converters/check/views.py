@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from converters.check.render import Camera, Picture, looking_at
+from converters.check.render import Camera, Picture, looking_at, over
 from converters.check.surfaces import geom_surface
 from converters.geometry.density import clearance_m
 from converters.records.visual import TexturedMesh
@@ -83,9 +83,7 @@ def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh
 
 def from_above(surface: TexturedMesh, low: np.ndarray, high: np.ndarray, pixel_m: float) -> np.ndarray:
     """What looks up, between corners (2,) m; the last row is the southernmost."""
-    columns, rows = np.ceil((high - low) / pixel_m).astype(int).tolist()
-    eye_w = np.array([low[0] + columns * pixel_m / 2, low[1] + rows * pixel_m / 2, 100.0])
-    return _taken(Camera(eye_w, np.eye(3), (rows, columns), 1 / pixel_m, True), {"structure": surface})
+    return _taken(over(np.eye(3), low, high, pixel_m), {"structure": surface})
 
 
 def at_eye_height(
