@@ -308,7 +308,8 @@ def convert_building(
     config: ConvertConfig,
     report: Report | None = None,
     cache: Path | None = None,
-    warn: Callable[[str], None] | None = None,
+    warn: Callable[[str], None] = lambda warning: None,
+    floors: int | None = None,
 ) -> tuple[Converted, ...]:
     """Converts one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
 
@@ -320,36 +321,14 @@ def convert_building(
         report: progress callback.
         cache: folder of hulls and stage results by content; default `cache_folder()`.
         warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
+        floors: that it must have; None: any number.
 
     Raises:
-        SceneRejected: bad input.
+        SceneRejected: bad input, or another number of floors.
         StageFailed: a stage broke.
         FileError: `target` exists already (`overwrite`), or cannot be written.
         OSError: the disk is full or gone.
     """
-    return _convert(source, target, config, report, cache, None, warn)
-
-
-def convert(
-    source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
-) -> Converted:
-    """Converts a raw folder of one floor; arguments and errors of `convert_building`.
-
-    Raises:
-        SceneRejected: bad input, or several floors.
-    """
-    return _convert(source, target, config, report, cache, 1)[0]
-
-
-def _convert(
-    source: Path,
-    target: Path,
-    config: ConvertConfig,
-    report: Report | None,
-    cache: Path | None,
-    floors: int | None,
-    warn: Callable[[str], None] | None = None,
-) -> tuple[Converted, ...]:
     clock = Clock(report or (lambda stage, share: None))
     check_name(target.name, f"{target}: the scene's name")
     with contextlib.ExitStack() as stack:
@@ -363,9 +342,8 @@ def _convert(
             told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
             raw = dataclasses.replace(raw, name=target.name, warnings=told)
             scenes = split_storeys(raw)
-        if warn is not None:
-            for warning in raw.warnings:
-                warn(warning)
+        for warning in raw.warnings:
+            warn(warning)
         if config.auto_align and config.library is None and (source / "cad").is_dir():
             config = dataclasses.replace(config, library=source)
         if floors is not None and len(scenes) != floors:
@@ -384,3 +362,14 @@ def _convert(
             done.append(dataclasses.replace(result, folder=final, stage_s=clock.seconds))
         publish(folders, config.overwrite)
     return tuple(done)
+
+
+def convert(
+    source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
+) -> Converted:
+    """Converts a raw folder of one floor; arguments and errors of `convert_building`.
+
+    Raises:
+        SceneRejected: bad input, or several floors.
+    """
+    return convert_building(source, target, config, report, cache, floors=1)[0]

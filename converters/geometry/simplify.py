@@ -75,11 +75,6 @@ class Surface:
         return float(trimesh.proximity.closest_point(mesh, points[beyond])[1].max())
 
 
-def surface_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """`Surface.distance`, for one set of points."""
-    return Surface(vertices, faces).distance(points)
-
-
 def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: float) -> tuple[np.ndarray, np.ndarray]:
     """One part with half its faces, a quarter and so on, as long as it keeps the surface."""
     area = float(face_areas(vertices, faces).sum())

@@ -339,9 +339,3 @@ def _ears(outline: np.ndarray) -> np.ndarray | None:
         else:
             return None
     return np.array(found)
-
-
-def read_textured_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (n, 3), faces (m, 3) and texture coordinates of the corners (m, 3, 2) or None, as `read_obj`."""
-    mesh = read_obj(path)
-    return mesh.vertices, mesh.faces, mesh.corner_uv

@@ -210,9 +210,7 @@ def _beside(mask: np.ndarray, plan: FloorPlan, shown: Shown, above_m: float) -> 
     """(columns,) bool: a (rows, columns) mask of the plan, so far before the plane."""
     along = shown.low[0] + (np.arange(shown.seen.shape[1]) + 0.5) * shown.cell_m
     points = shown.plane.lift(np.column_stack([along, 0 * along])) + above_m * shown.plane.normal
-    row, column, inside = plan.grid.cells(points)
-    inside[inside] = mask[row[inside], column[inside]]
-    return inside
+    return plan.grid.values(mask, points)
 
 
 def _extent(plan: FloorPlan, shown: Shown) -> np.ndarray:

@@ -8,6 +8,7 @@ stores.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -24,8 +25,6 @@ from interactive_nav_common.rotations import yaw_matrix
 RESOLUTION_M = 0.05
 BAND_M = (0.02, 1.2)
 """Heights at which a robot meets things."""
-WHOLE_POINTS = 8
-"""Points (a third of a cell apart) that show a cell's floor entirely."""
 NOISE_M = 0.08
 """Reconstructed floors wave by a few centimetres: what is lower than this is floor, not obstacle."""
 CLOSE_CELLS = 2
@@ -66,6 +65,12 @@ class Grid:
         inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
         return row, column, inside
 
+    def values(self, mask: np.ndarray, points_w: np.ndarray) -> np.ndarray:
+        """(n,) of a (rows, columns) mask at (n, 2+) world points; False outside."""
+        row, column, inside = self.cells(points_w)
+        inside[inside] = mask[row[inside], column[inside]]
+        return inside
+
     def centres_w(self, rows: slice = slice(None), columns: slice = slice(None)) -> np.ndarray:
         """(rows, columns, 2) middles of the cells in the world, m."""
         row, column = np.meshgrid(
@@ -90,10 +95,6 @@ class FloorPlan:
     grid: Grid
     floor: np.ndarray
     """(rows, columns) bool: floor seen, or taken to be there."""
-    floor_seen: np.ndarray
-    """(rows, columns) bool: floor seen at least in part of the cell."""
-    floor_whole: np.ndarray
-    """(rows, columns) bool: floor seen in all of the cell."""
     occupied: np.ndarray
     """(rows, columns) bool: static structure in the robot's height band."""
     traversable: np.ndarray
@@ -265,9 +266,7 @@ def make_floor_plan(
             "check the floor's labels and height"
         )
     height = _heights(shown, occupied)
-    return FloorPlan(
-        grid, floor, floor_seen, shown.floor >= WHOLE_POINTS, occupied, traversable, shown.wall_height_m, leaf, height
-    )
+    return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -362,17 +361,8 @@ def resample(grid: Grid, mask: np.ndarray, resolution_m: float) -> tuple[np.ndar
     columns, rows = np.ceil((high - low) / resolution_m).astype(int) + 1
     result = np.ones((int(rows), int(columns)), bool)
     inset = 0.0 if grid.yaw else 0.25  # corner samples, drawn in a little where cells coincide
-    for dy, dx in (
-        (0.5, 0.5),
-        (inset, inset),
-        (inset, 1 - inset),
-        (1 - inset, inset),
-        (1 - inset, 1 - inset),
-    ):
+    for dy, dx in ((0.5, 0.5), *itertools.product((inset, 1 - inset), repeat=2)):
         r, c = np.indices(result.shape)
         sample = np.stack([c + dx, r + dy], axis=-1).reshape(-1, 2) * resolution_m + low
-        row, column, inside = grid.cells(sample)
-        value = np.zeros(len(sample), bool)
-        value[inside] = mask[row[inside], column[inside]]
-        result &= value.reshape(result.shape)
+        result &= grid.values(mask, sample).reshape(result.shape)
     return result, (float(low[0]), float(low[1]))

@@ -23,7 +23,7 @@ from converters.check.gates import LIMITS
 from converters.check.settle import settle
 from converters.clock import STAGES
 from converters.pipeline import ConvertConfig, convert
-from converters.read.files import read_textured_obj
+from converters.read.files import read_obj
 from converters.records.errors import SceneRejected
 from converters.records.gate import Limit
 from converters.structure.floor import LIFT_M
@@ -291,7 +291,8 @@ def test_a_small_whole_scan_is_drawn_as_it_is(tmp_path, hull_cache):
     room.export(tmp_path / "raw" / "room.obj")
     upright = dataclasses.replace(SMALL, up="z")
     convert(tmp_path / "raw" / "room.obj", tmp_path / "room", upright, None, hull_cache)
-    vertices, faces, corner_uv = read_textured_obj(tmp_path / "room" / "assets" / "structure_visual.obj")
+    mesh = read_obj(tmp_path / "room" / "assets" / "structure_visual.obj")
+    vertices, faces, corner_uv = mesh.vertices, mesh.faces, mesh.corner_uv
     assert (np.asarray(Image.open(tmp_path / "room" / "assets" / "structure.png").convert("RGB")) == colours).all()
     assert corner_uv is not None and len(faces) == 12
     # Its image holds the light of the place: the scene adds an even one, that a ceiling gets as a floor does.

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 import yaml
 
-from converters.geometry.simplify import loose_parts, simplify_within, surface_distance
+from converters.geometry.simplify import Surface, loose_parts, simplify_within
 from converters.library.build import MOST_FACES, SELECTION, as_catalogued, make_model, on_top, read_selection
 from converters.library.catalogue import Piece, read_catalogue
 from converters.library.store import ATTRIBUTION, PACKED, attribution, read_index, read_shape, write_library
@@ -87,8 +87,8 @@ def test_simplification_keeps_every_part_within_its_error():
     vertices, faces = box_of_boxes()
     low, kept = simplify_within(vertices, faces, 0.01)
     assert len(kept) < len(faces) / 8 and len(np.unique(loose_parts(kept, len(low)))) == 2
-    assert surface_distance(vertices, low, kept).max() <= 0.0101
-    assert surface_distance(low, vertices, faces).max() <= 0.0101
+    assert Surface(low, kept).distance(vertices).max() <= 0.0101
+    assert Surface(vertices, faces).distance(low).max() <= 0.0101
 
 
 def test_a_piece_takes_its_catalogues_size():
