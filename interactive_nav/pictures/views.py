@@ -2,7 +2,7 @@
 
 Everything is cast with MuJoCo's rays from the scene's visual meshes, so pictures are the same on a laptop, a
 cluster node without a display and in the tests. Walls are cut low where one looks in from outside.
-Policies see `interactive_nav.rendering` (or nothing but numbers); nothing here is on their path.
+Policies see `interactive_nav.sensing` (or nothing but numbers); nothing here is on their path.
 """
 
 from __future__ import annotations

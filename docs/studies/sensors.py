@@ -1,4 +1,4 @@
-"""`python -m interactive_nav.rendering SCENE -o sensors.png`: a scene folder in, its four streams side by side out."""
+"""`python -m docs.studies.sensors SCENE -o sensors.png`: a scene folder in, its four streams side by side out."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def as_rgb(stream: str, image: np.ndarray, depth_range_m: float = 5.0) -> np.nda
 
 def main(argv: list[str] | None = None) -> int:
     """Draws one picture."""
-    parser = argparse.ArgumentParser(prog="python -m interactive_nav.rendering", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m docs.studies.sensors", description=__doc__)
     parser.add_argument("scene", help="scene folder")
     parser.add_argument("-o", "--out", required=True, type=Path)
     parser.add_argument("--robot", default="turtlebot")
