@@ -28,7 +28,6 @@ from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import MaskClasses
 
 FORMAT = 1
-_CHUNK_STEPS = 50
 _ARRAYS = (
     *("start_xy_w", "goal_xy_w", "body_pos_w", "body_quat_w", "action", "reward", "force_n"),
     *("touches_movable", "touches_structure"),
@@ -140,7 +139,7 @@ class EpisodePlayer:
         self.env, self.name, self.label = env, name, label
         self._reset = jax.jit(jax.vmap(env.reset))
         self._planner = planner
-        self._chunk = jax.jit(functools.partial(_play_chunk, env, policy)) if policy else None
+        self._policy = jax.jit(functools.partial(_action, policy)) if policy else None
         self._step = jax.jit(functools.partial(_play_step, env))
 
     def play(self, key: jax.Array, episode: int = 0, on_progress: Callable[[int], None] = lambda step: None) -> Replay:
@@ -149,30 +148,23 @@ class EpisodePlayer:
         Args:
             key: the episode is drawn from it, and the policy's chances follow from it.
             episode: its number, for captions.
-            on_progress: told the number of steps taken, now and then.
+            on_progress: told the number of steps taken, after each.
         """
         state = self._reset(key[None])
         policy_key = policy_key_of(key)
         first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
-        parts, qpos = [], [np.asarray(state.pipeline_state.qpos)]
-        ended, step = False, 0
-        while not ended:
-            if self._chunk is not None:
-                state, steps = self._chunk(state, policy_key, step)
+        start_qpos, told = np.asarray(state.pipeline_state.qpos), []
+        while not told or not told[-1]["done"]:
+            if self._policy is not None:
+                action = self._policy(state.obs, policy_key, len(told))
             else:
                 assert self._planner is not None
-                state, steps = self._step(state, jnp.asarray(self._planner(state, episode, step), jnp.float32))
-                steps = jax.tree.map(lambda x: x[None], steps)
-            steps = jax.tree.map(np.asarray, steps)
-            done = np.flatnonzero(steps["done"])
-            ended = len(done) > 0
-            last = int(done[0]) + 1 if ended else len(steps["done"])
-            parts.append({name: values[:last] for name, values in steps.items()})
-            qpos.append(parts[-1]["qpos"])
-            step += last
-            on_progress(step)
-        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return _replay_of(self, episode, first, joined, np.concatenate(qpos))
+                action = jnp.asarray(self._planner(state, episode, len(told)), jnp.float32)
+            state, out = self._step(state, action)
+            told.append(jax.tree.map(np.asarray, out))
+            on_progress(len(told))
+        joined = {name: np.stack([out[name] for out in told]) for name in told[0]}
+        return _replay_of(self, episode, first, joined, np.concatenate([start_qpos, joined["qpos"]]))
 
 
 def _replay_of(
@@ -216,15 +208,10 @@ def policy_key_of(key: jax.Array) -> jax.Array:
     return jax.random.fold_in(key, zlib.crc32(b"policy"))
 
 
-def _play_chunk(env: InteractiveNav, policy: Any, state: Any, key: jax.Array, step: jax.Array) -> Any:
-    """`_CHUNK_STEPS` steps; what `_play_step` tells, stacked."""
-
-    def one_step(state: Any, t: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
-        obs = jax.tree.map(lambda x: x[0], state.obs)
-        action = jnp.asarray(policy(obs, jax.random.fold_in(key, step + t)), jnp.float32)
-        return _play_step(env, state, action[None])
-
-    return jax.lax.scan(one_step, state, jnp.arange(_CHUNK_STEPS))
+def _action(policy: Any, obs: Any, key: jax.Array, step: jax.Array) -> jax.Array:
+    """[1, A] for observations with leaves [1, ...]."""
+    action = policy(jax.tree.map(lambda x: x[0], obs), jax.random.fold_in(key, step))
+    return jnp.asarray(action, jnp.float32)[None]
 
 
 def _play_step(env: InteractiveNav, state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
