@@ -15,6 +15,7 @@ from scipy.spatial.distance import pdist
 
 from converters.check.agreement import manifest_values, wall_values
 from converters.check.surfaces import surface_values
+from converters.geometry.density import clearance_m
 from converters.records.gate import Gate, Limit
 from converters.structure.maps import label_pieces
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
@@ -135,11 +136,7 @@ def physical_values(model: mujoco.MjModel) -> dict[str, float]:
 
 def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
     """Cells whose middle is at least the radius from all that is not traversable, map edge included."""
-    padded = np.pad(traversable, 1)
-    distance = ndimage.distance_transform_edt(padded)
-    assert isinstance(distance, np.ndarray)
-    # The transform measures to the middle of the nearest blocked cell; its edge is half a cell nearer.
-    return ((distance - 0.5) * resolution_m >= radius_m)[1:-1, 1:-1]
+    return clearance_m(traversable, resolution_m) >= radius_m
 
 
 def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ from converters.check.object_preview import draw_object, geom_outline
 from converters.check.surfaces import geom_mesh
 from converters.check.views import CUT_M, EYE_M, EYE_VIEW_RAD, at_eye_height, from_above, from_the_south, world_surfaces
 from converters.geometry.boxes import convex_hull
+from converters.geometry.faces import face_vectors
 from converters.read.meshes import textured_by_face
 from converters.records.raw import RawScene, ScanMesh
 from converters.records.visual import TexturedMesh
@@ -164,7 +165,7 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
     for item in scene.manifest.objects:
         surface = scene.surfaces[item.name]
         corners = surface.vertices[surface.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = face_vectors(surface.vertices, surface.faces)
         light = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
         order = np.argsort(corners[:, :, 2].max(axis=1), kind="stable")
         colours = np.outer(0.55 + 0.45 * light, CATEGORIES[item.category].preview_colour)[order]

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from PIL import Image
 
+from converters.geometry.faces import face_vectors
 from converters.records.visual import TexturedMesh
 
 NEAR_M, FAR_M = 0.05, 100.0
@@ -92,7 +93,7 @@ class Picture:
         """
         assert mesh.corner_uv is not None and mesh.texture is not None
         corners = mesh.vertices[mesh.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = face_vectors(mesh.vertices, mesh.faces)
         pixels, depth = self._camera.project(corners)
         with np.errstate(all="ignore"):
             inverse = np.linalg.det(pixels)

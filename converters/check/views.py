@@ -12,6 +12,7 @@ from PIL import Image
 from converters.check.render import Camera, Picture, looking_at, over
 from converters.check.surfaces import geom_surface
 from converters.geometry.density import clearance_m
+from converters.geometry.faces import face_vectors
 from converters.records.visual import TexturedMesh
 from scenes_mjcf.schema import SceneMaps
 
@@ -72,8 +73,7 @@ def from_the_south(
 def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh:
     """The structure less upright faces that look south where no floor lies south of them."""
     assert structure.corner_uv is not None
-    corners = structure.vertices[structure.faces]
-    normal, centre = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
+    normal, centre = face_vectors(structure.vertices, structure.faces), structure.vertices[structure.faces].mean(axis=1)
     first = np.where(maps.traversable.any(axis=0), maps.traversable.argmax(axis=0), len(maps.traversable))
     column = np.floor((centre[:, 0] - maps.origin_w[0]) / maps.resolution_m).astype(int)
     south_m = maps.origin_w[1] + maps.resolution_m * first[np.clip(column, 0, len(first) - 1)]

@@ -25,10 +25,24 @@ def face_labels(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where((b == c) & (a != b), b, a)
 
 
+def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m, 3) normals of the faces, twice as long as their areas (m2)."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    return np.cross(b - a, c - a)
+
+
+def vertex_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(n, 3) sums of the `face_vectors` around each vertex."""
+    own, out = face_vectors(vertices, faces), np.zeros_like(vertices)
+    for k in range(3):
+        for corner in range(3):
+            out[:, k] += np.bincount(faces[:, corner], own[:, k], len(vertices))
+    return out
+
+
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(m,) m2."""
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return np.linalg.norm(face_vectors(vertices, faces), axis=1) / 2
 
 
 def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:

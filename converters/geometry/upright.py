@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.geometry.faces import face_areas
+from converters.geometry.faces import face_areas, face_vectors
 from converters.records.errors import SceneRejected
 
 AXES = {word: sign * np.eye(3)[k] for k, axis in enumerate("xyz") for word, sign in ((axis, 1.0), (f"-{axis}", -1.0))}
@@ -26,8 +26,7 @@ SURE = 1.25
 
 
 def _vectors(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
     return normal / np.maximum(length, 1e-300)[:, None], length / 2
 

@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.patches import Patch, Polygon
 from shapely import MultiPoint
 
+from converters.bodies.alignment import apply_alignment
 from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_corners, box_iou, propose_instances
 from converters.propose.retrieval import (
     Comparison,
@@ -74,17 +75,7 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
         text = f"{proposal.category} {proposal.confidence:.2f}"
         model = found.retrieved.get(k)
         if model is not None:
-            outline = MultiPoint(
-                model.cad.vertices[:, :2]
-                * model.pose.scale[:2]
-                @ np.array(
-                    [
-                        [np.cos(model.pose.yaw), np.sin(model.pose.yaw)],
-                        [-np.sin(model.pose.yaw), np.cos(model.pose.yaw)],
-                    ]
-                )
-                + model.pose.translation[:2]
-            ).convex_hull
+            outline = MultiPoint(apply_alignment(model.pose, model.cad.vertices)[:, :2]).convex_hull
             axes.add_patch(
                 Polygon(np.asarray(outline.exterior.coords), fill=True, alpha=0.25, facecolor=colour, edgecolor=colour)
             )

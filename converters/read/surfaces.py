@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from converters.geometry.faces import sample_faces
+from converters.geometry.faces import face_vectors, sample_faces, vertex_vectors
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M
@@ -25,12 +25,6 @@ FLOOR_SHARE = 0.05
 FLOOR_BIN_M, LEVEL_SHARE = 0.05, 0.2
 LONG_M, FINE_M = 0.5, 0.1
 """A face with an edge longer than the first is wall or not as a whole, by points so far apart on it as the second."""
-
-
-def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m, 3) normals of the faces, as long as their areas (m2)."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a) / 2
 
 
 def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -73,7 +67,7 @@ def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
         SceneRejected: nothing is level, or it is too large.
     """
     check_extent(where, vertices)
-    area = face_vectors(vertices, faces)
+    area = face_vectors(vertices, faces) / 2
     level = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
     height, size = vertices[faces[level], 2].mean(axis=1), area[level, 2]
     if not len(height):
@@ -102,11 +96,7 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
     Returns:
         (n,) int64.
     """
-    normal = np.zeros_like(vertices)
-    area = face_vectors(vertices, faces)
-    for k in range(3):
-        for axis in range(3):
-            normal[:, axis] += np.bincount(faces[:, k], area[:, axis], len(vertices))
+    normal, area = vertex_vectors(vertices, faces), face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
     up = np.divide(normal[:, 2], length, out=np.zeros(len(vertices)), where=length > 0)
     z = vertices[:, 2] - floor_height_m
@@ -163,7 +153,7 @@ def check_upright(
         SceneRejected: no floor faces up, or it is too large.
     """
     check_extent(where, vertices)
-    area = face_vectors(vertices, faces)
+    area = face_vectors(vertices, faces) / 2
     if labels is not None:
         is_floor = (labels[faces] == FLOOR).all(axis=1)
         seen = np.abs(area[is_floor]).sum(axis=0)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import face_areas, face_labels, sample_faces
+from converters.geometry.faces import face_areas, face_labels, face_vectors, sample_faces
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
 from converters.records.visual import ColourCloud
 from converters.structure.floor import LIFT_M
@@ -96,8 +96,7 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
     """
     label = face_labels(labels, faces)
     area = face_areas(vertices, faces)
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a) / np.maximum(2 * area, 1e-12)[:, None]
+    normal = face_vectors(vertices, faces) / np.maximum(2 * area, 1e-12)[:, None]
     left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
     middle = vertices[faces].mean(axis=1)
     flat = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-9)
@@ -141,8 +140,7 @@ def seen_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> np.n
     Panels and pillars that stand out of a wall are among them: a patch over them would be a second layer.
     """
     candidates = np.flatnonzero(np.abs(plane.distance(vertices))[faces].max(axis=1) < BESIDE_M)
-    corners = vertices[faces[candidates]]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = face_vectors(vertices, faces[candidates])
     along = normal @ plane.normal
     return candidates[(along > 0.7 * np.linalg.norm(normal, axis=1)) & (along > 1e-9)]
 
@@ -202,7 +200,7 @@ def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarra
     shadow = np.zeros(plan.grid.shape, bool)
     for placed in objects:
         plan.grid.add_below(shadow, to_world(placed, placed.vertices_b), SHADOW_M)
-    floor = ndimage.binary_propagation(plan.floor, mask=plan.floor | (shadow & ~plan.occupied))
+    floor = np.asarray(ndimage.binary_propagation(plan.floor, mask=plan.floor | (shadow & ~plan.occupied)), bool)
     return floor | ndimage.binary_closing(floor, np.ones((5, 5)))  # what the cut left of a leg stands on floor too
 
 

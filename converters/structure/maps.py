@@ -17,7 +17,7 @@ from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import beyond_block, face_labels, sampled
+from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 from interactive_nav_common.rotations import yaw_matrix
@@ -113,8 +113,7 @@ def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray
 
     Less than 1 degree counts as 0: the map then needs no turning."""
     wall = np.isin(face_labels(labels, faces), [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)])
-    a, b, c = (vertices_w[faces[wall, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_vectors(vertices_w, faces[wall])
     length = np.linalg.norm(normal, axis=1)
     steep = (length > 0) & (np.abs(normal[:, 2]) < 0.2 * length)
     if not steep.any():
@@ -292,8 +291,7 @@ def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.nd
     counts, top, heights = np.zeros((4, *grid.shape), np.int64), np.zeros(grid.shape), [np.zeros(0)]
     facing, turn = np.zeros((2, *grid.shape)), yaw_matrix(grid.yaw)[:2, 1::-1]
     kept, of_structure = np.flatnonzero(of_face != CEILING), np.isin(of_face, STRUCTURE_LABELS)
-    a, b, c = (vertices_w[faces[:, k]] for k in range(3))
-    unit = np.cross(b - a, c - a)
+    unit = face_vectors(vertices_w, faces)
     unit = unit[:, :2] / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     spacing_m = grid.resolution_m / 3
     # A large face's points are pushed off the cells' borders: along a wall on one, rounding would share them out.

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from converters.geometry.faces import BLOCK, sample_faces
+from converters.geometry.faces import BLOCK, face_vectors, sample_faces, vertex_vectors
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
@@ -46,11 +46,10 @@ def colour_cloud(
     normal = np.cross(b - a, c - a)
     if scan.texture is None or scan.corner_uv is None:
         assert scan.vertex_colours is not None
-        summed = np.zeros_like(vertices_w)
-        for k in range(3):
-            np.add.at(summed, chosen[:, k], normal)
         used = np.unique(chosen)
-        return ColourCloud(vertices_w[used], _unit(summed[used]), scan.vertex_colours[used].astype(float))
+        return ColourCloud(
+            vertices_w[used], _unit(vertex_vectors(vertices_w, chosen)[used]), scan.vertex_colours[used].astype(float)
+        )
     spacing_m = max(spacing_m, math.sqrt(np.linalg.norm(normal, axis=1).sum() / CLOUD))
     points, index = sample_faces(vertices_w, chosen, spacing_m)
     middle = sample_faces(
@@ -195,11 +194,10 @@ def bake_structure(
     """
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
     known, sought = cloud.points, point
     if turned_m:
         known = np.hstack([known, turned_m * cloud.normals])
-        sought = np.hstack([point, turned_m * _unit(np.cross(b - a, c - a))[face]])
+        sought = np.hstack([point, turned_m * _unit(face_vectors(vertices, faces))[face]])
     distance, index = KDTree(known).query(sought, k=min(3, len(known)))
     distance, index = distance.reshape(len(point), -1), index.reshape(len(point), -1)
     weight = 1.0 / (distance + 0.002)
@@ -237,8 +235,7 @@ def bake_object(
     texel, point, face = texel_surface(low_vertices, low_faces, uv, uv_faces, size)
     normal = np.asarray(trimesh.triangles.normals(low_vertices[low_faces])[0])
     if len(normal) != len(low_faces):  # degenerate faces are dropped by the library
-        a, b, c = (low_vertices[low_faces[:, k]] for k in range(3))
-        normal = _unit(np.cross(b - a, c - a))
+        normal = _unit(face_vectors(low_vertices, low_faces))
     sample, sample_face = sample_faces(vertices, faces, max(0.02, float(np.ptp(vertices, axis=0).max()) / 60))
     on_face = sample_face[KDTree(sample).query(point)[1]]
     cad_colour = face_colours[on_face].astype(float)

@@ -13,6 +13,7 @@ import numpy as np
 from converters.generate.surface.finishes import Colouring
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas, charts_of, face_axes, pack_rows
+from converters.geometry.faces import face_vectors
 
 SHEETS = (1024, 1536, 2048)
 """Sides that a sheet may have, texels; on the largest the resolution is lowered until all fits."""
@@ -49,8 +50,7 @@ class Chart:
 
     def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Its rectangle: corner (3,), unit edges (2, 3) and normal (3,), size (2,) in metres."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        normal = np.cross(b - a, c - a).sum(axis=0)
+        normal = face_vectors(self.vertices, self.faces).sum(axis=0)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
         edge = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
         u = np.cross(edge, normal)

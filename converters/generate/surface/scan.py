@@ -20,6 +20,7 @@ from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
+from converters.geometry.faces import vertex_vectors
 from converters.records.raw import FLOOR, WALL
 from scenes_mjcf.categories import TABLE
 
@@ -111,12 +112,7 @@ def seen_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volu
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(n, 3) unit normals, weighted by face area; (0, 0, 1) where there are no faces."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face_normals = np.cross(b - a, c - a)
-    out = np.zeros_like(vertices)
-    for k in range(3):
-        for corner in range(3):
-            out[:, k] += np.bincount(faces[:, corner], face_normals[:, k], len(vertices))
+    out = vertex_vectors(vertices, faces)
     length = np.linalg.norm(out, axis=1, keepdims=True)
     return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
 

@@ -19,6 +19,7 @@ from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Room, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
+from converters.geometry.faces import face_vectors
 from converters.records.visual import TexturedMesh
 from converters.write.texture import textured_cloud
 
@@ -42,8 +43,7 @@ class Atlas:
 
 def face_axes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(m,) 0..5: +x, -x, +y, -y, +z, -z, the axis that each face's normal is closest to."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = face_vectors(vertices, faces)
     axis = np.abs(normals).argmax(axis=1)
     return 2 * axis + (normals[np.arange(len(faces)), axis] < 0)
 
@@ -246,8 +246,7 @@ def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m:
     """
     uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
     faces_at = face_image(uv, face_uv, side).ravel()
-    a, b, c = (scan.vertices[scan.faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = face_vectors(scan.vertices, scan.faces)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     rows, columns = np.divmod(np.arange(side * side), side)
     points = texel_positions(uv, face_uv, scan, faces_at, np.stack([columns + 0.5, rows + 0.5], axis=1))

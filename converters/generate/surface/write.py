@@ -16,6 +16,7 @@ from converters.generate.models.cad import CadModel
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas
+from converters.geometry.faces import face_vectors
 from converters.records.visual import VisualMesh
 
 LICENCE = """CC0 1.0 Universal
@@ -107,8 +108,7 @@ def _write_parts(folder: Path, model: CadModel) -> None:
     for k, part in enumerate(model.parts):
         faces = part.faces
         if part.open:
-            a, b, c = (part.vertices[faces[:, i]] for i in range(3))
-            normal = np.cross(b - a, c - a)
+            normal = face_vectors(part.vertices, faces)
             faces = faces[normal[:, 1] > -0.99 * np.linalg.norm(normal, axis=1)]
         chunks += [f"o part_{k}\nusemtl {part.material}\n", _rows("v %.6f %.6f %.6f\n", part.vertices)]
         chunks.append(_rows("f %d %d %d\n", faces + base))

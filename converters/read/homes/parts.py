@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from converters.geometry.faces import merge_vertices, sample_faces
+from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
@@ -22,7 +22,7 @@ from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes
 from converters.read.storeys import label_storeys, storey_of
-from converters.read.surfaces import face_vectors, floor_level, with_own_corners
+from converters.read.surfaces import floor_level, with_own_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
@@ -190,7 +190,7 @@ def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
 
 def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The faces that look up, but for those below others by up to `SLAB_M`: the slab under a floor is no floor."""
-    area = face_vectors(vertices, faces)
+    area = face_vectors(vertices, faces) / 2
     level = faces[area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)]
     corners, height = vertices[level], vertices[level, 2].mean(axis=1)
     plan: Any = shapely.polygons(corners[..., :2])
