@@ -15,9 +15,9 @@ from converters.records.visual import TexturedMesh
 
 COLLISION = "collision.obj"
 """Beside a model: its collision mesh, made of convex pieces that share no vertex."""
-MOST_OWN = 8
+MOST_OWN = 10
 """Convex pieces of a model that came with its own."""
-OWN_SLACK = 0.03
+OWN_SLACK = 0.007
 """Share of the model's bounding box that joining two of them may add: slats become a back, legs stay legs."""
 
 

@@ -208,6 +208,7 @@ def shower_curtain(side=0.85, height=2.0, cloth="teal", metal="chrome") -> list[
 
 
 DRAWINGS = {
+    "stove_ceramic": Drawing("stove", stove_ceramic),
     "stove_range": Drawing("stove", stove_range, held_out=True),
     "stove_hood": Drawing("stove", stove_hood, held_out=True),
     "fridge_combined": Drawing("fridge", fridge_doors),
