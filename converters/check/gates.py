@@ -56,7 +56,7 @@ LIMITS: dict[str, Limit] = {
     "walls": Limit("count", most=200, meaning="wall boxes"),
     "surface_kept": Limit("share", least=0.9, meaning="of a model's area, what is drawn"),
     "unseen_hulls": Limit(
-        "share", most=0.1, meaning="of an object's hulls' sides, what lies over 10 cm from what is drawn"
+        "share", most=0.13, meaning="of an object's hulls' sides, what lies over 10 cm from what is drawn"
     ),
     "unsolid_surface": Limit("share", most=0.1, meaning="of what is drawn, what lies over 5 cm outside of the hulls"),
 }

@@ -39,10 +39,12 @@ def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | Non
         return None
     if mesh.corner_uv.min() < -1e-6 or mesh.corner_uv.max() > 1 + 1e-6:
         return None
-    used, faces = np.unique(mesh.faces, return_inverse=True)
+    # Corners of different charts lie in one place: the place is written once.
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    _, first, faces = np.unique(np.round(corners, 5), axis=0, return_index=True, return_inverse=True)
     uv, uv_faces = np.unique(np.clip(mesh.corner_uv, 0, 1).reshape(-1, 2), axis=0, return_inverse=True)
     shape = (-1, 3)
-    return VisualMesh(mesh.vertices[used], faces.reshape(shape), uv, uv_faces.reshape(shape), mesh.texture, True)
+    return VisualMesh(corners[first], faces.reshape(shape), uv, uv_faces.reshape(shape), mesh.texture, True)
 
 
 def draw_objects(

@@ -244,14 +244,14 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
     spec.worldbody.add_light(
         name="light",
         pos=[round(float(middle[0]), 3), round(float(middle[1]), 3), 4.0],
-        dir=[0, 0, -1],
+        dir=[0.25, 0.35, -0.9] if lit else [0, 0, -1],
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         castshadow=False,
-        diffuse=[0.2] * 3 if lit else [0.6] * 3,
-        ambient=[0.6] * 3 if lit else [0.4] * 3,
+        diffuse=[0.25] * 3 if lit else [0.6] * 3,
+        ambient=[0.5] * 3 if lit else [0.4] * 3,
     )
     if lit:
-        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.3] * 3, [0.1] * 3
+        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.25] * 3, [0.15] * 3
 
 
 def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) -> None:
