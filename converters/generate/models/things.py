@@ -239,7 +239,7 @@ DRAWINGS = {
     "bin_pedal": Drawing("bin", bin_pedal),
     "bin_open": Drawing("bin", bin_open),
     "suitcase_hard": Drawing("suitcase", suitcase_hard),
-    "suitcase_vintage": Drawing("suitcase", suitcase_vintage),
+    "suitcase_vintage": Drawing("suitcase", suitcase_vintage, held_out=True),
     "plant_monstera": Drawing("plant", plant_monstera, held_out=True),
     "plant_cactus": Drawing("plant", plant_cactus, held_out=True),
     "floor_lamp_shade": Drawing("floor_lamp", lamp_shade, "__SYM_ROTATE_UP_INF"),
