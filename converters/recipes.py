@@ -209,7 +209,7 @@ def load_recipes(path: Path) -> Recipes:
 
 
 def missed(building: BuildingConfig | HomeConfig, made: Converted) -> str:
-    """Which share a converted home was asked for and does not have; empty: none.
+    """Which share a converted home was asked for and does not have, or which gate it fails; empty: none.
 
     Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
 
@@ -218,6 +218,8 @@ def missed(building: BuildingConfig | HomeConfig, made: Converted) -> str:
         made: the scene, measured.
     """
     asked = building.must_push if isinstance(building, HomeConfig) else {}
+    if failed := [gate.name for gate in made.gates if not gate.passed and isinstance(building, HomeConfig)]:
+        return f"gates that fail once converted: {', '.join(failed)}"
     for robot, (low, high) in asked.items():
         share = made.manifest.measures["must_push_share"][robot]
         if not low - SHARE_TOLERANCE <= share <= high + SHARE_TOLERANCE:
