@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from converters.__main__ import main
-from converters.generate.homes.config import TIERS
+from converters.generate.homes.config import TIERS, HomeConfig
 from converters.recipes import load_recipes
 from interactive_nav.episodes import load
 from scenes_mjcf.schema import SceneError, load_manifest
@@ -41,10 +41,11 @@ def test_a_committed_tier_lists_what_its_recipes_make(tier: str, seed: int) -> N
     listed, recipes = read_set(folder / "set.json"), load_recipes(folder / "recipes.yaml").scenes
     assert listed.tier == tier and {r.tier for r in recipes} == {tier}
     assert {r.name: (r.split, r.seed) for r in recipes} == {n: (m.split, m.seed) for n, m in listed.scenes.items()}
-    assert sorted(m.split for m in listed.scenes.values()) == ["test"] * 2 + ["train"] * 8
+    assert sorted(m.split for m in listed.scenes.values()) == ["test"] * 3 + ["train"] * 8
     assert min(m.seed for m in listed.scenes.values()) == seed
+    assert sum(r.building.artefacts == "phone" for r in recipes if isinstance(r.building, HomeConfig)) == 2
     digests = [m.digest for m in listed.scenes.values()]
-    assert len(set(digests)) == 10 and all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
+    assert len(set(digests)) == 11 and all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
     wanted = TIERS[tier]
     for name, member in listed.scenes.items():
         assert set(member.measures["must_push_share"]) == {"turtlebot", "fetch"}
@@ -75,6 +76,11 @@ def test_fixed_episodes_are_in_the_scenes_of_their_split(tier: str, robot: str) 
         arrives += sum(open_) / len(open_) * len(of_split) / len(listed)
     low, high = ARRIVES[tier, robot]
     assert low <= arrives <= high
+    if tier == "cluttered":  # in each home to test in
+        test = load(ROOT / "scenes_mjcf" / "episodes" / f"{tier}-{robot}-test.json.gz").episodes
+        for k in range(3):
+            free = [not row["push_needed"] for row in test if row["scene"] == k]
+            assert low <= sum(free) / len(free) <= high
 
 
 @pytest.mark.heavy

@@ -39,8 +39,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--south", action="store_true")
     arguments = parser.parse_args()
-    views = [np.asarray(view(scene, arguments.south)) for scene in arguments.scenes]
-    views = [np.clip(v * (255 if v.dtype.kind == "f" and v.max() <= 1.01 else 1), 0, 255).astype(np.uint8) for v in views]
+    views = [view(scene, arguments.south) for scene in arguments.scenes]
     if len(views) % 2 and not arguments.south:
         views.append(np.full_like(views[0], 255))
     rows = [views] if arguments.south else [views[k : k + 2] for k in range(0, len(views), 2)]
