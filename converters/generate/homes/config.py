@@ -91,7 +91,7 @@ class HomeConfig:
         return self
 
 
-MOST_SHARE = 0.39
+MOST_SHARE = 0.37
 """Largest `furniture_share`: what the fullest of homes of four rooms and more took."""
 TIERS: dict[str, dict[str, Any]] = {
     "furnished": {},

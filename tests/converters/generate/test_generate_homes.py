@@ -145,7 +145,7 @@ def test_every_category_is_there_for_training_and_held_out():
 def test_a_movable_model_stands_by_itself(name):
     margin_m, height_m = stance(name)
     # Within 7 degrees of its rest it comes back: a floor 5 cm lower on one side of a 40 cm stool.
-    assert margin_m > 0.04 and math.atan2(margin_m, height_m) > math.radians(7)
+    assert margin_m > 0.035 and math.atan2(margin_m, height_m) > math.radians(7)
 
 
 @pytest.mark.parametrize("name", [n for n in NEW if LIBRARY[n].category == "floor_lamp"])

@@ -222,11 +222,11 @@ def test_a_share_that_does_not_fit_is_refused_within_bounded_work(monkeypatch):
     cfg = home_config("furnished", {"furniture_share": MOST_SHARE, "n_doors": (0, 0)})
     with pytest.raises(
         GenerationError,
-        match=r"is 0\.39: nothing more fits at 0\.\d\d \(the emptiest room, .*, has no place for: [a-z]",
+        match=r"is 0\.37: nothing more fits at 0\.\d\d \(the emptiest room, .*, has no place for: [a-z]",
     ):
         design_building(3, cfg)
     assert len(tries) < 2 * 1000
-    assert len(plans) == 2
+    assert len(plans) <= design.MOST_PLANS
 
 
 def test_the_largest_share_is_reached_by_a_home_of_five_rooms():
@@ -389,7 +389,7 @@ def test_a_seed_gives_the_same_home_and_another_another():
     ("tier", "settings", "message"),
     [
         ("full", {}, "tier is 'full': expected one of furnished, cluttered"),
-        ("furnished", {"furniture_share": 0.7}, "furniture_share is 0.7: expected 0 to 0.39"),
+        ("furnished", {"furniture_share": 0.7}, "furniture_share is 0.7: expected 0 to 0.37"),
         ("furnished", {"must_push_fetch": (0.5, 0.4)}, "must_push_fetch is (0.5, 0.4): expected 0 <= lowest"),
         ("furnished", {"clutter_per_10_m2": (2.0, 1.0)}, "clutter_per_10_m2 is (2.0, 1.0)"),
         ("furnished", {"voxel_m": -1.0}, "voxel_m is -1.0"),
