@@ -45,9 +45,11 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.linalg.norm(face_vectors(vertices, faces), axis=1) / 2
 
 
-def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
+def sample_faces(
+    vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
+) -> tuple[np.ndarray, np.ndarray]:
     """Points on every face no further apart than the spacing, by even barycentric steps (no chance involved), or by
-    even rows where these would be more than a block.
+    even rows on faces with more than `most_steps` of these: long thin ones then need few.
 
     Returns:
         points (k, 3) m, face (k,) the face each lies on.
@@ -57,20 +59,30 @@ def sample_faces(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> t
     """
     if len(faces) == 0:
         return np.zeros((0, 3)), np.zeros(0, np.int64)
-    corners = vertices[faces]
-    steps, short = _steps(corners, spacing_m).astype(float), _sides(corners).min(axis=1) / spacing_m
-    count = float(np.where(beyond_block(corners, spacing_m), steps * (short / 2 + 1), steps**2 / 2).sum())
+    count = count_samples(vertices, faces, spacing_m, most_steps)
     check_count(
         "a surface", count, SAMPLES, f"points at {spacing_m:g} m", "remove long thin faces, or split the source"
     )
-    points, index = zip(*sampled(vertices, faces, spacing_m), strict=True)
+    points, index = zip(*sampled(vertices, faces, spacing_m, most_steps), strict=True)
     return np.concatenate(points), np.concatenate(index)
 
 
-def sampled(vertices: np.ndarray, faces: np.ndarray, spacing_m: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def count_samples(
+    vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
+) -> float:
+    """How many points `sample_faces` gives, about."""
+    corners = vertices[faces]
+    steps, short = _steps(corners, spacing_m).astype(float), _sides(corners).min(axis=1) / spacing_m
+    return float(np.where(steps > most_steps, steps * (short / 2 + 1), steps**2 / 2).sum())
+
+
+def sampled(
+    vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The points of `sample_faces` and their faces, in blocks that fit the memory however large the faces are."""
-    corners, beyond = vertices[faces], beyond_block(vertices[faces], spacing_m)
+    corners = vertices[faces]
     steps = _steps(corners, spacing_m)
+    beyond = steps > most_steps
     for n in np.unique(steps[~beyond]):
         i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
         u, v = (i[i + j < n] + 1 / 3) / n, (j[i + j < n] + 1 / 3) / n

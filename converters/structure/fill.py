@@ -16,7 +16,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import face_areas, face_labels, face_vectors, sample_faces
+from converters.geometry.faces import count_samples, face_areas, face_labels, face_vectors, sample_faces
+from converters.records.limits import CLOUD
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
 from converters.records.visual import ColourCloud
 from converters.structure.floor import LIFT_M
@@ -31,6 +32,8 @@ MIN_WALL_M2 = 0.5
 MAX_WALLS = 60
 BESIDE_M = 0.10
 """Surface parallel to a plane and this near to it stands in its place."""
+LONG_STEPS = 100
+"""Steps of sampling along a drawn face beyond which it counts as long: simplified walls are slivers."""
 OVERLAP, FREE = 5, 2
 """Cells that a patch reaches under the scan around it, and beyond where nothing was seen (past a corner)."""
 BEHIND_M = 0.002
@@ -281,7 +284,9 @@ def fill_holes(
     done, clouds = [], []
     for plane in (ground, *planes):
         tolerance_m = FLOOR_TOLERANCE_M if plane is ground else WALL_TOLERANCE_M
-        points, _ = sample_faces(scan[0], scan[1][seen_in_plane(*scan, plane)], cell_m / 2)
+        faces = scan[1][seen_in_plane(*scan, plane)]
+        fine = count_samples(scan[0], faces, cell_m / 2, LONG_STEPS) < CLOUD
+        points, _ = sample_faces(scan[0], faces, cell_m / 2 if fine else cell_m, LONG_STEPS)
         if plane is ground:
             # The scan's floor is level by now; what is drawn below it is a reflection.
             points = points[plane.distance(points) > -1e-6]

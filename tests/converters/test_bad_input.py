@@ -82,8 +82,9 @@ def test_coacd_failing_on_one_object(gibson_raw, tmp_path, monkeypatch):
     manifest = load_manifest(tmp_path / "out")
     assert manifest.collision["convex_hull_only"] == ["table-a"]
     assert {o.name: o.n_hulls for o in manifest.objects} == {"table_0": 1, "basket_0": 1}
-    (warning,) = manifest.warnings
+    warning, gate = manifest.warnings
     assert warning.startswith("coacd failed on table-a") and warning.endswith("its convex hull stands for it")
+    assert gate == "unseen_hulls: table_0 is worst"  # a robot does not get below its top
     config = ConvertConfig(structure_texture=64, object_texture=32, strict=True)
     with pytest.raises(StageFailed, match="coacd failed on table-a"):
         convert(gibson_raw, tmp_path / "strict", config, cache=tmp_path / "cache")
@@ -95,7 +96,8 @@ def test_the_timeout_is_an_option(gibson_raw, tmp_path, monkeypatch):
     source, out = str(gibson_raw), tmp_path / "out"
     assert main(["convert", source, str(out), "--timeout", "0.001", "--strict"]) == 2
     assert not out.exists()
-    assert main(["convert", source, str(out), "--timeout", "0.001"]) == 0
+    assert main(["convert", source, str(out), "--timeout", "0.001"]) == 1  # the gate on what is hit unseen
+    assert not load_manifest(out).gates["unseen_hulls"]["passed"]
     assert load_manifest(out).collision["convex_hull_only"] == ["basket-a", "table-a"]
 
 

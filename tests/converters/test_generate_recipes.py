@@ -66,7 +66,7 @@ def test_a_tier_makes_a_home_with_the_split_s_models():
             ["--tier", "furnished", "furniture_shar=0.2"],
             "unknown key 'furniture_shar', did you mean 'furniture_share'?",
         ),
-        (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9: expected 0 to 0.39"),
+        (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9: expected 0 to 0.37"),
         (["--tier", "furnished", "furniture_share=x"], "furniture_share is 'x', expected a float"),
         (["--tier", "furnished", "n_chairs=3"], "unknown key 'n_chairs'"),
         (["n_rooms=[3"], "n_rooms: cannot read '[3', expected a number or [lowest, highest]"),
@@ -122,6 +122,7 @@ def test_a_name_that_leads_elsewhere_removes_nothing(tmp_path, capsys, name):
 def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(tmp_path, monkeypatch):
     tried: list[int] = []
     shares: dict[int, float] = {}  # of the pairs for Fetch, by try
+    broken: set[int] = set()  # tries whose scene fails a gate
 
     def generate(raw, seed, report, building):
         tried.append(seed)
@@ -130,7 +131,8 @@ def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(
 
     def convert(raw, made, config, report):
         measures = {"must_push_share": {"turtlebot": 0.05, "fetch": shares.get(len(tried), 0.3)}}
-        return SimpleNamespace(manifest=SimpleNamespace(measures=measures))
+        gates = (SimpleNamespace(name="drift_hulls", passed=len(tried) not in broken),)
+        return SimpleNamespace(manifest=SimpleNamespace(measures=measures), gates=gates)
 
     def made(recipe):
         tried.clear()
@@ -146,7 +148,10 @@ def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(
     given, shares = 0, {1: 0.7233, 2: 0.421, 3: 0.42}  # asked: at most 0.40, met to within 0.02
     made(home)
     assert tried == [3, 1_000_003, 2_000_003]
-    shares = dict.fromkeys(range(9), 0.9)
+    shares, broken = {}, {1}
+    made(home)
+    assert tried == [3, 1_000_003]
+    shares, broken = dict.fromkeys(range(9), 0.9), set()
     made(plain)  # a sparse building asks for no share
     with pytest.raises(
         GenerationError, match="a: none of 5 seeds: must_push_fetch is 0.9 once converted: expected 0.0"
