@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from converters.read.files import as_number
 from converters.records.errors import SceneRejected
 
 PROPERTIES = "PluginFurnitureCatalog.properties"
@@ -75,10 +76,7 @@ def _number(of: dict[str, str], key: str, where: str, default: float | None = No
     text = of.get(key)
     if text is None and default is not None:
         return default
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
+    value = as_number(text)
     if not math.isfinite(value):
         raise SceneRejected(f"{where}: {key} is {text!r}, expected a number of centimetres; fetch the library again")
     return value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -339,3 +340,11 @@ def _ears(outline: np.ndarray) -> np.ndarray | None:
         else:
             return None
     return np.array(found)
+
+
+def as_number(text: str | None) -> float:
+    """A number; NaN where the text is none."""
+    try:
+        return float(text or "")
+    except ValueError:
+        return math.nan

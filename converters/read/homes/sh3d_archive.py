@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from converters.read.files import as_number
 from converters.records.errors import SceneRejected
 from converters.records.limits import ENTRIES, UNPACKED, check_count
 
@@ -114,10 +115,7 @@ def number(element: ElementTree.Element, key: str, default: float | None = None)
     text = element.get(key)
     if text is None and default is not None:
         return default
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
+    value = as_number(text)
     if not abs(value) <= MOST:
         raise SceneRejected(f"{called(element)}: {key} is {(text or '')[:40]!r}, expected a number; mend the drawing")
     return value

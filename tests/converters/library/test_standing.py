@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from converters.bodies.alignment import Alignment
 from converters.bodies.objects import place_object
 from converters.bodies.physical import physical_properties
-from converters.check.gates import LIMITS, collide_with, physical_values
+from converters.check.gates import collide_with, judge, physical_values
 from converters.check.settle import settle
 from converters.generate.models.cad import cad_model
+from converters.generate.models.parts import hull
 from converters.geometry.boxes import Hull
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.library.store import read_index
@@ -24,8 +26,8 @@ MOVABLE = sorted(n for n, m in read_index().items() if CATEGORIES[m.category].is
 SCALES = (np.array([1.07, 0.95, 1.02]), np.array([0.94, 1.05, 0.97]))
 
 
-def turned_and_tilted(name: str, scale: np.ndarray) -> None:
-    """Checks that a model at rest stays so for the gates' five seconds."""
+def what_fails(name: str, scale: np.ndarray) -> list[str]:
+    """What a model at rest does that the gates' five seconds do not allow: "hull drift 0.02"."""
     model = cad_model(name)
     pieces = tuple((p.vertices @ Y_UP_TO_Z_UP.T, p.faces) for p in model.parts)
     vertices = np.vstack([v for v, _ in pieces])
@@ -37,24 +39,30 @@ def turned_and_tilted(name: str, scale: np.ndarray) -> None:
     settled = settle(SceneParts("it", (placed,), (physical_properties(model.category, placed.hulls_b),), ())).parts
     turn = settled.objects[0].quaternion_w
     tilt_deg = math.degrees(math.acos(1 - 2 * float(turn[1] ** 2 + turn[2] ** 2)))
-    assert tilt_deg < 3.0, f"{name}: leans by {tilt_deg:.1f} degrees once it rests"
-    for shape in ("hull", "box"):
-        model_at_rest = collide_with(build_spec(settled), shape)
-        model_at_rest.opt.timestep = 0.005
-        for quantity, value in physical_values(model_at_rest).items():
-            kind = "hulls" if shape == "hull" else "boxes"
-            limit = LIMITS["finite" if quantity == "finite" else f"{quantity}_{kind}"]
-            assert limit.least is None or value >= limit.least, (name, shape, quantity, value)
-            assert limit.most is None or value <= limit.most, (name, shape, quantity, value)
+    failed = [f"leans by {tilt_deg:.1f} degrees once it rests"] if tilt_deg >= 3.0 else []
+    for shape, kind in (("hull", "hulls"), ("box", "boxes")):
+        at_rest = collide_with(build_spec(settled), shape)
+        at_rest.opt.timestep = 0.005
+        for quantity, value in physical_values(at_rest).items():
+            gate = judge("finite" if quantity == "finite" else f"{quantity}_{kind}", value)
+            failed += [] if gate.passed else [f"{shape} {quantity} {value:.4g}"]
+    return failed
+
+
+def test_what_falls_over_is_told(monkeypatch):
+    corners = np.array([(x + 6 * (y > 0), y, z) for x in (0, 1) for y in (0, 9) for z in (0, 1)]) / 10.0
+    tower = dataclasses.replace(cad_model(MOVABLE[0]), parts=(hull(corners, "oak"),), unit_m=1.0)
+    monkeypatch.setitem(globals(), "cad_model", lambda name: tower)
+    assert any("leans by" in line for line in what_fails("tower", np.ones(3)))
 
 
 @pytest.mark.parametrize("name", MOVABLE[::12])
 def test_a_model_stands(name):
-    turned_and_tilted(name, SCALES[0])
+    assert what_fails(name, SCALES[0]) == []
 
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", MOVABLE)
 @pytest.mark.parametrize("scale", SCALES, ids=("wide", "tall"))
 def test_every_model_stands(name, scale):
-    turned_and_tilted(name, scale)
+    assert what_fails(name, scale) == []
