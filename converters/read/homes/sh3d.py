@@ -47,6 +47,8 @@ STOREY_M = 1.8
 LEAF_M = 0.04
 REBATE_M = 0.012
 TURN_MOST_RAD = math.radians(120)
+AJAR_RAD = math.radians(10)
+"""A leaf that is drawn farther from both ends of its swing stands ajar."""
 LOW_TABLE_M = 0.5
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
 """Ids, less what stands before #, of shapes that people build all kinds of things from."""
@@ -305,11 +307,14 @@ def _part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:
 
 
 def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of a leaf in the door's own frame: (2,) hinge, its angles at the start and end of its swing, its width (m)."""
+    """Of a leaf in the door's own frame: (2,) hinge, its angles at the start and end of its swing, its width (m).
+
+    Angles turn as the plan is seen: -90 degrees is towards the front.
+    """
     width, depth = metres(e, "width", "depth")
     side = -1.0 if e.get("modelMirrored") == "true" else 1.0
     at = np.array([side * (number(sash, "xAxis") - 0.5) * width, (0.5 - number(sash, "yAxis")) * depth])
-    angles = -np.array([number(sash, key, 0.0) for key in ("startAngle", "endAngle")])
+    angles = np.array([number(sash, key, 0.0) for key in ("startAngle", "endAngle")])
     return at, angles if side > 0 else math.pi - angles, number(sash, "width") * float(width)
 
 
@@ -333,7 +338,8 @@ def _swing(
     middle = (leaf.min(axis=0) + leaf.max(axis=0))[:2] / 2 - at
     drawn = math.atan2(middle[1], middle[0])
     gaps = [abs(math.remainder(a - drawn, math.tau)) for a in angles]
-    turns = np.clip(angles - angles[int(np.argmin(gaps))], -TURN_MOST_RAD, TURN_MOST_RAD)
+    at_rest = drawn if min(gaps) > AJAR_RAD else angles[int(np.argmin(gaps))]
+    turns = np.clip([math.remainder(a - at_rest, math.tau) for a in angles], -TURN_MOST_RAD, TURN_MOST_RAD)
     return np.array([*at, leaf[:, 2].min()]), (float(turns.min()), float(turns.max()))
 
 

@@ -202,8 +202,8 @@ def test_a_leaf_swings_about_its_sash(raw):
     assert leaf.hinge is not None and not leaf.hinge.assumed
     # The door is turned a quarter clockwise: its left, where the hinge is, is up in the plan.
     assert (leaf.pose[:3, :3] @ leaf.hinge.origin + leaf.pose[:3, 3])[:2] == pytest.approx([4.02, -1.85])
-    # From shut it turns counter-clockwise as seen from above.
-    assert leaf.hinge.range_rad == pytest.approx((0.0, math.pi / 2), abs=0.05)
+    # -90 degrees is towards the door's front, to the left in the plan: from shut it turns clockwise as seen from above.
+    assert leaf.hinge.range_rad == pytest.approx((-math.pi / 2, 0.0), abs=0.05)
     assert np.ptp(placed(raw, "Door"), axis=0) == pytest.approx([0.04, 0.9, 1.99], abs=1e-3)
 
 
@@ -222,7 +222,16 @@ def test_leaves_of_a_double_door_part_in_the_middle(tmp_path):
     assert leaves[0][:, 0].min() == pytest.approx(1.5) and leaves[1][:, 0].max() == pytest.approx(2.5)
     assert (leaves[0][:, 0].max(), leaves[1][:, 0].min()) == pytest.approx((1.988, 2.012))
     spans = [a.hinge.range_rad for a in raw.annotations if a.hinge is not None]
-    assert spans == [pytest.approx((0, math.pi / 2), abs=0.1), pytest.approx((-math.pi / 2, 0), abs=0.1)]
+    assert spans == [pytest.approx((-math.pi / 2, 0), abs=0.1), pytest.approx((0, math.pi / 2), abs=0.1)]
+
+
+def test_a_leaf_that_is_drawn_ajar_turns_both_ways(tmp_path):
+    swing = "<sash xAxis='0.05' yAxis='0.8' width='0.9' startAngle='0.7' endAngle='-0.9'/>"
+    ajar = piece(
+        "Door", 405, 230, "100 10 205", "catalogId='eTeks#door' model='2' angle='1.5707964'", swing, "doorOrWindow"
+    )
+    raw = read_sh3d(write_home(tmp_path, [*HOME[:5], ajar]))
+    assert [a.hinge.range_rad for a in raw.annotations if a.hinge] == [pytest.approx((-0.9, 0.7), abs=0.05)]
 
 
 def test_colours_are_the_drawings(raw):
