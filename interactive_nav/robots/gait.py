@@ -1,4 +1,4 @@
-"""A legged robot's joints and gait in, one `RobotSpec` per control mode out; its body is in `mjcf/<robot>.xml`.
+"""A row of `models/legged.yaml` and a gait in, one `RobotSpec` per control mode out; bodies: `mjcf/<robot>.xml`.
 
 A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
 targets are `home + reference(phase, command, base)`, a scripted stepping motion.
@@ -15,7 +15,16 @@ from typing import Any, NamedTuple
 import mujoco
 
 from interactive_nav.robots.build import FOLDER, read_file
-from interactive_nav.robots.spec import ControlLaw, RobotSpec, RobotState, TwistMap, check_mode, set_servo
+from interactive_nav.robots.spec import (
+    ControlLaw,
+    Figures,
+    RobotSpec,
+    RobotState,
+    TwistMap,
+    check_mode,
+    read_rows,
+    set_servo,
+)
 from interactive_nav_common.rotations import yaw_from_quat
 
 
@@ -80,13 +89,13 @@ class Legged:
     """Of a joint in mode `velocity`."""
     frequency_hz: float
     """Cycles of the gait a second."""
-    reference: Callable[[Any, Any, BaseMotion, Any], Any]
-    """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
     max_linear_m_s: float
     max_angular_rad_s: float
     modes: tuple[str, ...] = ("native", "position", "velocity", "twist")
     native: str = "torque"
     """What the original's actions are: `torque` or `position` of the joints."""
+    reference: Callable[[Any, Any, BaseMotion, Any], Any] | None = None
+    """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
 
     def body(self) -> mujoco.MjSpec:
         """The robot's file, parsed."""
@@ -108,10 +117,29 @@ class Legged:
         return tuple(float(joint.actfrcrange[1]) for joint in self._joints_of_file)
 
 
+@dataclasses.dataclass(frozen=True)
+class Row(Figures):
+    """A robot of `models/legged.yaml`."""
+
+    legs: Legged
+    spawn_height_m: float
+    contact_time_constant_s: float | None = None
+    gait: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Figures of its gait when it is told to go, and when told to stand; the other robots' stand with their gaits."""
+
+
+@functools.cache
+def legged_row(name: str) -> Row:
+    """A legged robot's row."""
+    rows = read_rows(FOLDER.parent / "models" / "legged.yaml", Row)
+    return next(row for row in rows if row.legs.name == name)
+
+
 def gait_law(legs: Legged) -> ControlLaw:
     """Twist to joint targets [..., J], rad, within the joints' ranges."""
 
     def law(command, state, xp):
+        assert legs.reference is not None
         phase = 2.0 * math.pi * legs.frequency_hz * state.time_s
         offsets = legs.reference(phase, command, base_motion(state, xp), xp)
         of_joints = (legs.home, *zip(*legs.ranges, strict=True))
@@ -151,14 +179,14 @@ def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
         set_servo(actuator, gains, {"velocity": (-100.0, 100.0), "torque": (-torque, torque)}.get(mode, limits))
 
 
-def legged_robot(legs: Legged, control_mode: str, **figures: Any) -> RobotSpec:
+def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> RobotSpec:
     """The spec of a legged robot in a control mode.
 
     Args:
         legs: its body, joints and gait.
         control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and
             angular velocity through the gait.
-        **figures: other fields of `RobotSpec`, or other values of those set here.
+        **figures: of `RobotSpec`, in place of those set here.
 
     Raises:
         ConfigError: unknown mode.
@@ -185,5 +213,5 @@ def legged_robot(legs: Legged, control_mode: str, **figures: Any) -> RobotSpec:
         control_modes=legs.modes,
         control_every_substep=twist,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), legs.max_linear_m_s, legs.max_angular_rad_s) if twist else None,
-        **(fields | figures),
+        **(fields | legged_row(legs.name).figures("legs", "gait") | figures),
     )

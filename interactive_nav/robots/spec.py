@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
 
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.records import Reader
 
 
 class RobotState(NamedTuple):
@@ -176,3 +178,34 @@ class RobotSpec:
                 f"choose another of its modes: {', '.join(self.control_modes)}"
             )
         return self.action(xp.stack([linear_m_s, angular_rad_s], -1) @ xp.asarray(self.twist.matrix).T, xp)
+
+
+@dataclasses.dataclass(frozen=True)
+class Figures:
+    """Fields of a `RobotSpec` that tables of robots (`models/*.yaml`) have."""
+
+    body_width_m: float
+    footprint_radius_m: float
+    height_m: float
+    camera: RobotCamera
+    mass_kg: float
+    size_m: tuple[float, float, float]
+    drive_type: str
+    source: str
+
+    def figures(self, *others: str) -> dict[str, Any]:
+        """By name, without the row's other columns."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in others}
+
+
+Row = TypeVar("Row", bound=Figures)
+
+
+def read_rows(path: Path, kind: type[Row]) -> tuple[Row, ...]:
+    """A table of robots that comes with the package.
+
+    Raises:
+        FileError: it is missing or damaged.
+    """
+    reader = Reader(FileError, "install the package again")
+    return reader.typed(reader.decoded(path.read_bytes(), "YAML", str(path)), tuple[kind, ...], str(path))

@@ -20,7 +20,7 @@ from train.learners import networks
 
 @dataclasses.dataclass(frozen=True)
 class ActorCritic(abc.ABC):
-    """All that learning does not change; with what its algorithm adds, an `offpolicy.Agent`.
+    """All that learning does not change; SAC and DDPG add what makes them SAC and DDPG.
 
     Its learner has `policy_params`, `policy_optimizer_state`, `q_params`, `q_optimizer_state`, `target_q_params`,
     `normalizer_params` and `gradient_steps`.
@@ -38,6 +38,28 @@ class ActorCritic(abc.ABC):
     @abc.abstractmethod
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
         """Of policy, of critics, and of what else the algorithm learns."""
+
+    @abc.abstractmethod
+    def init(self, key_networks: jax.Array, key: jax.Array) -> Any:
+        """A learner that has learned nothing; `key` is what its updates will draw from."""
+
+    @abc.abstractmethod
+    def policy(self, learner: Any, deterministic: bool) -> types.Policy:
+        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+
+    @abc.abstractmethod
+    def init_noise(self) -> Any:
+        """Exploration noise of every environment at the start of an episode."""
+
+    @abc.abstractmethod
+    def explore(self, learner: Any, observation: Any, noise: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+        """Actions [envs, A] in [-1, 1] to learn from, and the noise after them."""
+
+    @abc.abstractmethod
+    def gradient_step(
+        self, learner: Any, transitions: types.Transition, key: jax.Array
+    ) -> tuple[Any, dict[str, jax.Array]]:
+        """The learner after one gradient step on transitions [batch, ...], and its scalar metrics."""
 
     def begun(self, key: jax.Array) -> dict[str, Any]:
         """The fields of a learner that has learned nothing."""

@@ -94,7 +94,7 @@ def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: 
 
 @dataclasses.dataclass(frozen=True)
 class DDPG(ActorCritic):
-    """All that learning does not change; an `offpolicy.Agent`."""
+    """All that learning does not change."""
 
     config: DDPGConfig
     networks: DDPGNetworks
@@ -109,8 +109,9 @@ class DDPG(ActorCritic):
         common = self.begun(key_networks)
         return DDPGState(**common, target_policy_params=common["policy_params"], key=key)
 
-    def policy(self, learner: DDPGState) -> types.Policy:
-        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); never random."""
+    def policy(self, learner: DDPGState, deterministic: bool = True) -> types.Policy:
+        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); never random, whatever is asked."""
+        del deterministic
         params = self.whole_policy(learner.policy_params, learner.q_params)
 
         def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
@@ -174,9 +175,4 @@ def make_agent(env: Env, config: TrainConfig) -> DDPG:
 
 train = functools.partial(offpolicy.train, make_agent)
 template = functools.partial(offpolicy.template, make_agent)
-
-
-def policy(env: Env, config: TrainConfig, learner: DDPGState, deterministic: bool) -> types.Policy:
-    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); the same whether `deterministic` or not."""
-    del deterministic
-    return make_agent(env, config).policy(learner)
+policy = functools.partial(offpolicy.policy, make_agent)

@@ -98,6 +98,15 @@ def whole_updates(steps: int, steps_per_update: int) -> int:
     return max(1, math.ceil(steps / steps_per_update))
 
 
+def resumed(begin: Snapshot, callbacks: Callbacks, seed: int, reset: Callable[[jax.Array, PyTree], PyTree]) -> Snapshot:
+    """A run's first state, or its checkpoint; `reset` (key, first `env_state`) begins the episodes that it lacks."""
+    restored = callbacks.restore(begin)
+    if restored is None or restored.env_state is not None:
+        return restored or begin
+    key = jax.random.fold_in(jax.random.PRNGKey(seed), restored.env_steps)
+    return dataclasses.replace(restored, env_state=reset(key, begin.env_state))
+
+
 def run_loop(
     update_fn: UpdateFn, start: Snapshot, steps_per_update: int, run: RunConfig, callbacks: Callbacks
 ) -> TrainResult:

@@ -13,22 +13,21 @@ count like any others.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from brax.envs import Env
 from brax.training import types
-from brax.training.acme import running_statistics
 
 from interactive_nav_common.errors import ConfigError
 from train.config import OffPolicyConfig, TrainConfig
 from train.learners import networks, replay_buffer
-from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
+from train.learners.actor_critic import ActorCritic
+from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, resumed, run_loop
 from train.learners.replay_buffer import Replay
 
 
@@ -52,57 +51,12 @@ class OffPolicyData:
         return replay_buffer.describe(self.replay)
 
 
-class Learner(Protocol):
-    """All that learning changes (a flax dataclass), as far as this module knows it."""
-
-    @property
-    def normalizer_params(self) -> running_statistics.RunningStatisticsState:
-        """Of the vector part of observations."""
-        ...
-
-    @property
-    def gradient_steps(self) -> jax.Array:
-        """() i32: taken since the start of the run."""
-        ...
-
-    @property
-    def key(self) -> jax.Array:
-        """What the next update draws from."""
-        ...
-
-    def replace(self, **changes: Any) -> Any:
-        """A copy with some fields changed."""
-        ...
+MakeAgent = Callable[[Env, TrainConfig], ActorCritic]
 
 
-class Agent(Protocol):
-    """What makes SAC SAC and DDPG DDPG; changes nothing, holds no state."""
-
-    @property
-    def config(self) -> OffPolicyConfig:
-        """Resolved settings."""
-        ...
-
-    def init(self, key_networks: jax.Array, key: jax.Array) -> Any:
-        """A learner that has learned nothing; `key` is what its updates will draw from."""
-        ...
-
-    def init_noise(self) -> Any:
-        """Exploration noise of every environment at the start of an episode."""
-        ...
-
-    def explore(self, learner: Any, observation: Any, noise: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Actions [envs, A] in [-1, 1] to learn from, and the noise after them."""
-        ...
-
-    def gradient_step(
-        self, learner: Any, transitions: types.Transition, key: jax.Array
-    ) -> tuple[Any, dict[str, jax.Array]]:
-        """The learner after one gradient step on transitions [batch, ...], and its scalar metrics."""
-        ...
-
-
-def collect(agent: Agent, env: Env, learner: Any, data: OffPolicyData, key: jax.Array) -> tuple[OffPolicyData, Any]:
+def collect(
+    agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData, key: jax.Array
+) -> tuple[OffPolicyData, Any]:
     """Acts for one update.
 
     Returns:
@@ -138,7 +92,7 @@ def collect(agent: Agent, env: Env, learner: Any, data: OffPolicyData, key: jax.
     return jax.lax.scan(step, data, jax.random.split(key, agent.config.steps_per_update))
 
 
-def learn(agent: Agent, learner: Any, replay: Replay, key: jax.Array) -> tuple[Any, dict[str, jax.Array], Any]:
+def learn(agent: ActorCritic, learner: Any, replay: Replay, key: jax.Array) -> tuple[Any, dict[str, jax.Array], Any]:
     """Takes gradient steps, if the replay is full enough.
 
     Returns:
@@ -173,7 +127,7 @@ def learn(agent: Agent, learner: Any, replay: Replay, key: jax.Array) -> tuple[A
     return learner, {**means, "gradient_steps": count.astype(jnp.float32)}, draw(key_draw)
 
 
-def update(agent: Agent, env: Env, learner: Any, data: OffPolicyData) -> tuple[Any, OffPolicyData, Update]:
+def update(agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData) -> tuple[Any, OffPolicyData, Update]:
     """Acts, then learns."""
     key_act, key_learn, key_next = jax.random.split(learner.key, 3)
     data, seen = collect(agent, env, learner, data, key_act)
@@ -190,11 +144,11 @@ def update(agent: Agent, env: Env, learner: Any, data: OffPolicyData) -> tuple[A
     return learner, data, Update(losses, sums, finite, {"collected": seen, "learned": batch})
 
 
-def start(agent: Agent, env: Env, section: str, seed: int) -> Snapshot:
+def start(agent: ActorCritic, env: Env, section: str, seed: int) -> Snapshot:
     """The first state of learner, environments and replay, derived from the seed.
 
     Args:
-        agent: see `Agent`.
+        agent: see `ActorCritic`.
         env: natively batched and resetting itself.
         section: of the config, for messages.
         seed: of the run.
@@ -211,7 +165,7 @@ def start(agent: Agent, env: Env, section: str, seed: int) -> Snapshot:
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
 
 
-def reset_envs(agent: Agent, env: Env, key: jax.Array) -> Any:
+def reset_envs(agent: ActorCritic, env: Env, key: jax.Array) -> Any:
     """New episodes in every environment."""
     return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
 
@@ -227,9 +181,7 @@ def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
         )
 
 
-def train(
-    make_agent: Callable[[Env, TrainConfig], Agent], env: Env, config: TrainConfig, callbacks: Callbacks
-) -> TrainResult:
+def train(make_agent: MakeAgent, env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
     """Trains a policy.
 
     Args:
@@ -243,21 +195,18 @@ def train(
         DivergedError: see `train.learners.learner.run_loop`.
     """
     agent = make_agent(env, config)
-    begin = start(agent, env, config.algorithm, config.run.seed)
-    restored = callbacks.restore(begin)
-    if restored is not None:
-        empty: Any = begin.env_state
-        begin = restored
-        if begin.env_state is None:
-            key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), begin.env_steps)
-            env_state = reset_envs(agent, env, key)
-            begin = dataclasses.replace(begin, env_state=empty.replace(env_state=env_state))
-        del empty  # two replays might not fit
+    begin, seed = start(agent, env, config.algorithm, config.run.seed), config.run.seed
+    begin = resumed(begin, callbacks, seed, lambda key, old: old.replace(env_state=reset_envs(agent, env, key)))
     steps_per_update = (agent.config.num_envs or 0) * (agent.config.steps_per_update or 0)
     return run_loop(functools.partial(update, agent, env), begin, steps_per_update, config.run, callbacks)
 
 
-def template(make_agent: Callable[[Env, TrainConfig], Agent], env: Env, config: TrainConfig) -> Any:
+def template(make_agent: MakeAgent, env: Env, config: TrainConfig) -> Any:
     """A learner in the shape of this config's checkpoints."""
     key = jax.random.PRNGKey(0)
     return make_agent(env, config).init(key, key)
+
+
+def policy(make_agent: MakeAgent, env: Env, config: TrainConfig, learner: Any, deterministic: bool) -> types.Policy:
+    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+    return make_agent(env, config).policy(learner, deterministic)

@@ -31,8 +31,9 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import optimizer as ppo_optimizer
 
 from train.config import NetworkConfig, PPOConfig, TrainConfig
+from train.learners import learner as loop
 from train.learners import networks as nets
-from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, run_loop
+from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums
 
 
 @flax.struct.dataclass
@@ -326,11 +327,6 @@ def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
     """
     parts = parts_of(env, config)
     begin = start(parts, env, config.run.seed)
-    restored = callbacks.restore(begin)
-    if restored is not None:
-        begin = restored
-        if begin.env_state is None:
-            key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), begin.env_steps)
-            begin = dataclasses.replace(begin, env_state=reset_envs(parts, env, key))
+    begin = loop.resumed(begin, callbacks, config.run.seed, lambda key, _: reset_envs(parts, env, key))
     update_fn = functools.partial(update, parts, env)
-    return run_loop(update_fn, begin, parts.steps_per_update, config.run, callbacks)
+    return loop.run_loop(update_fn, begin, parts.steps_per_update, config.run, callbacks)

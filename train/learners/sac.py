@@ -54,7 +54,7 @@ class SACState:
 
 @dataclasses.dataclass(frozen=True)
 class SAC(ActorCritic):
-    """All that learning does not change; an `offpolicy.Agent`."""
+    """All that learning does not change."""
 
     config: SACConfig
     networks: sac_networks.SACNetworks
@@ -145,8 +145,4 @@ def make_agent(env: Env, config: TrainConfig) -> SAC:
 
 train = functools.partial(offpolicy.train, make_agent)
 template = functools.partial(offpolicy.template, make_agent)
-
-
-def policy(env: Env, config: TrainConfig, learner: SACState, deterministic: bool) -> types.Policy:
-    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-    return make_agent(env, config).policy(learner, deterministic)
+policy = functools.partial(offpolicy.policy, make_agent)

@@ -12,24 +12,19 @@ which keep the chains from folding through themselves, and no collisions of the 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
-from interactive_nav.robots.gait import Legged, Servo, legged_robot
-from interactive_nav.robots.spec import RobotCamera, RobotSpec
+from interactive_nav.robots.gait import legged_robot, legged_row
+from interactive_nav.robots.spec import RobotSpec
 
-UPPER_M, LOWER_M = 0.115, 0.2
-FOOT_Y_M = 0.107
-TOE_RADIUS_M = 0.0125
-HOME_RAD = math.pi / 2
-_DROP_M = math.sqrt(LOWER_M**2 - UPPER_M**2)
-_KNEE_HOME_RAD = math.atan2(_DROP_M, UPPER_M) - math.pi
+_UPPER_M, _LOWER_M, _FOOT_Y_M = 0.115, 0.2, 0.107
+_DROP_M = math.sqrt(_LOWER_M**2 - _UPPER_M**2)
+_KNEE_HOME_RAD = math.atan2(_DROP_M, _UPPER_M) - math.pi
 _LEGS = (("front_left", 1, 1), ("back_left", -1, 1), ("front_right", 1, -1), ("back_right", -1, -1))
 """Name, sign of x, sign of y; the original's order of motors."""
-JOINTS = tuple(f"minitaur_motor_{leg}_{link}" for leg, _, _ in _LEGS for link in ("fore", "aft"))
-
-
-_FREQUENCY_HZ = 3.24
+_ROW = legged_row("minitaur").legs
 _LIFT_RAD = 0.285
 _PRESS = 0.17
 """Legs on the ground push down by this share of the lift."""
@@ -48,27 +43,14 @@ def _reference(phase, command, base, xp):
     for _, x, y in _LEGS:
         at = phase + (0.0 if x * y > 0 else math.pi)
         # A foot on the ground sweeps v / (2 f), 0.164 m below its hip.
-        speed = _STRIDE_GAIN * forward - y * _TURN_GAIN * FOOT_Y_M * turn
-        swing = -speed / (4.0 * _FREQUENCY_HZ) / _DROP_M * xp.cos(at + _LAG_RAD)
+        speed = _STRIDE_GAIN * forward - y * _TURN_GAIN * _FOOT_Y_M * turn
+        swing = -speed / (4.0 * _ROW.frequency_hz) / _DROP_M * xp.cos(at + _LAG_RAD)
         lift = _LIFT_RAD * effort * (xp.maximum(xp.sin(at), 0.0) - _PRESS)
         out += [swing + lift, -swing + lift]
     return xp.stack(out, -1)
 
 
-LEGS = Legged(
-    name="minitaur",
-    base_body="chassis",
-    joints=JOINTS,
-    home=(HOME_RAD,) * 8,
-    servo=Servo(stiffness=20.0, damping=0.35, velocity_gain=0.5),
-    max_speed_rad_s=30.0,
-    frequency_hz=_FREQUENCY_HZ,
-    reference=_reference,
-    max_linear_m_s=0.4,
-    max_angular_rad_s=0.5,
-    modes=("native", "position", "velocity", "torque", "leg", "twist"),
-    native="position",
-)
+LEGS = dataclasses.replace(_ROW, reference=_reference)
 
 
 def _leg_angles(command, state, xp):
@@ -91,23 +73,10 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
     Raises:
         ConfigError: unknown mode.
     """
-    figures: dict[str, Any] = {}
+    parts = (("motor", LEGS.home[0]), ("knee", _KNEE_HOME_RAD))
+    home = tuple((joint.replace("motor", part), value) for joint in LEGS.joints for part, value in parts)
+    figures: dict[str, Any] = {"home_qpos": home}
     if control_mode == "leg":
         names = tuple(f"{leg} {what}" for what in ("swing", "extension") for leg, _, _ in _LEGS)
-        figures = {"action_low": (-1.0,) * 8, "action_high": (1.0,) * 8, "action_names": names, "control": _leg_angles}
-    parts = (("motor", HOME_RAD), ("knee", _KNEE_HOME_RAD))
-    return legged_robot(
-        LEGS,
-        control_mode,
-        body_width_m=0.28,
-        footprint_radius_m=0.36,
-        height_m=0.23,
-        spawn_height_m=_DROP_M + TOE_RADIUS_M,
-        camera=RobotCamera("minitaur_chassis", (0.3, 0.0, 0.05)),
-        home_qpos=tuple((joint.replace("motor", part), value) for joint in JOINTS for part, value in parts),
-        mass_kg=6.0,
-        size_m=(0.65, 0.28, 0.21),
-        drive_type="4 closed-chain legs, 8 motors",
-        source="GibsonEnv minitaur.urdf; iGibson's motor model",
-        **figures,
-    )
+        figures |= {"action_low": (-1.0,) * 8, "action_high": (1.0,) * 8, "action_names": names, "control": _leg_angles}
+    return legged_robot(LEGS, control_mode, **figures)

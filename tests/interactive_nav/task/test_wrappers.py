@@ -16,7 +16,7 @@ from interactive_nav.physics.mjx_batch import JaxPhysics
 from interactive_nav.task.wrappers import AutoResetEnv, wrap_for_brax_training
 from interactive_nav_common.errors import ConfigError
 from tests.toys import write_room
-from train.learners import brax_compat
+from tests.train import brax_compat
 
 N, LIMIT = 4, 6
 AHEAD = jnp.full((N, 2), 0.6)

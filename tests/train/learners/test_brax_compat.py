@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from train.learners import brax_compat
+from tests.train import brax_compat
 
 
 def test_replicates_onto_each_device():
@@ -27,7 +27,7 @@ def test_replicates_onto_each_device():
 def test_two_devices_hold_a_copy_each():
     # The number of host devices is fixed when JAX starts, so this needs a process of its own.
     program = (
-        "import jax, jax.numpy as jnp; from train.learners import brax_compat\n"
+        "import jax, jax.numpy as jnp; from tests.train import brax_compat\n"
         "out = brax_compat.device_put_replicated(jnp.array([1., 2.]), jax.local_devices())\n"
         "assert out.shape == (2, 2), out.shape\n"
         "assert [s.data.tolist() for s in out.addressable_shards] == [[[1., 2.]], [[1., 2.]]]\n"
@@ -46,7 +46,7 @@ def test_two_devices_hold_a_copy_each():
 def test_is_still_needed():
     from brax.training.agents.ppo import train as brax_train
 
-    message = "train/brax_compat.py is no longer needed: delete it, its callers' install() and this test"
+    message = "tests/train/brax_compat.py is no longer needed: delete it, its callers' install() and this test"
     given = getattr(jax, "device_put_replicated", None)
     assert given is None or given is brax_compat.device_put_replicated, message
     assert "jax.device_put_replicated" in inspect.getsource(brax_train), message

@@ -13,9 +13,10 @@ from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as brax_ppo
 
+from tests.train import brax_compat
 from tests.train.toy_env import ToyConfig, ToyEnv, batched
 from train.config import EnvConfig, PPOConfig, RunConfig, TrainConfig
-from train.learners import brax_compat, ppo
+from train.learners import ppo
 from train.learners.learner import Snapshot, Update, episode_sums
 
 SMALL = PPOConfig(

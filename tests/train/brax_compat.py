@@ -1,7 +1,7 @@
 """Puts back `jax.device_put_replicated`, which Brax 0.14.2 calls and JAX 0.10 lacks (google/brax#671).
 
 Needed wherever Brax's own `train` functions are called on such a JAX. `install()` goes, with this file, when
-Brax releases a version that does without; `tests/train/test_brax_compat.py` says when that is.
+Brax releases a version that does without; `tests/train/learners/test_brax_compat.py` says when that is.
 """
 
 from __future__ import annotations
