@@ -11,9 +11,12 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
+import yaml
 
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.categories import MaskClasses, class_id
@@ -211,61 +214,17 @@ def _toy(name: str, length: float, width: float, mass: float, colour: Rgba, cab:
     return SmallObject(name, "toy", 9, mass, 0.4, boxes, colour, tuple(shapes))
 
 
-# Segmentation ids 6 to 10 are the original's five models. 6 and 8 are its baskets and 9 its toy (names in its
-# demos); the released URDF of 7 calls itself a plant container, so 7 is a pot, which leaves 10 for the shoe.
-#
-# Masses. Baskets: walls of 2 mm polypropylene (905 kg/m3), so 0.77 kg for the laundry basket's 0.42 m2; wicker
-# and wire alike; a moulded Euro box of 400 x 300 x 270 mm 1.6 kg. Shoes, each: running 0.23 to 0.37 kg, casual
-# 0.27 to 0.45, hiking boots 0.45 to 1.4, work boots 0.68 to 1.4 (decentfoot.com, trailhead.pldthome.com).
-# Pots with lid: 2 mm of steel (7,900 kg/m3) on 0.09 m2 weigh 1.4 kg, cast aluminium of 4 to 6 l 1.4 to 3.2 kg
-# (kitchprep.com); terracotta of 7 mm (1,950 kg/m3) on 0.18 m2 2.4 kg. Toys: a wooden truck of 34 x 12 x 15 cm
-# 1.0 kg (robberteebob.co.nz), plastic ones of 2.5 mm ABS (1,050 kg/m3) 0.3 to 0.7 kg.
-_TRAIN: dict[str, tuple[SmallObject, ...]] = {
-    "basket": (
-        _basket("basket_laundry", 6, 0.38, 0.28, 0.24, 0.9, _rgba(0.30, 0.62, 0.70)),
-        _basket("basket_bin", 8, 0.30, 0.30, 0.30, 0.7, _rgba(0.85, 0.80, 0.68), 2),
-        _basket("basket_wicker", 6, 0.42, 0.30, 0.20, 1.1, _rgba(0.66, 0.47, 0.27), 3),
-        _basket("basket_hamper", 8, 0.36, 0.34, 0.40, 1.4, _rgba(0.74, 0.60, 0.42), 4),
-        _basket("basket_wire", 6, 0.34, 0.24, 0.16, 0.6, _rgba(0.55, 0.56, 0.58), 2),
-    ),
-    "shoe": (
-        _shoe("shoe_sneaker", 0.28, 0.10, 0.38, _rgba(0.75, 0.20, 0.18)),
-        _shoe("shoe_flat", 0.25, 0.09, 0.32, _rgba(0.20, 0.28, 0.48)),
-        _shoe("shoe_running", 0.29, 0.105, 0.29, _rgba(0.20, 0.62, 0.35), 0.045),
-        _shoe("shoe_boot", 0.30, 0.11, 0.68, _rgba(0.42, 0.27, 0.15), 0.12, _rgba(0.15, 0.13, 0.12)),
-    ),
-    "pot": (
-        _pot("pot_steel", 0.24, 0.18, 1.4, _rgba(0.68, 0.70, 0.72)),
-        _pot("pot_milk", 0.18, 0.14, 0.9, _rgba(0.82, 0.25, 0.20)),
-        _pot("pot_shallow", 0.26, 0.11, 1.2, _rgba(0.22, 0.24, 0.27)),
-        _pot("pot_stock", 0.28, 0.22, 2.1, _rgba(0.60, 0.62, 0.66)),
-    ),
-    "toy": (
-        _toy("toy_car", 0.26, 0.16, 0.5, _rgba(0.90, 0.65, 0.10)),
-        _toy("toy_buggy", 0.18, 0.12, 0.3, _rgba(0.25, 0.45, 0.85)),
-        _toy("toy_truck", 0.34, 0.14, 1.0, _rgba(0.70, 0.50, 0.30), (0.30, 0.16, 0.04), _rgba(0.85, 0.30, 0.22)),
-        _toy("toy_bus", 0.28, 0.13, 0.55, _rgba(0.85, 0.20, 0.20), (0.0, 0.46, 0.04)),
-    ),
-}  # fmt: skip
-_TEST: dict[str, tuple[SmallObject, ...]] = {
-    "basket": (
-        _basket("basket_crate", 6, 0.40, 0.30, 0.27, 1.6, _rgba(0.32, 0.38, 0.30), 1),
-        _basket("basket_sewing", 8, 0.26, 0.24, 0.18, 0.45, _rgba(0.70, 0.45, 0.55), 3),
-    ),
-    "shoe": (
-        _shoe("shoe_slipper", 0.27, 0.105, 0.25, _rgba(0.55, 0.40, 0.62), 0.03),
-        _shoe("shoe_work_boot", 0.31, 0.115, 0.85, _rgba(0.72, 0.55, 0.25), 0.10, _rgba(0.2, 0.16, 0.12)),
-    ),
-    "pot": (
-        _pot("pot_flower", 0.22, 0.20, 2.4, _rgba(0.72, 0.40, 0.26), planted=True),
-        _pot("pot_casserole", 0.29, 0.14, 2.6, _rgba(0.15, 0.35, 0.38)),
-    ),
-    "toy": (
-        _toy("toy_digger", 0.30, 0.16, 0.7, _rgba(0.92, 0.78, 0.12), (-0.25, 0.15, 0.05)),
-        _toy("toy_engine", 0.22, 0.10, 0.35, _rgba(0.16, 0.42, 0.30), (-0.28, 0.18, 0.045), _rgba(0.8, 0.2, 0.2)),
-    ),
-}  # fmt: skip
-MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {"train": _TRAIN, "test": _TEST}
+def _model(kind: str, about: dict[str, Any]) -> SmallObject:
+    """A model of the file."""
+    colours = {name: _rgba(*about[name]) for name in ("colour", "sole", "accent") if name in about}
+    return {"basket": _basket, "shoe": _shoe, "pot": _pot, "toy": _toy}[kind](**{**about, **colours})
+
+
+_ROWS = yaml.safe_load((Path(__file__).parent / "small_objects.yaml").read_text())
+MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {
+    split: {kind: tuple(_model(kind, row) for row in rows) for kind, rows in kinds.items()}
+    for split, kinds in _ROWS.items()
+}
 """Split -> kind -> models; no model is in both splits."""
 
 
