@@ -19,7 +19,6 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from scipy.ndimage import gaussian_filter1d
 
 from interactive_nav.pictures.replay import Replay, ReplayError, load, replay_path
@@ -37,6 +36,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.progress import progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
 
 FORMATS = (".mp4", ".gif")
@@ -268,13 +268,8 @@ def record(source: Path, arguments: argparse.Namespace, console: Console) -> Non
     """
     replay, out = load(source), Path(arguments.out)
     compositor = Compositor(replay, load_scene(replay.scene), arguments.height)
-    columns = (
-        *(SpinnerColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} frames")),
-        *(TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn()),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=-(-replay.num_steps // arguments.every) + 1)
-        frames = write_video(compositor, out, arguments.every, lambda n: bar.update(task, completed=n))
+    with progress_bar(console, "frames", -(-replay.num_steps // arguments.every) + 1, transient=True) as update:
+        frames = write_video(compositor, out, arguments.every, lambda n: update(completed=n))
     console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
 
 

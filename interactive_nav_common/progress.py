@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
@@ -14,6 +15,19 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+
+@contextlib.contextmanager
+def progress_bar(
+    console: Console, what: str, total: float | None = None, transient: bool = False
+) -> Iterator[Callable[..., None]]:
+    """A bar on a terminal, nothing elsewhere; what updates it takes `Progress.update`'s words, and a `status`."""
+    columns = (
+        *(TextColumn("{task.description:<14}"), BarColumn(bar_width=24), TaskProgressColumn(), TimeElapsedColumn()),
+        *(TextColumn("[dim]left[/]"), TimeRemainingColumn(), TextColumn("{task.fields[status]}")),
+    )
+    with Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as bar:
+        yield functools.partial(bar.update, bar.add_task(what, total=total, status=""))
 
 
 @contextlib.contextmanager

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Annotated, Any, Literal
+
+import yaml
 
 from interactive_nav.config import IMAGES, PhysicsConfig, SensorConfig, TaskRules
 from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, flat, replace
@@ -259,46 +262,7 @@ class TrainConfig(Settings):
     """The run."""
 
 
-AUTO_PPO: dict[str, dict[str, int]] = {
-    "native": {"num_envs": 64, "unroll_length": 32, "batch_size": 16, "num_minibatches": 4},
-    "jax": {"num_envs": 512, "unroll_length": 32, "batch_size": 128, "num_minibatches": 4},
-    "warp": {"num_envs": 4096, "unroll_length": 20, "batch_size": 512, "num_minibatches": 8},
-}
-"""What None means in `PPOConfig`, per physics backend. A CPU collects a thousand steps a second, so it trains
-on small batches often; Warp is fastest at thousands of worlds and has steps to spare."""
-
-AUTO_SAC: dict[str, dict[str, int]] = {
-    "native": {
-        "num_envs": 32,
-        "steps_per_update": 8,
-        "grad_steps_per_update": 16,
-        "batch_size": 256,
-        "min_replay_size": 8_192,
-        "max_replay_size": 1_000_000,
-    },
-    "jax": {
-        "num_envs": 256,
-        "steps_per_update": 4,
-        "grad_steps_per_update": 32,
-        "batch_size": 1_024,
-        "min_replay_size": 32_768,
-        "max_replay_size": 1_000_000,
-    },
-    "warp": {
-        "num_envs": 4_096,
-        "steps_per_update": 2,
-        "grad_steps_per_update": 16,
-        "batch_size": 2_048,
-        "min_replay_size": 131_072,
-        "max_replay_size": 1_048_576,
-    },
-}
-"""What None means in `SACConfig`. With thousands of environments a gradient step for each env step is neither
-affordable nor needed: a few large ones learn faster in wall-clock time (Li et al. 2023, arXiv:2307.12983; Seo et al.
-2025, arXiv:2505.22642)."""
-AUTO_DDPG = AUTO_SAC
-"""What None means in `DDPGConfig`."""
-AUTO = {"ppo": AUTO_PPO, "sac": AUTO_SAC, "ddpg": AUTO_DDPG}
+AUTO: dict[str, dict[str, dict[str, int]]] = yaml.safe_load((Path(__file__).parent / "sizes.yaml").read_text())
 """Section -> backend -> what its None means."""
 
 

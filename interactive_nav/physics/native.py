@@ -8,6 +8,7 @@ whose incoming state is not, to the bit, the one that the batch returned last.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import threading
 from typing import Any
 
@@ -76,23 +77,14 @@ class NativePhysics(Physics):
 
     def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]
-        f32, i32 = jnp.float32, jnp.int32
+
+        def told(name: str) -> jax.ShapeDtypeStruct:
+            shape = (n, self._slots) if name == "slot_force_n" else (n,)
+            return jax.ShapeDtypeStruct(shape, jnp.float32 if name.endswith("force_n") else jnp.int32)
+
         shapes = (
-            PhysicsState(
-                qpos=jax.ShapeDtypeStruct((n, self.nq), f32),
-                qvel=jax.ShapeDtypeStruct((n, self.nv), f32),
-                qacc_warmstart=jax.ShapeDtypeStruct((n, self.nv), f32),
-            ),
-            StepSignals(
-                force_n=jax.ShapeDtypeStruct((n,), f32),
-                slot_force_n=jax.ShapeDtypeStruct((n, self._slots), f32),
-                structure_force_n=jax.ShapeDtypeStruct((n,), f32),
-                body_force_n=jax.ShapeDtypeStruct((n,), f32),
-                overflow=jax.ShapeDtypeStruct((n,), i32),
-                left_out=jax.ShapeDtypeStruct((n,), i32),
-                unconverged=jax.ShapeDtypeStruct((n,), i32),
-                nonfinite=jax.ShapeDtypeStruct((n,), i32),
-            ),
+            PhysicsState(*(jax.ShapeDtypeStruct((n, size), jnp.float32) for size in (self.nq, self.nv, self.nv))),
+            StepSignals(**{field.name: told(field.name) for field in dataclasses.fields(StepSignals)}),
         )
         return jax.pure_callback(self._step_host, shapes, scene, state, command, time_s, vmap_method="sequential")
 

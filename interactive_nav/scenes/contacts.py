@@ -33,6 +33,21 @@ _ALL = "contacts_of_robot"
 _ROLLING = "contacts_of_rolling"
 
 
+def add_sensor(
+    spec: mujoco.MjSpec, name: str, objtype: mujoco.mjtObj, objname: str, body: str, numbers: tuple[int, int, int]
+) -> None:
+    """A contact sensor of a part of the robot against a body; `numbers` are its data, reduction and slots."""
+    spec.add_sensor(
+        name=name,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=objtype,
+        objname=objname,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname=body,
+        intprm=list(numbers),
+    )
+
+
 def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]) -> None:
     """Lists the robot's and its rolling parts' contacts with each of the bodies."""
 
@@ -43,15 +58,7 @@ def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]
     ]
 
     def add(name: str, objtype: mujoco.mjtObj, objname: str, body: str) -> None:
-        spec.add_sensor(
-            name=name,
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=objtype,
-            objname=objname,
-            reftype=mujoco.mjtObj.mjOBJ_BODY,
-            refname=body,
-            intprm=[_DATA, 0, SLOTS],
-        )
+        add_sensor(spec, name, objtype, objname, body, (_DATA, 0, SLOTS))
 
     for i, body in enumerate(bodies):
         add(f"{_ALL}_{i}", mujoco.mjtObj.mjOBJ_XBODY, robot.base_body, body)

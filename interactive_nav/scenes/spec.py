@@ -10,7 +10,7 @@ import numpy as np
 
 from interactive_nav.config import NavConfig, PhysicsConfig, TaskRules
 from interactive_nav.robots import RobotSpec
-from interactive_nav.scenes.contacts import add_contact_sensors
+from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
 from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import ConvertedObject
 from interactive_nav.scenes.objects import SmallObject, add_boxes, body_names
@@ -303,24 +303,13 @@ def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
 
 
 def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], rules: TaskRules) -> None:
+    # Net force of the robot's subtree on a body: 3 numbers, world frame.
+    numbers, subtree = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1), mujoco.mjtObj.mjOBJ_XBODY
     for i, (name, kind) in enumerate(slots):
-        _add_force_sensor(spec, robot.base_body, name, f"force_{i}")
+        add_sensor(spec, f"force_{i}", subtree, robot.base_body, name, numbers)
         if kind == "hinge":
             # A door leaf hangs in its frame: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
-    _add_force_sensor(spec, robot.base_body, "structure", "force_structure")
+    add_sensor(spec, "force_structure", subtree, robot.base_body, "structure", numbers)
     if rules.needs_contacts:
         add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
-
-
-def _add_force_sensor(spec: mujoco.MjSpec, robot_body: str, other: str, name: str) -> None:
-    """Net force of the robot's subtree on a body: 3 numbers, world frame."""
-    spec.add_sensor(
-        name=name,
-        type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_XBODY,
-        objname=robot_body,
-        reftype=mujoco.mjtObj.mjOBJ_BODY,
-        refname=other,
-        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],
-    )

@@ -12,7 +12,7 @@ from interactive_nav.config import ORIGINAL_CODE
 from interactive_nav_common.config import field_docs
 from interactive_nav_common.errors import ConfigError
 from train import config_io
-from train.config import AUTO_PPO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
+from train.config import AUTO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
 from train.config_io import apply_overrides, flatten, from_yaml, help_text, load, to_yaml
 
 BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
@@ -137,12 +137,12 @@ def test_minibatches_must_share_the_environments_out():
         validate(TrainConfig())
 
 
-@pytest.mark.parametrize("backend", sorted(AUTO_PPO))
+@pytest.mark.parametrize("backend", sorted(AUTO["ppo"]))
 def test_resolve_fills_what_was_left_open(backend):
     resolved = resolve(dataclasses.replace(BASE, ppo=PPOConfig(unroll_length=7)), backend)
     assert resolved.env.backend == backend
     assert resolved.ppo.unroll_length == 7
-    assert resolved.ppo.num_envs == AUTO_PPO[backend]["num_envs"]
+    assert resolved.ppo.num_envs == AUTO["ppo"][backend]["num_envs"]
     assert None not in (resolved.ppo.batch_size, resolved.ppo.num_minibatches)
 
 

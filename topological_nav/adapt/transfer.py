@@ -32,7 +32,7 @@ from topological_nav.adapt.adaptation import (
 )
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES, DataConfig
-from topological_nav.data.dataset import load_passages, read_header
+from topological_nav.data.dataset import PassageImages, load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
 from topological_nav.errors import Asked, DatasetError, MapError, go_on
@@ -47,14 +47,6 @@ from topological_nav.scenes.space import free_space
 
 CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "D": (True, True)}
 """Name -> whether the weights are the source's, and whether they are fine-tuned."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Labelled:
-    images: np.ndarray
-    free: np.ndarray
-    """[N, L] i32."""
-    scored: int
 
 
 def passage_configurations(
@@ -92,7 +84,7 @@ def passage_configurations(
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
         fresh = make_learner(network, shape, tx, config.seed)
         epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
-        images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free)
+        images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free, jnp.int32)
         results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
         for name, (from_source, tunes) in CONFIGURATIONS.items():
             # A copy: an epoch gives its argument's memory away.
@@ -180,7 +172,7 @@ def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
     return digests.index(scene.digest)
 
 
-def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[_Labelled, _Labelled]:
+def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
     """Target images to learn from and to test, as many free as blocked, no source in both."""
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):
@@ -199,7 +191,8 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
         if not len(rows):
             what = "for testing" if held else "to learn from"
             raise DatasetError(f"{target}: has no passages {what}; make it with more passage_sources or test_share")
-        parts.append(_Labelled(images[rows], passages.free[rows].astype(np.int32), passages.scored))
+        chosen = {name: getattr(passages, name)[rows] for name in ("free", "scene", "test")}
+        parts.append(dataclasses.replace(passages, images=images[rows], **chosen))
     return parts[0], parts[1]
 
 
@@ -208,12 +201,12 @@ def _of(trained: Trained, tx: optax.GradientTransformation) -> Learner:
     return Learner(params, trained.variables["batch_stats"], tx.init(params))
 
 
-def _scores(trained: Trained, tested: _Labelled) -> dict[str, Any]:
+def _scores(trained: Trained, tested: PassageImages) -> dict[str, Any]:
     logits = trained.logits(tested.images)
-    found, truth = (logits[:, tested.scored] > 0).astype(np.int32), tested.free[:, tested.scored]
+    found, truth = logits[:, tested.scored] > 0, tested.free[:, tested.scored]
     return {
         "accuracy": float((found == truth).mean()),
         "macro_f1": float(f1_score(truth, found, average="macro")),
-        "confusion": confusion_matrix(truth, found, labels=[0, 1]).tolist(),
+        "confusion": confusion_matrix(truth, found, labels=[False, True]).tolist(),
         "lengths": length_scores(logits, tested.free, trained.about["lengths_m"]),
     }

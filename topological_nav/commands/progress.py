@@ -8,8 +8,8 @@ from collections.abc import Callable
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from interactive_nav_common.progress import progress_bar
 from topological_nav.errors import Asked, Stopped
 
 Tell = Callable[[str, int, int], None]
@@ -46,22 +46,15 @@ def tell_line(line: str) -> None:
 def bar():
     """A bar with the time left on a terminal, a line every tenth elsewhere."""
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description:<14}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as shown:
-        task, tenths = shown.add_task("starting", total=None), 0
+    with progress_bar(console, "starting") as update:
+        tenths = 0
         # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
         first: tuple[float, int] | None = None
 
         def tell(what: str, done: int, total: int) -> None:
             nonlocal tenths, first
             first = first or (time.perf_counter(), done)
-            shown.update(task, description=what, completed=done, total=total)
+            update(description=what, completed=done, total=total)
             if not console.is_terminal and done * 10 // max(total, 1) > tenths:
                 tenths, (began, before), left = done * 10 // total, first, ""
                 if done > before:

@@ -159,10 +159,7 @@ class SimulatorNode:
         _wait(lambda: not lacking(), stop, lambda: f"nobody joined {', '.join(lacking())}: is the navigator running?")
 
     def _wait_for_command(self, seen: int, stop: Asked) -> None:
-        def come() -> bool:
-            with self._news:
-                return self._news.wait_for(lambda: self._commands > seen or self._done, 0.2)
-
+        come = _told(self._news, lambda: self._commands > seen or self._done)
         _wait(come, stop, lambda: f"no command came on {topics.COMMAND}: has the navigator ended?", pause_s=0.0)
 
     def _send_frames(self) -> None:
@@ -308,24 +305,15 @@ class NavigatorNode:
 
     def _heading_at(self, time_s: float, stop: Asked) -> float | None:
         """The heading when a picture was taken; waits a little for one that is not older."""
-
-        def told() -> bool:
-            with self._news:
-                return self._news.wait_for(lambda: self._headings.newest_s >= time_s - 1e-6, 0.2)
-
-        def any_told() -> bool:
-            return told() or math.isfinite(self._headings.newest_s)
-
+        told = _told(self._news, lambda: self._headings.newest_s >= time_s - 1e-6)
+        any_told = lambda: told() or math.isfinite(self._headings.newest_s)  # noqa: E731
         if not _wait(any_told, stop, lambda: f"no heading came on {self._heading_topic}", pause_s=0.0):
             return None
         with self._news:
             return math.remainder(self._headings.at(time_s) + self._offset, math.tau)
 
     def _fov_deg(self, stop: Asked) -> float:
-        def told() -> bool:
-            with self._news:
-                return self._news.wait_for(lambda: self._lens is not None, 0.2)
-
+        told = _told(self._news, lambda: self._lens is not None)
         _wait(told, stop, lambda: f"no camera_info came on {topics.INFO}", pause_s=0.0)
         lens = self._lens
         return lens.fov_deg if isinstance(lens, Lens) else math.nan
@@ -355,6 +343,16 @@ class NavigatorNode:
         with self._news:
             self._lens = lens
             self._news.notify_all()
+
+
+def _told(news: threading.Condition, ready: Callable[[], bool]) -> Callable[[], bool]:
+    """Waits a little for news that make it ready."""
+
+    def told() -> bool:
+        with news:
+            return news.wait_for(ready, 0.2)
+
+    return told
 
 
 def _wait(ready: Callable[[], bool], stop: Asked, lacking: Callable[[], str], pause_s: float = 0.05) -> bool:

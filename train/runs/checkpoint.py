@@ -177,14 +177,16 @@ def load_learner(folder: Path, template: Any) -> Any:
                 f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
                 "use the run's own config, or another checkpoint"
             ) from None
-    for name, expected in jax.tree_util.tree_leaves_with_path(template):
-        got = _leaf_at(learner, name)
+
+    def fitting(name: Any, expected: Any, got: Any) -> jax.Array:
         if np.shape(got) != np.shape(expected):
             raise CheckpointError(
                 f"{path}: {jax.tree_util.keystr(name)} has shape {np.shape(got)}, "
                 f"expected {np.shape(expected)}; use the config that the checkpoint was trained with"
             )
-    return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
+        return jnp.asarray(got, jnp.asarray(expected).dtype)
+
+    return jax.tree_util.tree_map_with_path(fitting, template, learner)
 
 
 def load_env_state(folder: Path, template: Any) -> Any | None:
@@ -253,12 +255,3 @@ def _is_key(leaf: Any) -> bool:
 
 def _raw(leaf: Any) -> jax.Array:
     return jax.random.key_data(leaf) if _is_key(leaf) else jnp.asarray(leaf)
-
-
-def _leaf_at(tree: Any, path: tuple[Any, ...]) -> Any:
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            tree = getattr(tree, key.name)
-        else:
-            tree = tree[key.key if isinstance(key, jax.tree_util.DictKey) else key.idx]  # type: ignore[attr-defined]
-    return tree

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+
+from interactive_nav_common.progress import progress_bar
 
 
 class TrainingDisplay:
@@ -18,41 +14,30 @@ class TrainingDisplay:
 
     def __init__(self, console: Console):
         self.console = console
-        self._bar = Progress(
-            TextColumn("training"),
-            BarColumn(bar_width=24),
-            TaskProgressColumn(),
-            TextColumn("[dim]elapsed[/]"),
-            TimeElapsedColumn(),
-            TextColumn("[dim]left[/]"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[status]}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task("", total=None, status="compiling")
+        self._shown = progress_bar(console, "training")
         self._total = 0
 
     def __enter__(self) -> TrainingDisplay:
-        self._bar.start()
+        self._bar = self._shown.__enter__()
+        self._bar(status="compiling")
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+    def __exit__(self, *error: Any) -> None:
+        self._shown.__exit__(*error)
 
     def begin(self, env_steps: int, total_steps: int) -> None:
         """The range of steps to show."""
         self._total = total_steps
-        self._bar.update(self._task, completed=env_steps, total=total_steps)
+        self._bar(completed=env_steps, total=total_steps)
 
     def update(self, env_steps: int) -> None:
         """Moves the bar."""
-        self._bar.update(self._task, completed=env_steps)
+        self._bar(completed=env_steps)
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Shows a log interval's scores."""
         status = describe(metrics)
-        self._bar.update(self._task, completed=env_steps, status=status)
+        self._bar(completed=env_steps, status=status)
         if not self.console.is_terminal:
             left = (self._total - env_steps) / max(metrics["env_steps_per_s"], 1e-9)
             share = 100.0 * env_steps / max(self._total, 1)

@@ -14,10 +14,10 @@ import jax
 import numpy as np
 import pyarrow as pa
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from interactive_nav.episodes import EpisodeFile, starts_of
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.progress import progress_bar
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.learners.algorithms import ALGORITHMS
@@ -213,7 +213,8 @@ def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None
 @contextlib.contextmanager
 def _progress(console: Console, name: str, episodes: int) -> Iterator[Callable[[int, int], None]]:
     """A line that says how many episodes are over."""
-    columns = (SpinnerColumn(), TextColumn(name), TextColumn("{task.fields[status]}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", status="compiling")
-        yield lambda finished, step: bar.update(task, status=f"{finished} of {episodes} episodes over, step {step}")
+    with progress_bar(console, name, episodes, transient=True) as update:
+        update(status="compiling")
+        yield lambda finished, step: update(
+            completed=finished, status=f"{finished} of {episodes} episodes over, step {step}"
+        )
