@@ -54,8 +54,8 @@ def build(
 def export_runs(arguments: argparse.Namespace) -> None:
     """Writes finished runs as a small folder."""
     config = overridden(ExportConfig(), arguments.settings)
-    from topological_nav.figures.export_figure import export_figure
     from topological_nav.figures.maps import save
+    from topological_nav.figures.transfer_figures import export_figure
     from topological_nav.weights.export import export, size_lines
 
     with stop_signals() as stops, bar() as tell:

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from topological_nav.config import DataConfig
+from topological_nav.rows import Rows
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.space import FreeSpace
 
 
 @dataclasses.dataclass(frozen=True)
-class Passages:
+class Passages(Rows):
     """Looks along straight ways; n of them, grouped by source."""
 
     xy_w: np.ndarray
@@ -28,13 +29,6 @@ class Passages:
     """[n] i32 room of the source."""
     test: np.ndarray
     """[n] bool."""
-
-    def __len__(self) -> int:
-        return len(self.xy_w)
-
-    def take(self, rows: np.ndarray) -> Passages:
-        """The passages at some indices."""
-        return Passages(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
 
 
 def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.random.Generator) -> Passages:

@@ -154,9 +154,8 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
         nodes.append(xy)
         edges.append(joined)
         fields_before += len(xy)
-    tasks = Tasks(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Tasks)))
     terrain = _terrain(spaces, fields)
-    return DrivePlan(tasks, np.concatenate(tests), terrain, tuple(spaces), tuple(nodes), tuple(edges))
+    return DrivePlan(Tasks.joined(parts), np.concatenate(tests), terrain, tuple(spaces), tuple(nodes), tuple(edges))
 
 
 def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terrain:

@@ -16,6 +16,7 @@ from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import UserError
 from topological_nav.config import DriveConfig
 from topological_nav.drives.expert import CONTROL_S, Terrain, command, scan_points
+from topological_nav.rows import Rows
 from topological_nav.scenes.rendering import need_engine
 from topological_nav.scenes.simulation import episode_starts
 
@@ -26,7 +27,7 @@ LIDAR_B = {"ttbot": (0.17, 0.0, 0.36)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Tasks:
+class Tasks(Rows):
     """Drives of one batch over several scenes; B of them."""
 
     scene: np.ndarray
@@ -41,13 +42,6 @@ class Tasks:
     """[B, 2] m."""
     start_yaw_rad: np.ndarray
     """[B]."""
-
-    def __len__(self) -> int:
-        return len(self.scene)
-
-    def take(self, rows: np.ndarray) -> Tasks:
-        """The drives at some indices."""
-        return Tasks(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
 
 
 @dataclasses.dataclass(frozen=True)

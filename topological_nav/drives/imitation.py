@@ -33,7 +33,6 @@ from topological_nav.drives.policy import Forward, Policy, policy_loss, standard
 from topological_nav.drives.sequences import (
     Sequences,
     class_values,
-    joined,
     make_sequences,
     mirrored,
     thinned,
@@ -114,7 +113,7 @@ def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.nd
     if not len(learned):
         raise RunError(f"no sequence to learn from in {len(drives)} drives; drive more or set straight_kept=1")
     if config.mirror:
-        learned = joined([learned, mirrored(learned, len(drives.command), config)])
+        learned = Sequences.joined([learned, mirrored(learned, len(drives.command), config)])
     return _Split(every, learned, held_out)
 
 

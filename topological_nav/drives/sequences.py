@@ -9,10 +9,11 @@ import numpy as np
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
 from topological_nav.drives.expert import CONTROL_S
+from topological_nav.rows import Rows
 
 
 @dataclasses.dataclass(frozen=True)
-class Sequences:
+class Sequences(Rows):
     """W windows of T control steps."""
 
     rows: np.ndarray
@@ -25,13 +26,6 @@ class Sequences:
     """[W, T] i32 class of the commanded velocity."""
     angular: np.ndarray
     """[W, T] i32."""
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def take(self, which: np.ndarray) -> Sequences:
-        """The windows at some indices."""
-        return Sequences(*(getattr(self, f.name)[which] for f in dataclasses.fields(self)))
 
 
 def class_values(config: PolicyConfig, linear_m_s: float, angular_rad_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -110,8 +104,3 @@ def mirrored(sequences: Sequences, frames: int, config: PolicyConfig) -> Sequenc
     return dataclasses.replace(
         sequences, rows=sequences.rows + frames, angular=config.angular_classes - 1 - sequences.angular
     )
-
-
-def joined(parts: list[Sequences]) -> Sequences:
-    """Windows one after the other."""
-    return Sequences(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Sequences)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import label as components
@@ -12,6 +11,7 @@ from interactive_nav.navigation.ways import PathGrid
 from interactive_nav.scenes.scene import Scene
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import SpaceError
+from topological_nav.rows import Rows
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.space import FreeSpace
 
@@ -22,7 +22,7 @@ LEAST, MOST, PER_M2 = 25, 60, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class DrivenEpisodes:
+class DrivenEpisodes(Rows):
     """Fixed episodes of one scene."""
 
     number: np.ndarray
@@ -38,13 +38,6 @@ class DrivenEpisodes:
     """[n] i32."""
     shortest_m: np.ndarray
     """[n] length of the shortest way round walls and furniture, for half of the robot's width."""
-
-    def take(self, rows: Any) -> DrivenEpisodes:
-        """Some of them."""
-        return DrivenEpisodes(**{f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self)})
-
-    def __len__(self) -> int:
-        return len(self.yaw_rad)
 
 
 def count_of(scene: Scene, config: EvaluationConfig) -> int:

@@ -2,7 +2,7 @@
 
 from train.figures.cli import figures_of, main
 from train.figures.curves import cell_curves, learning_curves
-from train.figures.frontier import frontier
 from train.figures.paths import trajectories
+from train.figures.scores import frontier
 
 __all__ = ["cell_curves", "figures_of", "frontier", "learning_curves", "main", "trajectories"]

@@ -18,9 +18,8 @@ from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
-from train.figures.frontier import frontier
 from train.figures.paths import side_by_side, spread_episodes, trajectories
-from train.figures.scores import efficiency_plane, effort_terms, ins_over_alpha, robots_plane, seen_and_unseen
+from train.figures.scores import efficiency_plane, effort_terms, frontier, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
 from train.scoring.row_files import PATHS
 from train.scoring.statistics import run_means

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from interactive_nav.navigation.ways import Ways
+from interactive_nav.robots.spec import TwistMap
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
-from train.scoring.steering import velocity_towards
 
 REPLAN_STEPS = 10
 """Control steps between two plans of an episode, where something has moved."""
@@ -25,6 +25,28 @@ LOOK_AHEAD_M = 0.25
 CRUISE_M_S = 0.4
 ALIGNED_RAD = math.pi / 6
 """Beyond this bearing the planners turn on the spot."""
+TURN_GAIN_PER_S = 4.0
+MAX_TURN_RAD_S = 2.0
+
+
+def velocity_towards(
+    twist: TwistMap, bearing_rad: Any, cruise_m_s: float, aligned_rad: float, xp: Any
+) -> tuple[Any, Any]:
+    """Turns towards a point, and drives the faster the better aligned.
+
+    Args:
+        twist: the robot's limits, of its control mode.
+        bearing_rad: [...] of the point, 0 ahead, positive to the left.
+        cruise_m_s: speed straight ahead.
+        aligned_rad: beyond this bearing it turns on the spot.
+        xp: `numpy` or `jax.numpy`.
+
+    Returns:
+        Linear (m/s) and angular (rad/s) velocity [...].
+    """
+    most, cruise = min(MAX_TURN_RAD_S, twist.max_angular_rad_s), min(cruise_m_s, twist.max_linear_m_s)
+    speed_m_s = xp.where(xp.abs(bearing_rad) < aligned_rad, cruise * xp.cos(bearing_rad), 0.0)
+    return speed_m_s, xp.clip(TURN_GAIN_PER_S * bearing_rad, -most, most)
 
 
 @dataclasses.dataclass(frozen=True)

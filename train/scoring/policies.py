@@ -16,8 +16,7 @@ import jax.numpy as jnp
 
 from interactive_nav.robots import RobotSpec
 from interactive_nav_common.errors import UserError
-from train.scoring.planners import Planner
-from train.scoring.steering import velocity_towards
+from train.scoring.planners import Planner, velocity_towards
 
 Observation = jax.Array | Mapping[str, jax.Array]
 PolicyFn = Callable[[Observation, jax.Array], jax.Array]

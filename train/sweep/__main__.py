@@ -17,7 +17,7 @@ from train.runs.run_folder import claim
 from train.sweep import spec
 from train.sweep.devices import Machine, find_gpus
 from train.sweep.folder import SweepFolder
-from train.sweep.local import Launcher, LocalLauncher
+from train.sweep.jobs import Launcher, LocalLauncher
 from train.sweep.scheduler import STAGES, Programs, Scheduler
 from train.sweep.spec import Sweep
 from train.sweep.table import SweepDisplay, status_table, totals

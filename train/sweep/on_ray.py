@@ -9,8 +9,7 @@ from typing import Any
 
 from interactive_nav_common.errors import ConfigError
 from train.sweep.devices import Gpu, Share, share_env
-from train.sweep.jobs import LOST, Child, Job
-from train.sweep.local import Launcher
+from train.sweep.jobs import LOST, Child, Job, Launcher
 
 
 class Worker(Child):

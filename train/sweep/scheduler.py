@@ -19,8 +19,7 @@ from train.sweep.folder import (
     words_of_evaluation,
     words_of_training,
 )
-from train.sweep.jobs import LOCKED, LOST, Job
-from train.sweep.local import Launcher
+from train.sweep.jobs import LOCKED, LOST, Job, Launcher
 from train.sweep.spec import RunSpec
 from train.sweep.table import SweepDisplay
 

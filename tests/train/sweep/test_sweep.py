@@ -23,7 +23,7 @@ from train.sweep import jobs, spec
 from train.sweep.__main__ import main
 from train.sweep.devices import Gpu, Machine, find_gpus, parse_gpus, share_env
 from train.sweep.folder import RunState, SweepFolder, last_line
-from train.sweep.local import LocalLauncher
+from train.sweep.jobs import LocalLauncher
 from train.sweep.scheduler import Outcome, Programs, Scheduler
 from train.sweep.spec import LaunchConfig
 from train.sweep.table import SweepDisplay, totals
