@@ -1,4 +1,4 @@
-"""Runs of transfer and exports in, pictures out: domains side by side, learning, scores, how exports agree with runs."""
+"""Runs of transfer and exports in, pictures out: domains side by side, learning, scores; an export beside its runs."""
 
 from __future__ import annotations
 
