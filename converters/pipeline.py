@@ -17,7 +17,7 @@ import numpy as np
 from converters.bodies.alignment import Alignment
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject, name_objects, place_object
-from converters.bodies.physical import physical_properties, with_source
+from converters.bodies.physical import Physical, physical_properties, with_source
 from converters.bodies.placement import compare, upright
 from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
@@ -28,6 +28,7 @@ from converters.geometry.simplify import simplify_open
 from converters.propose.proposals import propose_instances
 from converters.propose.report import floor_of
 from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
+from converters.read.homes.parts import built_in
 from converters.read.source import read_source
 from converters.read.storeys import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
@@ -240,6 +241,27 @@ def _report_objects(
             row["hinge_assumed"] = placed.hinge.assumed
 
 
+def _placed(
+    raw: RawScene, placements: list[Alignment], decomposed: Decomposition, floor_m: float, walls_yaw: float
+) -> tuple[tuple[PlacedObject, ...], tuple[Physical, ...]]:
+    """Every object where it was annotated, and its mass and friction."""
+    annotated = tuple(
+        place_object(name, a, raw.cads[a.cad_id], decomposed.hulls[a.cad_id], pose, floor_m, walls_yaw)
+        for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, placements, strict=True)
+    )
+    cads = [raw.cads[o.cad_id] for o in annotated]
+    return annotated, tuple(
+        with_source(physical_properties(o.category, o.hulls_b), cad.mass_kg, cad.friction)
+        for o, cad in zip(annotated, cads, strict=True)
+    )
+
+
+def _beside(settled: Settled, annotated: tuple[PlacedObject, ...]) -> dict[int, str]:
+    """Number of an object that was held -> what its source calls what it overlaps."""
+    called = {o.name: o.cad_id for o in annotated}
+    return {k: called.get(other, "a wall, or what is built in") for k, other in settled.held.items()}
+
+
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
     """Every stage after reading; writes into `folder`, which exists and is empty.
 
@@ -259,16 +281,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     decompose_config = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)
     with clock.stage("decompose") as progress:
         decomposed = _decompose_models(raw, decompose_config, config, cache, progress)
-        annotated = tuple(
-            place_object(name, a, raw.cads[a.cad_id], decomposed.hulls[a.cad_id], pose, floor_height, walls_yaw)
-            for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, placements, strict=True)
-        )
-        physical = tuple(
-            with_source(
-                physical_properties(o.category, o.hulls_b), raw.cads[o.cad_id].mass_kg, raw.cads[o.cad_id].friction
-            )
-            for o in annotated
-        )
+        annotated, physical = _placed(raw, placements, decomposed, floor_height, walls_yaw)
     with clock.stage("cut"):
         cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated, raw.scan.furnished)
     with clock.stage("map"):
@@ -282,7 +295,9 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         maps = SceneMaps(traversable, plan.grid.resolution_m, origin, floor_height)
     with clock.stage("settle"):
         unsettled = SceneParts(raw.name, annotated, physical, walls)
-        settled = settle(unsettled) if annotated else Settled(unsettled, (), ())
+        settled = settle(unsettled, bool(raw.picture)) if annotated else Settled(unsettled, (), ())
+    if settled.held:
+        return convert_raw(built_in(raw, _beside(settled, annotated)), folder, config, clock, cache)
     with clock.stage("texture") as progress:
         structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
         progress(0.5)

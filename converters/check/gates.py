@@ -107,13 +107,23 @@ def movable_bodies(model: mujoco.MjModel) -> list[int]:
     return [b for b in range(1, model.nbody) if model.body_jntnum[b] > 0]
 
 
-def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Largest penetration among the present contacts, m; 0 without any."""
-    return max([-float(c.dist) for c in data.contact[: data.ncon]], default=0.0) if data.ncon else 0.0
+def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, str]:
+    """Largest penetration among the present contacts, m, and the two bodies; 0 without any."""
+    if not data.ncon:
+        return 0.0, ""
+    contact = min(data.contact[: data.ncon], key=lambda c: c.dist)
+    bodies = sorted(model.body(model.geom_bodyid[g]).name.replace("world", "floor") for g in contact.geom)
+    return -float(contact.dist), " and ".join(bodies)
 
 
-def physical_values(model: mujoco.MjModel) -> dict[str, float]:
-    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot."""
+def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) -> dict[str, float]:
+    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot.
+
+    Args:
+        model: of a scene.
+        named: takes, for each of the first three, the bodies that have it.
+    """
+    named = {} if named is None else named
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bodies = movable_bodies(model)
@@ -126,10 +136,14 @@ def physical_values(model: mujoco.MjModel) -> dict[str, float]:
         np.linalg.norm(data.xpos[bodies] - start_pos, axis=1),
     )
     cosine = np.abs((data.xquat[bodies] * start_quat).sum(axis=1))
+    turned = np.degrees(2 * np.arccos(np.clip(cosine, 0, 1)))
+    depth, named["penetration"] = max(depth, deepest_contact(model, data))
+    for quantity, values in (("drift", moved), ("turn", turned)) if bodies else ():
+        named[quantity] = model.body(bodies[int(np.argmax(values))]).name
     return {
         "drift": float(moved.max(initial=0.0)),
-        "turn": float(np.degrees(2 * np.arccos(np.clip(cosine, 0, 1))).max(initial=0.0)),
-        "penetration": max(depth, deepest_contact(model, data)),
+        "turn": float(turned.max(initial=0.0)),
+        "penetration": depth,
         "finite": float(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all() and not started_over(data)),
     }
 
@@ -225,7 +239,8 @@ def evaluate(
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or "" for g in range(model.ngeom)]
     hulls = [sum(n.startswith(f"{o}_hull_") for n in names) for o in object_names]
     off = objects_off_map(model, maps)
-    by_hull, by_box = physical_values(model), physical_values(boxes)
+    who: dict[str, dict[str, str]] = {"hulls": {}, "boxes": {}}
+    by_hull, by_box = physical_values(model, who["hulls"]), physical_values(boxes, who["boxes"])
     values = {
         "compiles": 1.0,
         "unmatched_objects": float(len(bodies ^ set(object_names)) + len(off)),
@@ -239,7 +254,8 @@ def evaluate(
     agreed, warnings = manifest_values(model, objects)
     surface, worst = surface_values(model, kept or {})
     values |= free_space_values(maps) | wall_values(model, maps) | agreed | surface
-    warnings |= {name: told for name, told in worst.items() if not judge(name, surface[name]).passed}
+    told = {f"{what}_{shape}": (body,) for shape, of in who.items() for what, body in of.items()} | worst
+    warnings |= {name: words for name, words in told.items() if not judge(name, (values | surface)[name]).passed}
     warnings["connected_share"] = free_space_warnings(maps)
     if off:
         warnings["unmatched_objects"] = (f"{', '.join(off)}: more than {OFF_MAP_M:g} m from all free floor of the map",)

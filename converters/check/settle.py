@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -18,6 +19,9 @@ DOOR_CLEARANCE_M = 0.015
 """Gap under a door's leaf."""
 PUSH_STEPS = 400
 MAX_PUSH_M = 0.5
+DRAWN_PUSH_M = 0.05
+"""The same of a piece that somebody drew where it is to stand."""
+OVERLAP_M = 0.0015
 DAMP_PER_S = 8.0
 SETTLE_S = 1.5
 
@@ -32,6 +36,8 @@ class Settled:
     """Per object, horizontal, from the annotated pose."""
     drop_m: tuple[float, ...]
     """Per object, change of height (positive: up)."""
+    held: Mapping[int, str] = dataclasses.field(default_factory=dict)
+    """Objects that could not be parted from what is named, by number."""
 
 
 def _on_floor(parts: SceneParts) -> SceneParts:
@@ -47,33 +53,33 @@ def _on_floor(parts: SceneParts) -> SceneParts:
     return dataclasses.replace(parts, objects=tuple(objects))
 
 
-def push_apart(parts: SceneParts) -> SceneParts:
-    """Slides free objects horizontally until neither hulls nor boxes cut walls or each other.
+def _overlaps(
+    model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int]
+) -> dict[tuple[int, int], tuple[float, np.ndarray]]:
+    """Pairs of bodies of which one is free: their deepest overlap, m, and the (2,) way out of it for the second."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    deepest: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    for contact in data.contact[: data.ncon]:
+        a, b = (int(model.geom_bodyid[g]) for g in contact.geom)
+        if contact.dist > -0.0005 or 0 in (a, b) or (a not in free and b not in free):
+            continue
+        depth, normal = -float(contact.dist), np.array(contact.frame[:2])
+        if np.linalg.norm(normal) < 0.5:  # one above the other: apart along the line between their middles
+            normal = data.xipos[b, :2] - data.xipos[a, :2]
+        normal = normal / max(np.linalg.norm(normal), 1e-9)
+        if depth > deepest.get((a, b), (0.0, normal))[0]:
+            deepest[a, b] = (depth, normal)
+    return deepest
 
-    Without dynamics, so that nothing flies."""
-    model = collide_with(build_spec(parts), "both")
-    data = mujoco.MjData(model)
-    free = {
-        int(model.body(o.name).id): int(model.joint(f"{o.name}_free").qposadr[0])
-        for o in parts.objects
-        if o.hinge is None
-    }
-    moved = dict.fromkeys(free, 0.0)
+
+def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most_m: float) -> dict:
+    """Slides the free bodies (id -> address in qpos) by up to `most_m`; the overlaps that stay."""
+    mujoco.mj_resetData(model, data)
+    start = {body: data.qpos[at : at + 2].copy() for body, at in free.items()}
     for _ in range(PUSH_STEPS):
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        deepest: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
-        for contact in data.contact[: data.ncon]:
-            a, b = (int(model.geom_bodyid[g]) for g in contact.geom)
-            if contact.dist > -0.0005 or 0 in (a, b) or (a not in free and b not in free):
-                continue
-            depth, normal = -float(contact.dist), np.array(contact.frame[:2])
-            if np.linalg.norm(normal) < 0.5:  # one above the other: apart along the line between their middles
-                normal = data.xipos[b, :2] - data.xipos[a, :2]
-            normal = normal / max(np.linalg.norm(normal), 1e-9)
-            if depth > deepest.get((a, b), (0.0, normal))[0]:
-                deepest[a, b] = (depth, normal)
+        deepest = _overlaps(model, data, free)
         if not deepest:
             break
         shift = {body: np.zeros(2) for body in free}
@@ -85,11 +91,45 @@ def push_apart(parts: SceneParts) -> SceneParts:
             if b in free:
                 shift[b] += step * normal
         for body, by in shift.items():
-            length = float(np.linalg.norm(by))
-            if moved[body] + length <= MAX_PUSH_M:
-                data.qpos[free[body] : free[body] + 2] += by
-                moved[body] += length
-    return _with_poses(parts, model, data)
+            way = data.qpos[free[body] : free[body] + 2] + by - start[body]
+            data.qpos[free[body] : free[body] + 2] = start[body] + way * min(1.0, most_m / max(np.hypot(*way), 1e-9))
+    return _overlaps(model, data, free)
+
+
+def push_apart(parts: SceneParts, most_m: float = MAX_PUSH_M, hold: bool = False) -> tuple[SceneParts, dict[int, str]]:
+    """Slides free objects horizontally until neither hulls nor boxes cut walls or each other.
+
+    Without dynamics, so that nothing flies.
+
+    Args:
+        parts: as annotated or drawn.
+        most_m: farthest that an object slides.
+        hold: objects that still overlap stay where they were, the worst first, and the others are pushed anew.
+
+    Returns:
+        The objects apart, and those that were held: number -> what it overlaps.
+    """
+    model = collide_with(build_spec(parts), "both")
+    data = mujoco.MjData(model)
+    number = {int(model.body(o.name).id): k for k, o in enumerate(parts.objects)}
+    free = {
+        body: int(model.joint(f"{parts.objects[k].name}_free").qposadr[0])
+        for body, k in number.items()
+        if parts.objects[k].hinge is None
+    }
+    held: dict[int, str] = {}
+    left = _push(model, data, free, most_m)
+    while hold and (deep := {pair: depth for pair, (depth, _) in left.items() if depth > OVERLAP_M}):
+        a, b = pair = max(deep, key=lambda p: deep[p])
+        # A leaf that stands in a piece cannot turn; of two pieces the lighter one can be missed.
+        worst = min(
+            (body for body in pair if body in number and number[body] not in held),
+            key=lambda body: (body in free, model.body_mass[body]),
+        )
+        held[number[worst]] = model.body(a + b - worst).name
+        free.pop(worst, None)
+        left = _push(model, data, free, most_m)
+    return _with_poses(parts, model, data), held
 
 
 def _with_poses(parts: SceneParts, model: mujoco.MjModel, data: mujoco.MjData) -> SceneParts:
@@ -126,15 +166,21 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
     return _with_poses(parts, model, data)
 
 
-def settle(parts: SceneParts) -> Settled:
+def settle(parts: SceneParts, drawn: bool = False) -> Settled:
     """Sets objects on the floor, pushes them apart, then lets boxes and after them hulls come to rest.
+
+    Args:
+        parts: with the objects where they were annotated.
+        drawn: they were drawn there: they slide by `DRAWN_PUSH_M` at most, and what does not part is `held`. If
+            anything is, nothing else is done.
 
     Raises:
         StageFailed: the simulation diverged.
     """
-    result = push_apart(_on_floor(parts))
-    result = _simulate(result, "box", SETTLE_S)
-    result = _simulate(result, "hull", SETTLE_S)
+    result, held = push_apart(_on_floor(parts), DRAWN_PUSH_M if drawn else MAX_PUSH_M, drawn)
+    if not held:
+        result = _simulate(result, "box", SETTLE_S)
+        result = _simulate(result, "hull", SETTLE_S)
     before = np.array([o.position_w for o in parts.objects])
     after = np.array([o.position_w for o in result.objects])
     horizontal = np.linalg.norm((after - before)[:, :2], axis=1)
@@ -142,4 +188,5 @@ def settle(parts: SceneParts) -> Settled:
         result,
         tuple(round(float(v), 4) for v in horizontal),
         tuple(round(float(v), 4) for v in (after - before)[:, 2]),
+        held,
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,43 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         picture=tuple((shell.vertices, shell.faces) for shell in shells),
         sources=dict(sorted(source.sha256.items())),
         warnings=tuple(source.warnings),
+    )
+
+
+def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
+    """A home of parts in which some of its pieces are structure, as they stand.
+
+    Args:
+        raw: made by `home`.
+        beside: number of an annotation -> what it cannot be parted from.
+    """
+    texture = raw.scan.texture
+    shells = []
+    for k in beside:
+        surface = raw.cads[raw.annotations[k].cad_id].surface
+        assert surface is not None
+        shells.append(placed(_small(surface), raw.annotations[k].pose))
+    mesh = with_own_corners(join_meshes(*shells))
+    whole = join_meshes(TexturedMesh(raw.scan.vertices, raw.scan.faces, raw.scan.corner_uv, texture), mesh)
+    fresh = len(whole.vertices) - len(raw.scan.vertices)
+    told = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
+    words = f"{len(told)} pieces cannot be parted from what they stand in, and are built in: {', '.join(told)}"
+    stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)
+    return dataclasses.replace(
+        raw,
+        scan=dataclasses.replace(
+            raw.scan,
+            vertices=whole.vertices,
+            faces=whole.faces,
+            labels=np.concatenate([raw.scan.labels, np.full(fresh, OTHER_STRUCTURE)]),
+            vertex_colours=np.full((len(whole.vertices), 3), 170, np.uint8) if whole.texture is None else None,
+            corner_uv=whole.corner_uv,
+            texture=whole.texture,
+        ),
+        cads={a.cad_id: raw.cads[a.cad_id] for a in stay},
+        annotations=stay,
+        picture=raw.picture + tuple((shell.vertices, shell.faces) for shell in shells),
+        warnings=(*raw.warnings, words),
     )
 
 

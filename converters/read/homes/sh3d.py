@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from converters.geometry.boxes import convex_hull
 from converters.read.files import SourceFolder
 from converters.read.homes.parts import Part, category_of, home
 from converters.read.homes.sh3d_archive import called, metres, number, point, read_xml, unpack
@@ -44,6 +45,7 @@ DOOR_M = (0.1, 1.5)
 """A door's foot is lower than the first and its height more than the second; else its leaves stay shut: a window."""
 STOREY_M = 1.8
 """Levels closer to one another are one storey."""
+SLIDES = re.compile("(?i)_on_rail|sliding|slider|folding")
 LEAF_M = 0.04
 REBATE_M = 0.012
 TURN_MOST_RAD = math.radians(120)
@@ -243,6 +245,8 @@ class _Drawing:
         name = " ".join((e.get("name") or e.get("catalogId") or "piece").split())[:60]
         self.named[name] += 1
         name = f"{name} {self.named[name]}"
+        if SLIDES.search(" ".join([e.get("catalogId") or "", name, *np.unique(group)])):
+            self.source.note(f"{name}: its leaves slide or fold; they stay as drawn")
         if e.tag == "doorOrWindow":
             return self._door(e, name, pose, surface, group)
         kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
@@ -259,8 +263,6 @@ class _Drawing:
         sashes = e.findall("sash")
         foot, height = number(e, "elevation", 0.0) / 100, number(e, "height") / 100
         if not sashes or foot > DOOR_M[0] or height < DOOR_M[1]:
-            if any(str(g).startswith("sweethome3d_opening_on_rail") for g in group):
-                self.dropped["sliding leaves' motion (they stay as drawn)"] += 1
             return [Part(name, pose, surface, None, True, held=True, known_as="structure")]
         leaf = np.array([int(m[1]) if (m := LEAF.match(str(g))) else 0 for g in group])
         leaf[leaf > len(sashes)] = 0
@@ -351,23 +353,6 @@ def _plain_leaf(e: ElementTree.Element, sash: ElementTree.Element, like: Texture
     foot = np.array([at + across, at - across, at + along * width - across, at + along * width + across])
     high = float(like.vertices[:, 2].max())
     vertices = np.vstack([np.column_stack([foot, np.full(4, z)]) for z in (0.0, high)])
-    hull = shapely.Polygon(foot)
-    faces = np.array(
-        [
-            (0, 1, 5),
-            (0, 5, 4),
-            (1, 2, 6),
-            (1, 6, 5),
-            (2, 3, 7),
-            (2, 7, 6),
-            (3, 0, 4),
-            (3, 4, 7),
-            (4, 5, 6),
-            (4, 6, 7),
-            (0, 2, 1),
-            (0, 3, 2),
-        ]
-    )
-    faces = faces if hull.exterior.is_ccw else faces[:, ::-1]
+    box = convex_hull(vertices)
     colour = colours_of_faces(like).mean(axis=0).astype(np.uint8).reshape(1, 1, 3)
-    return TexturedMesh(vertices, faces, np.full((12, 3, 2), 0.5), np.tile(colour, (4, 4, 1)))
+    return TexturedMesh(box.vertices, box.faces, np.full((len(box.faces), 3, 2), 0.5), np.tile(colour, (4, 4, 1)))

@@ -163,9 +163,10 @@ class Models:
             vertices, faces, group = np.asarray(box.vertices), np.asarray(box.faces, np.int64), np.full(len(none), "")
             uv, numbers, images = np.zeros((len(faces), 3, 2)), none, [colour(element.get("color"), GREYS)]
         else:
-            used, faces = np.unique(model.faces, return_inverse=True)
+            vertices, faces = self._deformed(element, model)
+            used, faces = np.unique(faces, return_inverse=True)
             faces, group = faces.reshape(-1, 3), model.group
-            vertices = model.vertices[used] @ _rotation(element).T
+            vertices = vertices[used] @ _rotation(element).T
             uv, numbers, images = self._painted(element, model)
         low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
         scale = np.where(span > 1e-9, size / np.maximum(span, 1e-12), 1.0)
@@ -188,6 +189,28 @@ class Models:
         mesh = placed(mesh, tilt)
         return dataclasses.replace(mesh, vertices=mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), group
 
+    def _deformed(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces of a model whose parts are opened, turned or slid as drawn.
+
+        Raises:
+            SceneRejected: a matrix that is none.
+        """
+        vertices, faces = model.vertices, model.faces
+        for child in element.findall("transformation"):
+            name = (child.get("name") or "?")[:60]
+            matrix = _numbers(element, "transformation", child.get("matrix") or "")
+            if len(matrix) != 12 or not np.linalg.det(matrix.reshape(3, 4)[:, :3]) > 0:
+                raise SceneRejected(f"{called(element)}: transformation is no matrix; mend the drawing")
+            word = re.compile(rf"({re.escape(name)}|.*_on_{re.escape(name.removeprefix('sweethome3d_'))})(?!\d)")
+            own = np.flatnonzero([word.match(str(g)) is not None for g in model.group])
+            if not len(own):
+                self.source.note(f"{called(element)}: its model has no part {name!r}; it stays as modelled")
+            moved = vertices[faces[own]].reshape(-1, 3) @ matrix.reshape(3, 4)[:, :3].T + matrix.reshape(3, 4)[:, 3]
+            faces = faces.copy()
+            faces[own] = len(vertices) + np.arange(len(moved)).reshape(-1, 3)
+            vertices = np.vstack([vertices, moved])
+        return vertices, faces
+
     def _painted(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
         """Texture coordinates, image numbers and images of a model, in the piece's own colours."""
         images, numbers, uv = list(model.images), model.number.copy(), model.corner_uv
@@ -202,9 +225,10 @@ class Models:
         for k, name in enumerate(model.materials):
             if name in changed:
                 images[k], size = changed[name]
-                if size is not None and not np.ptp(uv[numbers == k], axis=(0, 1)).any():
+                own = np.flatnonzero(numbers == k)
+                if size is not None and len(own) and not np.ptp(uv[own], axis=(0, 1)).any():
                     uv = uv.copy()
-                    uv[numbers == k] = _by_place(model, element, np.flatnonzero(numbers == k), size)
+                    uv[own] = _by_place(model, element, own, size)
         numbers[pane] = len(images)
         return uv, numbers, [*images, GLASS]
 
@@ -227,13 +251,23 @@ def _rotation(element: ElementTree.Element) -> np.ndarray:
     Raises:
         SceneRejected: no rotation.
     """
-    words = (element.get("modelRotation") or "1 0 0 0 1 0 0 0 1").split()
-    turn = np.zeros(0)
-    if len(words) == 9:
-        turn = np.array([number(ElementTree.Element("modelRotation", {"m": w}), "m") for w in words]).reshape(3, 3)
-    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
+    turn = _numbers(element, "modelRotation", element.get("modelRotation") or "1 0 0 0 1 0 0 0 1")
+    turn = turn.reshape(3, 3) if len(turn) == 9 else np.zeros((3, 3))
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
         raise SceneRejected(f"{called(element)}: modelRotation is no rotation; mend the drawing")
     return turn
+
+
+def _numbers(element: ElementTree.Element, what: str, text: str) -> np.ndarray:
+    """(n,) numbers of a list.
+
+    Raises:
+        SceneRejected: one that is none.
+    """
+    name = element.get("name") or element.get("id") or "?"
+    return np.array(
+        [number(ElementTree.Element(element.tag, {"name": name, what: word}), what) for word in text.split()]
+    )
 
 
 def yaw_pose(at: np.ndarray, yaw: float) -> np.ndarray:
