@@ -19,9 +19,9 @@ DOOR_CLEARANCE_M = 0.015
 """Gap under a door's leaf."""
 PUSH_STEPS = 400
 MAX_PUSH_M = 0.5
-DRAWN_PUSH_M = 0.05
+DRAWN_PUSH_M = 0.1
 """The same of a piece that somebody drew where it is to stand."""
-OVERLAP_M = 0.0015
+OVERLAP_M = 0.002
 DAMP_PER_S = 8.0
 SETTLE_S = 1.5
 
