@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import mujoco
 import numpy as np
@@ -54,16 +54,16 @@ def _on_floor(parts: SceneParts) -> SceneParts:
 
 
 def _overlaps(
-    model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int]
+    model: mujoco.MjModel, data: mujoco.MjData, among: Collection[int]
 ) -> dict[tuple[int, int], tuple[float, np.ndarray]]:
-    """Pairs of bodies of which one is free: their deepest overlap, m, and the (2,) way out of it for the second."""
+    """Pairs of bodies with one `among` them: their deepest overlap, m, and the (2,) way out of it for the second."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_collision(model, data)
     deepest: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     for contact in data.contact[: data.ncon]:
         a, b = (int(model.geom_bodyid[g]) for g in contact.geom)
-        if contact.dist > -0.0005 or 0 in (a, b) or (a not in free and b not in free):
+        if contact.dist > -0.0005 or 0 in (a, b) or not {a, b} & set(among):
             continue
         depth, normal = -float(contact.dist), np.array(contact.frame[:2])
         if np.linalg.norm(normal) < 0.5:  # one above the other: apart along the line between their middles
@@ -74,8 +74,8 @@ def _overlaps(
     return deepest
 
 
-def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most_m: float) -> dict:
-    """Slides the free bodies (id -> address in qpos) by up to `most_m`; the overlaps that stay."""
+def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most_m: float) -> None:
+    """Slides the free bodies (id -> address in qpos) by up to `most_m`."""
     mujoco.mj_resetData(model, data)
     start = {body: data.qpos[at : at + 2].copy() for body, at in free.items()}
     for _ in range(PUSH_STEPS):
@@ -93,7 +93,6 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most
         for body, by in shift.items():
             way = data.qpos[free[body] : free[body] + 2] + by - start[body]
             data.qpos[free[body] : free[body] + 2] = start[body] + way * min(1.0, most_m / max(np.hypot(*way), 1e-9))
-    return _overlaps(model, data, free)
 
 
 def push_apart(parts: SceneParts, most_m: float = MAX_PUSH_M, hold: bool = False) -> tuple[SceneParts, dict[int, str]]:
@@ -118,17 +117,19 @@ def push_apart(parts: SceneParts, most_m: float = MAX_PUSH_M, hold: bool = False
         if parts.objects[k].hinge is None
     }
     held: dict[int, str] = {}
-    left = _push(model, data, free, most_m)
-    while hold and (deep := {pair: depth for pair, (depth, _) in left.items() if depth > OVERLAP_M}):
-        a, b = pair = max(deep, key=lambda p: deep[p])
+    among = set(number)
+    _push(model, data, free, most_m)
+    while hold:
+        left = {pair: depth for pair, (depth, _) in _overlaps(model, data, among).items() if depth > OVERLAP_M}
+        if not left:
+            break
+        a, b = max(left, key=lambda pair: left[pair])
         # A leaf that stands in a piece cannot turn; of two pieces the lighter one can be missed.
-        worst = min(
-            (body for body in pair if body in number and number[body] not in held),
-            key=lambda body: (body in free, model.body_mass[body]),
-        )
+        worst = min({a, b} & among, key=lambda body: (body in free, model.body_mass[body]))
         held[number[worst]] = model.body(a + b - worst).name
         free.pop(worst, None)
-        left = _push(model, data, free, most_m)
+        among.remove(worst)
+        _push(model, data, free, most_m)
     return _with_poses(parts, model, data), held
 
 

@@ -246,7 +246,7 @@ class _Drawing:
         self.named[name] += 1
         name = f"{name} {self.named[name]}"
         if SLIDES.search(" ".join([e.get("catalogId") or "", name, *np.unique(group)])):
-            self.source.note(f"{name}: its leaves slide or fold; they stay as drawn")
+            self.source.note(f"{name}: its sliding or folding parts stay as drawn")
         if e.tag == "doorOrWindow":
             return self._door(e, name, pose, surface, group)
         kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)

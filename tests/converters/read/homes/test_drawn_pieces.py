@@ -55,6 +55,15 @@ def test_what_cannot_be_parted_is_built_in(crowded):
     assert any(c == pytest.approx([0.15, c[1], c[2]], abs=0.03) and -2.1 < c[1] < -0.9 for c in corners)
 
 
+def test_a_leaf_that_stands_in_a_piece_stays_shut(tmp_path, hull_cache):
+    blocked = write_home(tmp_path, [*HOME[:7], piece("Bookcase", 400, 230, "60 60 180")])
+    made = convert(blocked, tmp_path / "out", SMALL, cache=hull_cache)
+    assert made.manifest.objects == ()
+    told = " ".join(w for w in made.manifest.warnings if "built in" in w)
+    assert "Door_1_leaf_1 (from " in told and "Bookcase_1 (from " in told
+    assert {g.name for g in made.gates if not g.passed} == set()
+
+
 RAIL = f"g sweethome3d_opening_on_rail_1\n{cuboid((-45, 5, 25), (45, 45, 27), 8)}"
 DRAWER = f"g body\n{cuboid((-50, 0, -25), (50, 50, 25))}{RAIL}"
 
@@ -70,7 +79,7 @@ def test_parts_of_a_model_are_moved_as_drawn(tmp_path):
     points = placed(raw, "Dresser")
     assert np.unique(points[:, 1].round(4)).tolist() == pytest.approx([-1.86, -1.84, -1.64, -1.14])
     assert any("has no part 'sweethome3d_rail_7'" in w for w in raw.warnings)
-    assert "Dresser 1: its leaves slide or fold; they stay as drawn" in raw.warnings
+    assert "Dresser 1: its sliding or folding parts stay as drawn" in raw.warnings
     for matrix in ("1 0 0", "0 0 0 0 0 0 0 0 0 0 0 0", "nan 0 0 0 0 1 0 0 0 0 1 0"):
         bad = moved.replace("1 0 0 0 0 1 0 0 0 0 1 20", matrix)
         path = write_home(
