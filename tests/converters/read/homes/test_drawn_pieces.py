@@ -113,7 +113,7 @@ def test_a_model_without_leaves_gets_flat_ones(tmp_path):
     assert leaf.min(axis=0) == pytest.approx([1.55, 0.03, 0.0]) and leaf.max(axis=0) == pytest.approx([2.45, 0.07, 2.0])
     (annotation,) = raw.annotations
     assert annotation.hinge is not None
-    assert annotation.hinge.range_rad == pytest.approx((0.0, math.pi / 2))
+    assert annotation.hinge.range_rad == pytest.approx((-math.pi / 2, 0.0))
     assert (annotation.pose[:3, :3] @ annotation.hinge.origin + annotation.pose[:3, 3]) == pytest.approx(
         [1.55, 0.05, 0.0]
     )
