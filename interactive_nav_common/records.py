@@ -32,6 +32,7 @@ KINDS: dict[Any, tuple[type | types.UnionType, str]] = {
     int: (int, "a whole number"),
     float: (int | float, "a number"),
     tuple: (list | tuple, "a list"),
+    list: (list | tuple, "a list"),
     dict: (dict, "a mapping"),
 }
 """A type -> what decoded files hold for it, and its name in errors."""
@@ -150,6 +151,8 @@ class Reader:
             raise self.error(f"{where} is {shown(value)}, expected {words}; {self.remedy}")
         if origin is dict:
             return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in found.items()}
+        if origin is list:
+            return [self.typed(item, arguments[0], f"{where}[{i}]") for i, item in enumerate(found)]
         if origin is tuple:
             each = [arguments[0]] * len(found) if arguments[1:] == (...,) else arguments
             if len(each) != len(found):

@@ -27,14 +27,21 @@ class Robot:
     wheels: tuple[Wheel, ...] = ()
     at: tuple[float, float] | None = None
     seeds: dict[str, Natural] = dataclasses.field(default_factory=dict)
-    size: int | dict[str, int] = 0
+    size: int | dict[str, list[int]] = 0
     moves: bool = True
     notes: Any = None
 
 
 def test_lists_become_tuples_and_mappings_records():
-    data = {"name": "a", "kind": "arm", "wheels": [{"radius_m": 1}], "at": [0, 1.5], "size": {"x": 2}, "notes": [None]}
-    want = Robot("a", "arm", (Wheel(1),), (0, 1.5), {}, {"x": 2}, True, [None])
+    data = {
+        "name": "a",
+        "kind": "arm",
+        "wheels": [{"radius_m": 1}],
+        "at": [0, 1.5],
+        "size": {"x": [2]},
+        "notes": [None],
+    }
+    want = Robot("a", "arm", (Wheel(1),), (0, 1.5), {}, {"x": [2]}, True, [None])
     assert READER.record(data, Robot, "x") == want and READER.record({"name": "a"}, Robot, "x") == Robot("a")
     assert READER.record({"name": "a", "more": 1}, Robot, "x", others=True) == Robot("a")
 
