@@ -340,3 +340,15 @@ def test_physical_values_of_a_ball_in_free_fall():
     values = physical_values(spec.compile())
     assert values["drift"] == pytest.approx(0.5 * 9.81 * 5.0**2, rel=0.01)  # g t^2 / 2
     assert values["turn"] == pytest.approx(0.0, abs=1e-6) and values["penetration"] == 0.0 and values["finite"] == 1.0
+
+
+def test_what_fails_is_named():
+    spec = mujoco.MjSpec()
+    for name, height in (("still", 0.3), ("sunk", 0.4)):
+        body = spec.worldbody.add_body(name=name, pos=[0, 0, height])
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.06])
+    named: dict[str, str] = {}
+    values = physical_values(spec.compile(), named)
+    assert values["penetration"] == pytest.approx(0.02, abs=1e-6) and named["penetration"] == "still and sunk"
+    assert values["drift"] > 100 and named["drift"] in ("still", "sunk")
