@@ -1,4 +1,4 @@
-"""`python -m converters convert|object|propose|check|generate|generate-scenes|models|preview`: parse, print, exit.
+"""`python -m converters convert|export|object|propose|check|generate|...`: parse, print, exit.
 
 Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
 line on stderr), 130 or 143 interrupted.
@@ -159,6 +159,14 @@ def _preview(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _export(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.write.sh3d import export_sh3d
+
+    for line in export_sh3d(arguments.scene, arguments.output):
+        console.print(f"{arguments.output}: {line}", soft_wrap=True, highlight=False, markup=False)
+    return 0
+
+
 def _propose(arguments: argparse.Namespace, console: Console) -> int:
     from converters.propose.report import propose
     from converters.propose.retrieval import read_library
@@ -302,11 +310,20 @@ def _add_preview(commands: Commands) -> None:
     command.set_defaults(run=_preview, writes=("{}",))
 
 
+def _add_export(commands: Commands) -> None:
+    command = commands.add_parser(
+        "export", help="draw a scene for Sweet Home 3D, to edit it there and convert it again"
+    )
+    command.add_argument("scene", type=Path, metavar="SCENE_DIR")
+    command.add_argument("output", type=Path, metavar="HOME.sh3d", help="file to make")
+    command.set_defaults(run=_export, writes=("{}",))
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     generating = (add_generate, add_generate_scenes, add_models, add_library)
-    for add in (_add_convert, _add_propose, _add_object, _add_check, *generating, _add_preview):
+    for add in (_add_convert, _add_propose, _add_object, _add_check, *generating, _add_preview, _add_export):
         add(commands)
     return parser
 

@@ -52,6 +52,8 @@ TURN_MOST_RAD = math.radians(120)
 AJAR_RAD = math.radians(10)
 """A leaf that is drawn farther from both ends of its swing stands ajar."""
 LOW_TABLE_M = 0.5
+OURS = "interactive_nav#"
+"""Ids of drawings that `converters.write.sh3d` makes: their categories are known."""
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
 """Ids, less what stands before #, of shapes that people build all kinds of things from."""
 IDS = {
@@ -132,7 +134,7 @@ def kind_of(catalogue_id: str, name: str, height_m: float = 1.0) -> str:
             if word == key or (len(key) > 4 and word.endswith(key))
         )
         found = found or FOREIGN.get(next(ends, ""))
-    if found == "table" and height_m < LOW_TABLE_M:
+    if found == "table" and height_m < LOW_TABLE_M and not catalogue_id.startswith(OURS):
         return "coffee_table"
     return found or "other"
 

@@ -1,0 +1,320 @@
+"""A scene folder in; a Sweet Home 3D drawing (`.sh3d`, a ZIP with `Home.xml` and models) out, to be edited there.
+
+Frames: a scene is metres, z up, y to the back of the plan; a drawing is cm, its y points down and its angles turn
+clockwise; models are y up with their front along +z. A door's own frame is z up, x along the wall that it stands in.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import xml.etree.ElementTree as ElementTree
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import shapely
+from PIL import Image
+
+from converters.geometry.boxes import convex_hull
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.homes.sh3d import OURS
+from converters.records.errors import SceneRejected
+from converters.structure.walls import cover_rectangles
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import whole_file
+from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
+from scenes_mjcf.schema import load_manifest
+
+WALL_M = 1.8
+"""What is built in and lower is furniture or a parapet: it bounds no room."""
+FRAME_M = 0.008
+"""Of a door's frame, within the wall beside the leaf and above it."""
+GAP_M = 0.6
+"""A doorway may be so much wider than its leaf."""
+BESIDE_M = 0.08
+"""A leaf may hang so far beside the middle of its wall."""
+BEYOND_M, THICK_M = (0.01, 0.06, 0.11), (0.04, 0.4)
+"""So far beyond a gap's ends it is seen how thick the wall is, within these bounds; else it is `INNER_M`."""
+INNER_M, ROOM_M2, SLACK_RAD, TILT_RAD = 0.1, 0.5, 0.15, 0.01
+IN_M = 0.002
+"""Free faces are drawn so far back: those on the border of two cells of a map would fill both."""
+WALL, FLOOR = "FFEDEAE4", "FFC8B9A0"
+LEAF = "sweethome3d_opening_on_hinge_1"
+
+
+class Wall(NamedTuple):
+    """A straight wall, m."""
+
+    ends: np.ndarray  # (2, 2) of its middle line
+    thickness: float
+    height: float
+
+    def polygon(self) -> Any:
+        """Its footprint."""
+        return shapely.LineString(self.ends).buffer(self.thickness / 2, cap_style="flat")
+
+
+class Mesh(NamedTuple):
+    """What shows a body: (n, 3) vertices (body frame, m), the OBJ's other lines, its texture, and the names of both."""
+
+    vertices: np.ndarray
+    rest: str
+    image: bytes
+    key: tuple[str, str]
+
+
+def export_sh3d(folder: Path, target: Path) -> list[str]:
+    """Writes a scene's walls, rooms, doors and furniture as a drawing; returns a line each on what is in it, or is not.
+
+    Args:
+        folder: of the scene.
+        target: file to write, which must not be there.
+
+    Raises:
+        SceneError: no scene folder.
+        SceneRejected: its MJCF or a mesh is missing or damaged.
+        FileError: the target is there, has another ending or cannot be written.
+    """
+    manifest = load_manifest(folder)
+    if target.suffix != ".sh3d" or target.exists():
+        state = "exists" if target.exists() else "has another ending"
+        raise FileError(f"{target}: {state}, expected a new file that ends in .sh3d; choose another name")
+    drawing = _Export(folder, manifest.name, manifest.licence)
+    told = drawing.fill({o.name: o.category for o in manifest.objects})
+    with whole_file(target) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in drawing.files.items():
+            archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED)
+    return told
+
+
+def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall]:
+    """Walls side by side, of boxes that overlap: (3,) centres, (3,) half sizes, m, and yaws, rad; high ones first."""
+    walls, groups = [], {}
+    for centre, half, yaw in boxes:
+        turn = round(yaw, 3)
+        at, flat = centre[:2] @ yaw_matrix(turn)[:2, :2], half[:2]
+        groups.setdefault(turn, []).append(np.round([*(at - flat), *(at + flat), centre[2] + half[2]], 4))
+    for turn, edges in groups.items():
+        x0, y0, x1, y1, top = np.array(edges).T
+        xs, ys = np.unique([x0, x1]), np.unique([y0, y1])
+        taken = np.zeros((len(ys) - 1, len(xs) - 1), bool)
+        for height in np.unique(top)[::-1]:
+            own = np.zeros_like(taken)
+            for k in np.flatnonzero(top == height):
+                rows, columns = ys.searchsorted([y0[k], y1[k]]), xs.searchsorted([x0[k], x1[k]])
+                own[slice(*rows), slice(*columns)] = True
+            own &= ~taken
+            taken |= own
+            for r0, r1, c0, c1 in cover_rectangles(own, own, disjoint=True):
+                low, high = np.array([xs[c0], ys[r0]]), np.array([xs[c1], ys[r1]])
+                along = int(np.argmax(high - low))
+                ends = np.tile((low + high) / 2, (2, 1))
+                ends[:, along] = low[along], high[along]
+                ends = ends @ yaw_matrix(turn)[:2, :2].T
+                walls.append(Wall(ends, float((high - low)[1 - along]), float(height)))
+    return walls
+
+
+class _Export:
+    """A drawing in the making."""
+
+    def __init__(self, folder: Path, name: str, licence: str) -> None:
+        self.folder, self.files = folder, {"LICENCE": licence.encode()} if licence else {}
+        try:
+            self.spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+        except (ValueError, RuntimeError, OSError) as error:
+            why = f"MuJoCo refuses it ({' '.join(str(error).split())})"
+            raise SceneRejected(f"{folder / 'scene.xml'}: {why}; convert the scene again") from None
+        self.root = ElementTree.Element("home", version="6500", name=f"{name}.sh3d", wallHeight="250")
+        self._add("property", name="licence", value=licence)
+        self.models: dict[Any, str] = {}
+
+    def _add(self, tag: str, parent: ElementTree.Element | None = None, /, **words: Any) -> ElementTree.Element:
+        text = {k: f"{v:.5f}" if isinstance(v, float) else str(v) for k, v in words.items()}
+        return ElementTree.SubElement(self.root if parent is None else parent, tag, text)
+
+    def fill(self, category: dict[str, str]) -> list[str]:
+        """All of it; what there is and what is left out, a line each."""
+        geoms = [g for g in self.spec.geoms if g.name.startswith("wall_")]
+        self.walls = merged_walls([(np.array(g.pos), np.array(g.size), _yaw(g.quat)) for g in geoms])
+        self.low_m = min(WALL_M, 0.8 * max((w.height for w in self.walls), default=0.0))
+        self.high = [w for w in self.walls if w.height > self.low_m]
+        self.stands = shapely.union_all([w.polygon() for w in self.high])
+        told, hinged = ["left out: windows, colours of walls and floors, and masses"], 0
+        if len(self.high) < len(self.walls):
+            told.append("built-in furniture is drawn as low walls")
+        bodies = [b for b in self.spec.bodies if b.name in category]
+        for body in bodies:
+            mesh = self._mesh(body)
+            hinge = mesh is not None and any(j.type == mujoco.mjtJoint.mjJNT_HINGE for j in body.joints)
+            hinged += hinge
+            if mesh is None:
+                told.append(f"left out: {body.name}, which has no mesh to look at")
+            elif not (hinge and self._door(body, mesh)):
+                self._piece(body, mesh, category[body.name])
+                told += [f"{body.name}: stands in no gap of a wall; drawn as a piece that does not turn"] * hinge
+        every = shapely.union_all([w.polygon() for w in self.walls])
+        for k, wall in enumerate(self.walls):
+            run = np.diff(wall.ends, axis=0)[0] / np.linalg.norm(wall.ends[1] - wall.ends[0])
+            beyond = [wall.ends[0] - 1e-3 * run, wall.ends[1] + 1e-3 * run]
+            out = np.where(shapely.contains(every, shapely.points(beyond)), IN_M, -IN_M)
+            (x0, y0), (x1, y1) = 100 * (wall.ends + np.outer(out * [-1, 1], run)) * [1.0, -1.0] + 0.0
+            words = {"height": 100 * wall.height, "thickness": 100 * (wall.thickness - 2 * IN_M), "pattern": "hatchUp"}
+            words |= {"leftSideColor": WALL, "rightSideColor": WALL}
+            self._add("wall", id=f"wall{k}", xStart=x0, yStart=y0, xEnd=x1, yEnd=y1, **words)
+        high = (w.polygon() for w in self.walls if w.height > self.low_m)
+        stands = shapely.union_all([p.buffer(1e-4, join_style="mitre") for p in high])
+        holes = (shapely.Polygon(ring) for part in shapely.get_parts(stands) for ring in part.interiors)
+        rooms = [hole.simplify(1e-3) for hole in holes if hole.area > ROOM_M2]
+        for k, plan in enumerate(rooms):
+            words = {"areaVisible": "true", "floorColor": FLOOR, "ceilingVisible": "false"}
+            room = self._add("room", id=f"room{k}", name=f"Room {k + 1}", **words)
+            for x, y in 100 * shapely.get_coordinates(plan.exterior)[:-1] * [1.0, -1.0] + 0.0:
+                self._add("point", room, x=x, y=y)
+        ElementTree.indent(self.root)
+        self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
+        count = f"{len(self.walls)} walls, {len(rooms)} rooms, {hinged} doors, {len(bodies) - hinged} other things"
+        return [count, *told]
+
+    def _mesh(self, body: Any) -> Mesh | None:
+        """What shows a body; None where nothing does."""
+        geom = next((g for g in body.geoms if g.name == f"{body.name}_visual"), None)
+        if geom is None:
+            return None
+        path = self.folder
+        try:
+            mesh = self.spec.mesh(geom.meshname)
+            look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]
+            path = self.folder / self.spec.meshdir / mesh.file
+            rows = path.read_text(encoding="ascii").splitlines()
+            vertices = np.array([row.split()[1:4] for row in rows if row[:2] == "v "], float) * mesh.scale
+            if vertices.ndim != 2 or not np.isfinite(vertices).all():
+                raise ValueError("has no vertices")
+            path = self.folder / self.spec.texturedir / self.spec.texture(look).file
+            data = path.read_bytes()
+            Image.open(io.BytesIO(data)).verify()
+        except (OSError, ValueError, AttributeError, SyntaxError) as error:
+            reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+            why = f"not readable ({reason}), {body.name} needs it"
+            raise SceneRejected(f"{path}: {why}; convert the scene again") from None
+        rest = "\n".join(row for row in rows if row[:2] in ("vt", "f "))
+        return Mesh(vertices, rest, data, (f"{mesh.file} {mesh.scale}", look))
+
+    def _model(
+        self, key: Any, vertices: np.ndarray, mesh: Mesh, group: str = "piece", frame: np.ndarray | None = None
+    ) -> str:
+        """Entry of a model, written once, of vertices in a frame that is z up and corners of a door frame's bars."""
+        if key in self.models:
+            return self.models[key]
+        number = len(self.models) + 1
+        bars = [] if frame is None else [convex_hull(bar) for bar in frame]
+        points = 100 * np.vstack([vertices, *(bar.vertices for bar in bars)]) @ Y_UP_TO_Z_UP + 0.0
+        text = "mtllib model.mtl\n" + "".join(f"v {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in points)
+        text += f"g {group}\nusemtl look\n{mesh.rest}\n" + ("g frame\nusemtl frame\n" if bars else "")
+        first = len(vertices) + 1
+        for bar in bars:
+            text += "".join(f"f {a} {b} {c}\n" for a, b, c in bar.faces + first)
+            first += len(bar.vertices)
+        materials = "newmtl look\nKd 1 1 1\nillum 1\nmap_Kd model.png\nnewmtl frame\nKd 0.85 0.83 0.8\nillum 1\n"
+        for name, data in (("obj", text.encode()), ("mtl", materials.encode()), ("png", mesh.image)):
+            self.files[f"{number}/model.{name}"] = data
+        self.models[key] = f"{number}/model.obj"
+        return self.models[key]
+
+    def _words(self, kind: str, model: str, box: np.ndarray, yaw: float, at: np.ndarray) -> dict[str, Any]:
+        """Attributes of a piece whose model fills a (2, 3) box in a frame at (3,) `at`."""
+        middle = at[:2] + yaw_matrix(yaw)[:2, :2] @ box.mean(axis=0)[:2]
+        width, depth, height = 100 * (box[1] - box[0])
+        place = {"x": 100 * middle[0], "y": -100 * middle[1], "elevation": max(100 * (at[2] + box[0, 2]), 0.0)}
+        place |= {"angle": -yaw % math.tau, "width": width, "depth": depth, "height": height}
+        name = "thing" if kind == "other" else kind.replace("_", " ").capitalize()
+        return {"catalogId": OURS + kind, "name": name, "model": model, **place}
+
+    def _piece(self, body: Any, mesh: Mesh, kind: str) -> None:
+        yaw = _yaw(body.quat)
+        rest = yaw_matrix(yaw).T @ matrix_from_quat(np.array(body.quat))
+        rest = rest if math.acos(np.clip(rest[2, 2], -1, 1)) > TILT_RAD else np.eye(3)
+        vertices = mesh.vertices @ rest.T
+        model = self._model((mesh.key, rest.round(6).tobytes()), vertices, mesh)
+        box = np.array([vertices.min(axis=0), vertices.max(axis=0)])
+        self._add("pieceOfFurniture", movable="true", **self._words(kind, model, box, yaw, np.array(body.pos)))
+
+    def _door(self, body: Any, mesh: Mesh) -> bool:
+        """A door as it stands, with its frame and the wall that it stands in; False where it stands in no gap."""
+        joint, at, own = body.joints[0], np.array(body.pos), matrix_from_quat(np.array(body.quat))
+        leaf, hinge = mesh.vertices @ own.T + at, (own @ joint.pos + at)[:2]
+        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2 - joint.pos
+        axis = int(np.argmax(np.ptp(mesh.vertices, axis=0)[:2]))
+        along = own[:2, axis] * math.copysign(1.0, middle[axis])
+        rest, length = math.atan2(along[1], along[0]), float(((leaf[:, :2] - hinge) @ along).max())
+        lines = {round(math.atan2(*(w.ends[1] - w.ends[0])[::-1]) % (math.pi / 2), 3) for w in self.high}
+        gaps = []
+        for yaw in (line + k * math.pi / 2 for line in lines for k in range(4)):
+            turn = math.remainder(yaw - rest, math.tau)
+            if joint.range[0] - SLACK_RAD <= turn <= joint.range[1] + SLACK_RAD:
+                shut = hinge + yaw_matrix(turn)[:2, :2] @ (own @ middle)[:2]
+                gap = _gap(self.stands, shut, yaw_matrix(yaw)[:2, 0], length)
+                gaps += [] if gap is None else [(float(np.linalg.norm(gap[1] - gap[0])), yaw, gap)]
+        if not gaps:
+            return False
+        wide, yaw, gap = min(gaps, key=lambda g: g[:2])
+        wall = _between(self.stands, gap, max(w.height for w in self.high))
+        self.walls.append(wall)
+        back, centre = yaw_matrix(yaw), np.array([*wall.ends.mean(axis=0), 0.0])
+        vertices, pin = (leaf - centre) @ back, ((hinge - centre[:2]) @ back[:2, :2])
+        x, y, top = wide / 2, wall.thickness / 2, vertices[:, 2].max() + 0.01
+        out, up = x + FRAME_M, top + FRAME_M
+        bars = np.array([_bar(-out, -x, 0.0, top, y), _bar(x, out, 0.0, top, y), _bar(-out, out, top, up, y)])
+        model = self._model((mesh.key, body.name), vertices, mesh, LEAF, bars)
+        every = np.vstack([vertices, bars.reshape(-1, 3)])
+        box = np.array([every.min(axis=0), every.max(axis=0)])
+        width, depth = (box[1] - box[0])[:2]
+        words = self._words("door", model, box, yaw, centre)
+        shape = f"M{(-out - box[0, 0]) / width:.5f},0 v1 h{2 * out / width:.5f} v-1 z"  # the leaf may reach farther
+        words |= {"wallThickness": wall.thickness / depth, "wallDistance": (box[1, 1] - y) / depth}
+        door = self._add("doorOrWindow", movable="false", cutOutShape=shape, wallCutOutOnBothSides="true", **words)
+        start, end = sorted((math.remainder(rest - yaw, math.tau) + float(q) for q in joint.range), key=abs)
+        sash = {"xAxis": (pin[0] - box[0, 0]) / width, "yAxis": (box[1, 1] - pin[1]) / depth}
+        self._add("sash", door, **sash, width=length / width, startAngle=start, endAngle=end)
+        return True
+
+
+def _yaw(quat: Any) -> float:
+    turn = matrix_from_quat(np.array(quat))
+    return math.atan2(turn[1, 0], turn[0, 0])
+
+
+def _bar(x0: float, x1: float, z0: float, z1: float, half: float) -> np.ndarray:
+    """(8, 3) corners of an upright bar across a wall: four below, four above."""
+    return np.array([(x, y, z) for z in (z0, z1) for x, y in ((x0, -half), (x1, -half), (x1, half), (x0, half))])
+
+
+def _gap(stands: Any, middle: np.ndarray, along: np.ndarray, length: float) -> np.ndarray | None:
+    """(2, 2) ends, in its direction, of the gap between walls in which a shut leaf stands; None where there is none."""
+    reach = along * (length + GAP_M)
+    band = shapely.LineString([middle - reach, middle + reach]).buffer(BESIDE_M, cap_style="flat")
+    parts = shapely.get_parts(shapely.intersection(band, stands))
+    runs = [(shapely.get_coordinates(part) - middle) @ along for part in parts]
+    start = max((r.max() for r in runs if r.mean() < 0), default=-math.inf)
+    end = min((r.min() for r in runs if r.mean() > 0), default=math.inf)
+    if not 0.8 * length < end - start < length + GAP_M:
+        return None
+    return middle + np.outer([start, end], along)
+
+
+def _between(stands: Any, ends: np.ndarray, height: float) -> Wall:
+    """The wall from (2,) end to (2,) end of a gap, as thick as the thicker one beside it."""
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    across, found = along[::-1] * [-1.0, 1.0], []
+    for end, out in ((ends[0], -along), (ends[1], along)):
+        for at in end + np.outer(BEYOND_M, out):
+            line = shapely.LineString([at - across, at + across])
+            for part in shapely.get_parts(shapely.intersection(line, stands)):
+                if shapely.distance(part, shapely.Point(at)) < BESIDE_M and THICK_M[0] <= part.length <= THICK_M[1]:
+                    middle = shapely.get_coordinates(part).mean(axis=0)
+                    found.append((part.length, float((middle - end) @ across)))
+    thick, off = max(found, default=(INNER_M, 0.0))
+    return Wall(ends + off * across, thick, height)

@@ -1,0 +1,163 @@
+"""A scene drawn for Sweet Home 3D, read and converted again."""
+
+import shutil
+import zipfile
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from scipy.spatial import KDTree
+
+from converters.__main__ import main
+from converters.pipeline import ConvertConfig, convert
+from converters.read.homes.sh3d import kind_of, read_sh3d
+from converters.write.sh3d import Wall, export_sh3d, merged_walls
+from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.schema import CATEGORIES, load_manifest, load_maps
+
+HOME = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
+CUT_M = 1.05
+
+
+@pytest.fixture(scope="module")
+def drawing(tmp_path_factory) -> Path:
+    """A committed home with two doors, drawn."""
+    path = tmp_path_factory.mktemp("drawn") / "apartment.sh3d"
+    told = export_sh3d(HOME, path)
+    assert told[0] == "36 walls, 2 rooms, 2 doors, 7 other things"
+    return path
+
+
+def of_scene(folder: Path) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+
+
+def footprint(folder: Path) -> shapely.Geometry:
+    """Of the wall boxes that are higher than `CUT_M`."""
+    boxes = [g for g in of_scene(folder).geoms if g.name.startswith("wall_") and g.pos[2] + g.size[2] > CUT_M]
+    return shapely.union_all([shapely.box(*(g.pos - g.size)[:2], *(g.pos + g.size)[:2]) for g in boxes])
+
+
+def seen(folder: Path, name: str) -> np.ndarray:
+    """(n, 3) vertices of a body's picture, in the world."""
+    body = of_scene(folder).body(name)
+    own = np.asarray(trimesh.load_mesh(folder / "assets" / f"{name}_visual.obj", process=False).vertices)
+    return own @ matrix_from_quat(np.array(body.quat)).T + body.pos
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> float:
+    """The Hausdorff distance of two clouds, m."""
+    return max(KDTree(a).query(b)[0].max() for a, b in ((first, second), (second, first)))
+
+
+def test_every_piece_stands_where_it_stood(drawing):
+    raw, objects = read_sh3d(drawing), load_manifest(HOME).objects
+    assert sorted(a.category for a in raw.annotations) == sorted(o.category for o in objects)
+    for thing in objects:
+        world = seen(HOME, thing.name)
+        found = [
+            apart(surface.vertices @ a.pose[:3, :3].T + a.pose[:3, 3], world)
+            for a in raw.annotations
+            if a.category == thing.category and (surface := raw.cads[a.cad_id].surface) is not None
+        ]
+        assert min(found) < 0.002, thing.name
+
+
+def test_walls_and_doorways_are_the_scenes(drawing):
+    raw, stands = read_sh3d(drawing), footprint(HOME)
+    segments = trimesh.intersections.mesh_plane(
+        trimesh.Trimesh(raw.scan.vertices, raw.scan.faces, process=False), [0, 0, 1], [0, 0, CUT_M]
+    )
+    lines = shapely.union_all(shapely.linestrings(np.asarray(segments)[:, :, :2]))
+    outline = shapely.points(shapely.get_coordinates(stands.boundary.segmentize(0.1)))
+    assert shapely.distance(outline, lines).max() < 0.01
+    # The bars of a frame fill the steps of a wall that tapers towards its doorway.
+    assert shapely.difference(lines, stands.buffer(0.01)).length < 1.0 and stands.buffer(0.11).covers(lines)
+
+
+def test_leaves_turn_as_far_to_the_same_side(drawing):
+    raw = read_sh3d(drawing)
+    for k in (0, 1):
+        body = of_scene(HOME).body(f"door_{k}")
+        turn = matrix_from_quat(np.array(body.quat))
+        pin = (turn @ body.joints[0].pos + body.pos)[:2]
+        ends = [a for a in raw.annotations if a.hinge is not None]
+        off = [np.linalg.norm((a.pose[:3, :3] @ a.hinge.origin + a.pose[:3, 3])[:2] - pin) for a in ends if a.hinge]
+        hinge = ends[int(np.argmin(off))].hinge
+        assert min(off) < 0.002 and hinge is not None
+        assert hinge.range_rad == pytest.approx(body.joints[0].range, abs=0.1)
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_the_reader_knows_every_category(category):
+    assert kind_of(f"interactive_nav#{category}", "thing", 0.3) == category
+
+
+def test_a_scene_comes_back(tiny_scene, tmp_path, hull_cache):
+    assert main(["export", str(tiny_scene[0]), str(tmp_path / "tiny.sh3d")]) == 0
+    config = ConvertConfig(structure_texture=64, object_texture=32)
+    back = convert(tmp_path / "tiny.sh3d", tmp_path / "back", config, cache=hull_cache)
+    assert {g.name for g in back.gates if not g.passed} == set()
+    own, again = (sorted(load_manifest(f).objects, key=lambda o: o.name) for f in (tiny_scene[0], tmp_path / "back"))
+    assert [o.name for o in again] == [o.name for o in own]
+    for thing in own:
+        before, after = (of_scene(f).body(thing.name) for f in (tiny_scene[0], tmp_path / "back"))
+        assert np.linalg.norm(np.array(before.pos) - after.pos) < 0.01
+        turn = matrix_from_quat(np.array(before.quat)).T @ matrix_from_quat(np.array(after.quat))
+        assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 1
+    maps = [load_maps(folder) for folder in (tiny_scene[0], tmp_path / "back")]
+    assert np.array_equal(maps[0].traversable, maps[1].traversable) and maps[0].origin_w == maps[1].origin_w
+    assert footprint(tiny_scene[0]).symmetric_difference(footprint(tmp_path / "back")).area < 1e-6
+
+
+def test_overlapping_boxes_become_walls_side_by_side():
+    boxes = [((0, 0, 1.25), (2, 0.1, 1.25)), ((1.9, 1, 1.25), (0.1, 1, 1.25)), ((0, 0.3, 0.5), (0.5, 0.4, 0.5))]
+    turn = 0.3
+    c, s = np.cos(turn), np.sin(turn)
+    placed = [(np.array([c * x - s * y, s * x + c * y, z]), np.array(half), turn) for (x, y, z), half in boxes]
+    walls = merged_walls(placed)
+    assert all(isinstance(w, Wall) for w in walls) and sorted(w.height for w in walls) == [1.0, 2.5, 2.5]
+    areas = [w.polygon().area for w in walls]
+    assert sum(areas) == pytest.approx(shapely.union_all([w.polygon() for w in walls]).area, abs=1e-6)
+    assert sum(areas) == pytest.approx(4 * 0.2 + 0.2 * 1.9 + 1.0 * 0.6, abs=1e-3)
+
+
+def test_one_mesh_is_written_once(tmp_path):
+    folder = shutil.copytree(HOME, tmp_path / "twins")
+    text = (folder / "scene.xml").read_text()
+    for word in ("mesh", "material"):
+        end = "visual" if word == "mesh" else "material"
+        text = text.replace(f' {word}="chair_1_{end}"', f' {word}="chair_0_{end}"')
+    (folder / "scene.xml").write_text(text)
+    export_sh3d(folder, tmp_path / "twins.sh3d")
+    with zipfile.ZipFile(tmp_path / "twins.sh3d") as archive:
+        assert sum(name.endswith(".obj") for name in archive.namelist()) == 8
+        assert archive.read("Home.xml").count(b"<pieceOfFurniture") == 7
+
+
+@pytest.mark.parametrize(
+    ("spoil", "out", "words"),
+    [
+        (lambda f: shutil.rmtree(f), "home.sh3d", "expected a scene folder"),
+        (lambda f: (f / "assets" / "chair_0_visual.obj").unlink(), "home.sh3d", "chair_0 needs it; convert the scene"),
+        (
+            lambda f: (f / "assets" / "chair_0.png").write_bytes(b"?"),
+            "home.sh3d",
+            "chair_0 needs it; convert the scene",
+        ),
+        (lambda f: (f / "scene.xml").write_text("<mujoco"), "home.sh3d", "MuJoCo refuses it"),
+        (lambda f: None, "home.xml", "expected a new file that ends in .sh3d"),
+        (lambda f: (f.parent / "home.sh3d").write_text("kept"), "home.sh3d", "exists, expected a new file"),
+    ],
+)
+def test_bad_input(tmp_path, capsys, spoil, out, words):
+    folder = Path(shutil.copytree(HOME, tmp_path / "home"))
+    spoil(folder)
+    before = sorted(p.name for p in tmp_path.iterdir())
+    assert main(["export", str(folder), str(tmp_path / out)]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
