@@ -6,6 +6,7 @@ Conventions of the written MJCF (classes, groups, names) are in `scenes_mjcf/REA
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import mujoco
@@ -271,6 +272,40 @@ def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) ->
         )
 
 
+def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
+    """Triangles, and quads in place of two that share an edge.
+
+    Readers of OBJ cut a quad from its first corner to its third or along its shorter diagonal. The shared edge is both,
+    or the quad is a parallelogram, which is the same however it is cut.
+
+    Args:
+        faces: (m, 3) triangles of one orientation.
+        corners: (k, d) position and texture coordinates of each corner.
+    """
+    made: list[list[int]] = []
+    free: dict[tuple[int, int], int] = {}
+    at = corners[:, :3].tolist(), corners.tolist()
+    for a, b, c in faces.tolist():
+        for start, end, tip in ((a, b, c), (b, c, a), (c, a, b)):
+            k = free.get((end, start))
+            if k is None:
+                continue
+            u, v, w = made[k]
+            other = u + v + w - start - end
+            shared, across = math.dist(at[0][start], at[0][end]), math.dist(at[0][tip], at[0][other])
+            even = all(abs(p + q - r - s) < 1e-4 for p, q, r, s in zip(*(at[1][x] for x in (start, end, tip, other))))
+            if shared < 0.999 * across or even:
+                for edge in ((u, v), (v, w), (w, u)):
+                    if free.get(edge) == k:
+                        del free[edge]
+                made[k] = [start, other, end, tip]
+                break
+        else:
+            free.update(dict.fromkeys(((a, b), (b, c), (c, a)), len(made)))
+            made.append([a, b, c])
+    return made
+
+
 def write_obj(
     path: Path,
     vertices: np.ndarray,
@@ -278,15 +313,20 @@ def write_obj(
     uv: np.ndarray | None = None,
     uv_faces: np.ndarray | None = None,
     decimals: int = 4,
+    uv_decimals: int = 4,
 ) -> None:
-    """Writes a triangle mesh as OBJ, 0.1 mm by default; one with texture coordinates without trailing zeros."""
+    """Writes a triangle mesh as OBJ, 0.1 mm by default; one with texture coordinates in as few bytes as will do."""
     if uv is None or uv_faces is None:
         lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     else:
-        lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.round(vertices, decimals) + 0.0]
-        lines += [f"vt {u:.9g} {v:.9g}" for u, v in np.round(uv, 4) + 0.0]
-        lines += [f"f {a}/{i} {b}/{j} {c}/{k}" for (a, b, c), (i, j, k) in zip(faces + 1, uv_faces + 1, strict=True)]
+        vertices, uv = np.round(vertices, decimals) + 0.0, np.round(uv, uv_decimals) + 0.0
+        pairs, of = np.unique(np.stack([faces, uv_faces], axis=2).reshape(-1, 2), axis=0, return_inverse=True)
+        lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv]
+        names = [f"{v}/{t}" for v, t in pairs + 1]
+        for polygon in paired(of.reshape(-1, 3), np.hstack([vertices[pairs[:, 0]], uv[pairs[:, 1]]])):
+            lines.append(" ".join(("f", *(names[k] for k in polygon))))
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
@@ -306,7 +346,8 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
         assert visual is not None
         if look.mesh == name:
             mesh = visual.vertices, visual.faces, visual.uv, visual.uv_faces
-            write_obj(assets / f"{name}_visual.obj", *mesh, decimals=3 if name == "structure" else 4)
+            digits = 3 if name == "structure" else 4, 3 if max(visual.image.shape) <= 256 else 4
+            write_obj(assets / f"{name}_visual.obj", *mesh, *digits)
         if look.image == name:
             image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
             image.save(assets / f"{name}.png", optimize=True)

@@ -14,6 +14,7 @@ from converters.generate.surface.finishes import Colouring
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas, charts_of, face_axes, pack_rows
 from converters.geometry.faces import face_vectors
+from converters.write.texture import quantise
 
 SHEETS = (1024, 1536, 2048)
 """Sides that a sheet may have, texels; on the largest the resolution is lowered until all fits."""
@@ -21,8 +22,8 @@ MARGIN = 3
 """Texels around each patch that repeat its border, so that smaller versions of the sheet do not mix patches."""
 LIGHT_M = 0.06
 """Between the points of a patch at which light is worked out."""
-LEVELS = 63
-"""Steps of each channel, few enough for a small PNG."""
+COLOURS = 256
+"""Of the sheet: a PNG with a palette."""
 
 Light = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(n, 3) places and (n, 3) normals -> (n, 3) brightness of each channel."""
@@ -45,6 +46,8 @@ class Chart:
     """Its colour is what one sees: no light falls on it."""
     uv: np.ndarray | None = None
     """(k, 2) in 0..1, of an image."""
+    uv_faces: np.ndarray | None = None
+    """(m, 3) into `uv`; None: as `faces`."""
     lit_as: np.ndarray | None = None
     """(3,) normal that light falls on as if it were its own: of thin things at a wall, whose edges are not dark."""
 
@@ -190,10 +193,16 @@ def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
             uv.append(corner + q.chart.uv * n)
         else:
             uv.append(corner + (q.chart.vertices - q.corner) @ q.axes.T * density)
-    start = np.cumsum([0, *(len(c.vertices) for c in charts)])
-    vertices = np.concatenate([c.vertices for c in charts])
-    faces = np.concatenate([c.faces + k for c, k in zip(charts, start, strict=False)]).astype(np.int64)
+    vertices, faces = _stacked([c.vertices for c in charts], [c.faces for c in charts])
+    uv, uv_faces = _stacked(uv, [c.faces if c.uv_faces is None else c.uv_faces for c in charts])
     labels = np.repeat([c.label for c in charts], [len(c.vertices) for c in charts]).astype(np.uint8)
-    colour = np.round(np.round(np.clip(sheet, 0, 1), 6) * LEVELS) * (255 / LEVELS)
-    image = np.round(colour).astype(np.uint8)[::-1]
-    return Scan(vertices, faces, labels), Atlas(np.concatenate(uv) / side, faces, image)
+    # Steps of 1/63 first: the last digits of a colour are the processor's.
+    colour = np.round(np.round(np.round(np.clip(sheet, 0, 1), 6) * 63) * (255 / 63)).astype(np.uint8)[::-1]
+    image = np.asarray(quantise(colour, COLOURS).convert("RGB"))
+    return Scan(vertices, faces, labels), Atlas(uv / side, uv_faces, image)
+
+
+def _stacked(points: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """All points, and all faces into them."""
+    start = np.cumsum([0, *(len(p) for p in points)])
+    return np.concatenate(points), np.concatenate([f + k for f, k in zip(faces, start, strict=False)]).astype(np.int64)

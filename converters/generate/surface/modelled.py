@@ -173,12 +173,9 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
             picture = np.asarray(visual.image, float)[..., :3] / 255
             h, w = (n // 2 * 2 for n in picture.shape[:2])
             images[item.model.name] = picture[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean(axis=(1, 3))
-        # A vertex of the picture for each corner's UV.
-        pairs = np.column_stack([np.ravel(visual.faces), np.ravel(visual.uv_faces)])
-        used, index = np.unique(pairs, axis=0, return_inverse=True)
-        placed = item.to_floor(np.asarray(visual.vertices, float)[used[:, 0]])
-        uv = np.asarray(visual.uv, float)[used[:, 1]]
-        charts.append(Chart(placed, index.reshape(-1, 3), label, images[item.model.name], uv=uv))
+        placed, image = item.to_floor(np.asarray(visual.vertices, float)), images[item.model.name]
+        uv, uv_faces = np.asarray(visual.uv, float), visual.uv_faces
+        charts.append(Chart(placed, visual.faces, label, image, uv=uv, uv_faces=uv_faces))
     return charts
 
 

@@ -8,13 +8,14 @@ import mujoco
 import numpy as np
 import trimesh
 from PIL import Image
+from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import physical_properties
 from converters.check.surfaces import geom_mesh, geom_surface
 from converters.geometry.boxes import convex_hull, fit_box
 from converters.records.visual import VisualMesh
-from converters.write.emit import SceneParts, write_scene
+from converters.write.emit import SceneParts, paired, write_obj, write_scene
 
 WIDE = np.array([1.1, 0.95, 1.0])
 IMAGE = np.random.default_rng(0).integers(0, 255, (16, 8, 3), np.uint8)
@@ -49,8 +50,37 @@ def test_equal_objects_share_their_files_and_keep_their_vertices(tmp_path):
     for placed, visual in made:
         drawn = geom_surface(model, model.geom(f"{placed.name}_visual").id)
         assert drawn.corner_uv is not None and drawn.texture is not None
-        assert np.abs(drawn.vertices[drawn.faces] - visual.vertices[visual.faces]).max() < 1e-4
-        assert np.abs(drawn.corner_uv - visual.uv[visual.uv_faces]).max() < 1e-4
+        corners = np.concatenate([visual.vertices[visual.faces], visual.uv[visual.uv_faces]], axis=2)
+        turned = np.concatenate([np.roll(corners, k, axis=1) for k in range(3)]).reshape(-1, 15)
+        found = np.concatenate([drawn.vertices[drawn.faces], drawn.corner_uv], axis=2).reshape(-1, 15)
+        far, index = KDTree(turned).query(found)
+        assert far.max() < 2e-3 and sorted(index % len(corners)) == list(range(len(corners)))
         assert (drawn.texture == visual.image).all()
         hull = geom_mesh(model, model.geom(f"{placed.name}_hull_0").id)[0]
         assert np.abs(np.sort(hull, axis=0) - np.sort(placed.hulls_b[0].vertices, axis=0)).max() < 2e-5
+
+
+def test_two_triangles_are_a_quad_where_every_reader_finds_the_same_two(tmp_path):
+    """A square, two slopes that meet in a short ridge, two in a long one, which is not the shorter diagonal."""
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [5, 4, 7], [8, 9, 10], [9, 8, 11]])
+    square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    short, long = ([[x, 3, 0], [x + ridge, 3, 0], [x, 4, 1], [x, 2, 1]] for x, ridge in ((0, 0.5), (2, 4)))
+    vertices = np.array([*square, *short, *long], float)
+    uv = vertices[:, :2] / 10
+    assert paired(faces, np.hstack([vertices, uv])) == [[0, 1, 2, 3], [5, 6, 4, 7], [8, 9, 10], [9, 8, 11]]
+    write_obj(tmp_path / "mesh.obj", vertices, faces, uv, faces)
+    polygons = [line.split()[1:] for line in (tmp_path / "mesh.obj").read_text().splitlines() if line[0] == "f"]
+    assert [len(polygon) for polygon in polygons] == [4, 4, 3, 3]
+    own = trimesh.load(tmp_path / "mesh.obj", process=False)
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="mesh", file=str(tmp_path / "mesh.obj"), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    for read, cut in ((own.vertices, own.faces), geom_mesh(spec.compile(), 0)):
+        found = np.round(np.asarray(read, float)[cut], 4) + 0.0
+        for ridge in (faces[2:4], faces[4:]):
+            for face in ridge:
+                wanted = sorted(vertices[face].tolist())
+                assert any(sorted(t) == wanted for t in found.tolist())
+        flat = found[(found[:, :, 2] == 0).all(axis=1) & (found[:, :, 1] <= 1).all(axis=1)]
+        normals = np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+        assert len(flat) == 2 and normals.tolist() == [[0.0, 0.0, 1.0]] * 2
