@@ -280,11 +280,11 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
 
     Args:
         faces: (m, 3) triangles of one orientation.
-        corners: (k, d) position and texture coordinates of each corner.
+        corners: (k, 5) position and texture coordinates of each corner, in units of their last digit.
     """
     made: list[list[int]] = []
     free: dict[tuple[int, int], int] = {}
-    at = corners[:, :3].tolist(), corners.tolist()
+    at = corners[:, :3].tolist()
     for a, b, c in faces.tolist():
         for start, end, tip in ((a, b, c), (b, c, a), (c, a, b)):
             k = free.get((end, start))
@@ -292,9 +292,11 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
                 continue
             u, v, w = made[k]
             other = u + v + w - start - end
-            shared, across = math.dist(at[0][start], at[0][end]), math.dist(at[0][tip], at[0][other])
-            even = all(abs(p + q - r - s) < 1e-4 for p, q, r, s in zip(*(at[1][x] for x in (start, end, tip, other))))
-            if shared < 0.999 * across or even:
+            shared, across = math.dist(at[start], at[end]), math.dist(at[tip], at[other])
+            if (
+                shared < 0.999 * across
+                or np.abs(corners[[start, end]].sum(0) - corners[[tip, other]].sum(0)).max() < 2.5
+            ):
                 for edge in ((u, v), (v, w), (w, u)):
                     if free.get(edge) == k:
                         del free[edge]
@@ -325,7 +327,8 @@ def write_obj(
         lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
         lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv]
         names = [f"{v}/{t}" for v, t in pairs + 1]
-        for polygon in paired(of.reshape(-1, 3), np.hstack([vertices[pairs[:, 0]], uv[pairs[:, 1]]])):
+        steps = np.hstack([vertices[pairs[:, 0]] * 10**decimals, uv[pairs[:, 1]] * 10**uv_decimals])
+        for polygon in paired(of.reshape(-1, 3), steps):
             lines.append(" ".join(("f", *(names[k] for k in polygon))))
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 

@@ -67,7 +67,7 @@ def test_two_triangles_are_a_quad_where_every_reader_finds_the_same_two(tmp_path
     short, long = ([[x, 3, 0], [x + ridge, 3, 0], [x, 4, 1], [x, 2, 1]] for x, ridge in ((0, 0.5), (2, 4)))
     vertices = np.array([*square, *short, *long], float)
     uv = vertices[:, :2] / 10
-    assert paired(faces, np.hstack([vertices, uv])) == [[0, 1, 2, 3], [5, 6, 4, 7], [8, 9, 10], [9, 8, 11]]
+    assert paired(faces, 1e4 * np.hstack([vertices, uv])) == [[0, 1, 2, 3], [5, 6, 4, 7], [8, 9, 10], [9, 8, 11]]
     write_obj(tmp_path / "mesh.obj", vertices, faces, uv, faces)
     polygons = [line.split()[1:] for line in (tmp_path / "mesh.obj").read_text().splitlines() if line[0] == "f"]
     assert [len(polygon) for polygon in polygons] == [4, 4, 3, 3]
