@@ -16,7 +16,7 @@ from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
 from converters.geometry.boxes import OrientedBox, least_turned
 from converters.records.visual import VisualMesh
-from converters.write.texture import as_png, quantise
+from converters.write.texture import as_png, quantise, share_plain
 
 TIMESTEP_S = 0.005
 DOOR_DAMPING = 2.0
@@ -341,6 +341,7 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
         folder: of the scene.
         palette: colours of a texture.
     """
+    parts = dataclasses.replace(parts, object_visuals=tuple(map(share_plain, parts.object_visuals)))
     assets, shared = folder / "assets", share_assets(parts)
     assets.mkdir()
     drawn = dict(zip((o.name for o in parts.objects), parts.object_visuals, strict=True))

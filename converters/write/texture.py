@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -23,6 +24,8 @@ AGREE = 0.5
 and out)."""
 TEXTURE_SPACING_M = 0.025
 """Sampling of a textured scan's surface; a vertex-coloured scan is sampled at its vertices."""
+PLAIN, MARGIN = 8, 4
+"""Levels of a channel that a face of one colour may differ by; texels that are kept around what is looked up."""
 
 
 def colour_cloud(
@@ -173,6 +176,41 @@ def as_png(image: np.ndarray) -> Image.Image:
 def quantise(image: np.ndarray, colours: int) -> Image.Image:
     """Palette image: a third of the bytes, and scan colours carry no more."""
     return Image.fromarray(image).quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+
+
+def share_plain(visual: VisualMesh) -> VisualMesh:
+    """The same picture in fewer bytes: faces of one colour look up one place, and what nobody looks up is blank.
+
+    Args:
+        visual: as baked; one with an image that is not square is left as it is.
+    """
+    side, faces = len(visual.image), np.arange(len(visual.faces))
+    if visual.image.shape[1] != side or not len(faces):
+        return visual
+    texel, _, face = texel_surface(visual.vertices, visual.faces, visual.uv, visual.uv_faces, side)
+    middle = visual.uv[visual.uv_faces].mean(axis=1)
+    row, column = (np.clip((v * side).astype(int), 0, side - 1) for v in (1 - middle[:, 1], middle[:, 0]))
+    texel, face = np.append(texel, row * side + column), np.append(face, faces)
+    colours = visual.image.reshape(-1, 3)[texel].astype(int)
+    low, high = np.full((len(faces), 3), 255), np.zeros((len(faces), 3), int)
+    np.minimum.at(low, face, colours)
+    np.maximum.at(high, face, colours)
+    plain = np.ptp([low, high], axis=0).max(axis=1) <= PLAIN
+    if not plain.any():
+        return visual
+    # Each colour is looked up in the largest of its faces.
+    order = np.lexsort([-np.bincount(face, minlength=len(faces))[plain]])
+    chosen = np.flatnonzero(plain)[order]
+    _, first, of = np.unique(visual.image[row, column][chosen], axis=0, return_index=True, return_inverse=True)
+    places = chosen[first]
+    uv_faces = visual.uv_faces.copy()
+    uv_faces[chosen] = len(visual.uv) + of.reshape(-1, 1)
+    uv, index = np.unique(np.vstack([visual.uv, middle[places]])[uv_faces.ravel()], axis=0, return_inverse=True)
+    used = np.zeros(side * side, bool)
+    used[texel[~plain[face] | np.isin(face, places)]] = True
+    near = ndimage.binary_dilation(used.reshape(side, side), iterations=MARGIN)
+    image = np.where(near[..., None], visual.image, visual.image[row[places[0]], column[places[0]]])
+    return dataclasses.replace(visual, uv=uv, uv_faces=index.reshape(-1, 3), image=image)
 
 
 def bake_structure(

@@ -14,7 +14,6 @@ from converters.generate.surface.finishes import Colouring
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas, charts_of, face_axes, pack_rows
 from converters.geometry.faces import face_vectors
-from converters.write.texture import quantise
 
 SHEETS = (1024, 1536, 2048)
 """Sides that a sheet may have, texels; on the largest the resolution is lowered until all fits."""
@@ -22,8 +21,8 @@ MARGIN = 3
 """Texels around each patch that repeat its border, so that smaller versions of the sheet do not mix patches."""
 LIGHT_M = 0.06
 """Between the points of a patch at which light is worked out."""
-COLOURS = 256
-"""Of the sheet: a PNG with a palette."""
+LEVELS = 63
+"""Steps of each channel, few enough for a small PNG."""
 
 Light = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(n, 3) places and (n, 3) normals -> (n, 3) brightness of each channel."""
@@ -196,9 +195,8 @@ def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
     vertices, faces = _stacked([c.vertices for c in charts], [c.faces for c in charts])
     uv, uv_faces = _stacked(uv, [c.faces if c.uv_faces is None else c.uv_faces for c in charts])
     labels = np.repeat([c.label for c in charts], [len(c.vertices) for c in charts]).astype(np.uint8)
-    # Steps of 1/63 first: the last digits of a colour are the processor's.
-    colour = np.round(np.round(np.round(np.clip(sheet, 0, 1), 6) * 63) * (255 / 63)).astype(np.uint8)[::-1]
-    image = np.asarray(quantise(colour, COLOURS).convert("RGB"))
+    colour = np.round(np.round(np.clip(sheet, 0, 1), 6) * LEVELS) * (255 / LEVELS)
+    image = np.round(colour).astype(np.uint8)[::-1]
     return Scan(vertices, faces, labels), Atlas(uv / side, uv_faces, image)
 
 

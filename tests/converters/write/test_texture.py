@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
 
 from converters.geometry.faces import simplify
 from converters.records.raw import ScanMesh
-from converters.records.visual import ColourCloud
+from converters.records.visual import ColourCloud, VisualMesh
 from converters.write.texture import (
     bake_object,
     bake_structure,
     colour_cloud,
     fill_image,
     quantise,
+    share_plain,
     texel_surface,
 )
 
@@ -144,3 +147,32 @@ def test_quantised_colours_stay_close():
     ramp = np.tile(np.arange(256, dtype=np.uint8)[:, None, None], (1, 8, 3)) // np.array([1, 2, 4], np.uint8)
     back = np.asarray(quantise(ramp, 64).convert("RGB")).astype(int)
     assert np.abs(back - ramp).max() <= 8
+
+
+def test_faces_of_one_colour_look_up_one_place_and_the_rest_is_blank():
+    """Two red triangles, a blue one and a striped one, in the quarters of an image with noise between them."""
+    image = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    for (row, column), colour in {(2, 2): [255, 0, 0], (2, 34): [255, 0, 0], (34, 2): [0, 0, 255]}.items():
+        image[row : row + 26, column : column + 26] = colour
+    image[34:60, 34:60] = np.where(np.arange(26)[:, None, None] % 4 < 2, 0, 255)
+    corner = np.array([[3, 3], [25, 3], [3, 25]])
+    uv = np.concatenate([corner + [x, y] for y, x in ((2, 2), (2, 34), (34, 2), (34, 34))]) / 64
+    uv[:, 1] = 1 - uv[:, 1]
+    vertices, faces = np.hstack([uv, np.zeros((12, 1))]), np.arange(12).reshape(4, 3)
+    visual = VisualMesh(vertices, faces, uv, faces, image)
+    made = share_plain(visual)
+    assert len(made.uv) == 5 and (np.ptp(made.uv[made.uv_faces[:3]], axis=1) == 0).all()
+    assert (made.uv[made.uv_faces[3]] == uv[9:]).all() and (made.faces == faces).all()
+    for weights in ([0.8, 0.1, 0.1], [0.2, 0.5, 0.3]):
+        before, after = (
+            [
+                v.image[int((1 - y) * 64), int(x * 64)].tolist()
+                for x, y in np.tensordot(weights, v.uv[v.uv_faces], (0, 1))
+            ]
+            for v in (visual, made)
+        )
+        assert before == after
+    assert len(np.unique(made.image[:28, 34:].reshape(-1, 3), axis=0)) == 1
+    assert share_plain(made).uv.tolist() == made.uv.tolist()
+    noise = dataclasses.replace(visual, image=np.random.default_rng(1).integers(0, 255, (64, 64, 3), np.uint8))
+    assert share_plain(noise) is noise
