@@ -15,7 +15,8 @@ OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
 SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar")
 """Parts of the state vector."""
-IMAGES = ("depth", "segmentation")
+IMAGES = ("depth", "segmentation", "rgb", "normals")
+"""Parts that are images."""
 ORIGINAL_CODE: dict[str, Any] = {
     "episode_steps": 500,
     "success_in_3d": True,
@@ -195,7 +196,7 @@ class SensorConfig(Settings):
 
     observations: tuple[str, ...] = OBSERVATIONS
     """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
-    odometry, collision, joints, lidar. With images (depth, segmentation) the observation is a dict."""
+    odometry, collision, joints, lidar. With images (depth, segmentation, rgb, normals) the observation is a dict."""
     renderer: Literal["auto", "warp", "rays"] = "auto"
     """Who draws: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
     image_size: AtLeastOne = 68
@@ -203,7 +204,7 @@ class SensorConfig(Settings):
     image_fov_deg: Annotated[float | None, Bounds(0, 180, open=True)] = None
     """Field of view; none: the robot's camera's (120 degrees)."""
     image_dtype: Literal["float32", "float16", "uint8"] = "float32"
-    """Of images: float32 or float16 in [0, 1], or uint8, 255 times that."""
+    """Of images: float32 or float16 in [0, 1], or uint8, 255 times that; normals are in [-1, 1] and never uint8."""
     depth_range_m: Positive = 5.0
     """Depth is cut off here and divided by it."""
     segmentation_classes: MaskClasses = 4
@@ -229,7 +230,7 @@ class SensorConfig(Settings):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("image_size image_fov_deg image_dtype renderer", "depth or segmentation among observations",
+        ("image_size image_fov_deg image_dtype renderer", f"one of {', '.join(IMAGES)} among observations",
          lambda c: any(name in c.observations for name in IMAGES)),
         ("depth_range_m depth_dropout depth_noise", "depth among observations", lambda c: "depth" in c.observations),
         ("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar among observations",

@@ -4,9 +4,9 @@
 
 Cameras stand at drawn starts of a scene and turn a little at every call, so that no frame repeats. Each stream is
 measured with the frames left on the device and copied to the host. `rgb` is Lambert shading of the collision boxes
-by class; `rgb_textured` draws the scene's visual meshes with textures (renderer warp only); `observation` is depth
-and segmentation in one pass, without the environment around them. A row that fails (memory, for the most part)
-carries `error` instead of a rate. Rows are appended to `benchmarks/results/rendering.jsonl`.
+in their bodies' mean colours; `rgb_textured` draws the scene's visual meshes with textures (renderer warp only);
+`observation` is depth and segmentation in one pass, without the environment around them. A row that fails (memory, for
+the most part) carries `error` instead of a rate. Rows are appended to `benchmarks/results/rendering.jsonl`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ import numpy as np
 
 import interactive_nav
 from benchmarks.measurement import SCENE, append_row, command_line, origin, timed
-from interactive_nav.pictures.shading import PALETTES, lambert
-from interactive_nav.sensing import BoxTables, CameraPose, Lens, make_renderer
-from interactive_nav.sensing.boxes import box_poses, rotate
+from interactive_nav.sensing import CameraPose, Lens, build_boxes, make_renderer
 
 STREAMS = ("observation", "depth", "segmentation", "normals", "rgb", "rgb_textured")
 TURN_RAD = 0.1
@@ -64,7 +62,8 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
         matrix = jnp.broadcast_to(matrix, (n, visual.model.ngeom, 3, 3))
         painter = WarpColour(visual.model, lens, n, list(SCENE))
         return lambda angle: painter.draw(position, matrix, _turned(camera, angle))
-    renderer = make_renderer(sensors.boxes, lens, renderer_name, env.backend)
+    boxes = build_boxes(env.world, sensors.boxes.classes, colours=stream in ("rgb", "normals"))
+    renderer = make_renderer(boxes, lens, renderer_name, env.backend)
 
     @jax.jit
     def draw(scene, qpos, camera, angle):
@@ -72,80 +71,10 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
         if stream in ("observation", "depth", "segmentation"):
             depth, ids = renderer.render_batch(scene, qpos, camera)
             return {"observation": (depth, ids), "depth": depth, "segmentation": ids}[stream]
-        depth, index = renderer.trace_batch(scene, qpos, camera)
-        normal = normals(sensors.boxes, scene, qpos, camera, lens, depth, index)
-        return normal if stream == "normals" else colours(sensors.boxes, scene, camera, normal, index)
+        seen = renderer.images_batch((stream,), scene, qpos, camera)[stream]
+        return seen if stream == "normals" else jnp.round(255.0 * seen).astype(jnp.uint8)
 
     return lambda angle: draw(scene, qpos, camera, angle)
-
-
-def normals(
-    tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: CameraPose, lens: Lens, depth, index
-) -> jax.Array:
-    """World normals of what the pixels show; leading axes [N].
-
-    Args:
-        tables: of the world.
-        scene: [N] i32.
-        qpos: [N, nq].
-        camera: leaves [N, ...].
-        lens: of the images.
-        depth: [N, H, W] f32, m.
-        index: [N, H, W] i32, both from `Renderer.trace_batch`.
-
-    Returns:
-        [N, H, W, 3] f32 unit vectors, 0 where nothing is met.
-    """
-    centre, axes = box_poses(tables, scene, qpos)
-    n, boxes = centre.shape[:2]
-    forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
-    columns, rows = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
-    ray = forward + right * columns + up * rows
-    point = camera.pos_w[:, None, None] + ray * depth[..., None]
-
-    def of_pixel(table):
-        """[N, B + 2, k] to [N, H, W, k]: rows by the pixels' indices; the floor's and nothing's come last."""
-        row = jnp.where(index < 0, boxes + 1, index) + (boxes + 2) * jnp.arange(n)[:, None, None]
-        return table.reshape(n * (boxes + 2), -1)[row]
-
-    def with_rest(table):
-        return jnp.concatenate([table, jnp.zeros((n, 2, table.shape[-1]))], 1)
-
-    # The face that a point lies on is the one that it is least inside of, by distance to the box's middle planes.
-    inverse = jnp.swapaxes(axes, -1, -2).reshape(n, boxes, 9)
-    planes = jnp.concatenate([inverse, rotate(jnp.swapaxes(axes, -1, -2), centre), tables.half_m[scene]], -1)
-    row = jax.lax.optimization_barrier(of_pixel(with_rest(planes)))
-    offsets = [(row[..., 3 * i : 3 * i + 3] * point).sum(-1) - row[..., 9 + i] for i in range(3)]
-    depths = [jnp.abs(o) - row[..., 12 + i] for i, o in enumerate(offsets)]
-    first = (depths[0] >= depths[1]) & (depths[0] >= depths[2])
-    second = ~first & (depths[1] >= depths[2])
-    normal = jnp.sign(offsets[2])[..., None] * row[..., 6:9]
-    normal = jnp.where(second[..., None], jnp.sign(offsets[1])[..., None] * row[..., 3:6], normal)
-    normal = jnp.where(first[..., None], jnp.sign(offsets[0])[..., None] * row[..., 0:3], normal)
-    return jnp.where((index == boxes)[..., None], jnp.asarray([0.0, 0.0, 1.0]), normal)
-
-
-def colours(tables: BoxTables, scene: jax.Array, camera: CameraPose, normal_w: jax.Array, index) -> jax.Array:
-    """Flat colours by class, lit from above and from the camera (Lambert).
-
-    Args:
-        tables: of the world.
-        scene: [N] i32.
-        camera: leaves [N, ...].
-        normal_w: [N, H, W, 3].
-        index: [N, H, W] i32.
-
-    Returns:
-        [N, H, W, 3] u8.
-    """
-    n, boxes = len(scene), tables.num_boxes
-    ids = tables.class_id[scene].astype(jnp.int32)
-    palette = jnp.asarray(PALETTES[tables.classes])
-    floor, background = len(palette) - 2, len(palette) - 1
-    ids = jnp.concatenate([ids, jnp.full((n, 1), floor), jnp.full((n, 1), background)], 1)
-    place = jnp.where(index < 0, boxes + 1, index).reshape(n, -1)
-    base = palette[jnp.take_along_axis(ids, place, 1)].reshape(*index.shape, 3)
-    return lambert(base, normal_w, camera.axes_w[:, None, None, :, 0], index >= 0, jnp)
 
 
 def measure(draw: Callable[[jax.Array], Any], num_envs: int, to_host: bool, seconds: float) -> dict[str, float]:

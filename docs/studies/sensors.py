@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 import interactive_nav
 from interactive_nav.pictures.camera import ENGINES, STREAMS, VIEWS, Camera
-from interactive_nav.pictures.shading import PALETTES
+from interactive_nav.sensing.shading import PALETTES
 
 _GAP_PX, _LABEL_PX = 8, 22
 

@@ -61,7 +61,8 @@ def register_envs() -> None:
 def observation_space_of(env: InteractiveNav) -> spaces.Space:
     """A `Box` for a flat observation, a `Dict` of boxes for one in parts.
 
-    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 to 1 in their own type.
+    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 (normals: -1) to 1 in
+    their own type.
     """
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     obs = jax.eval_shape(env.reset, key).obs
@@ -69,7 +70,8 @@ def observation_space_of(env: InteractiveNav) -> spaces.Space:
     def box(name: str, x: Any) -> spaces.Box:
         image, dtype = name.startswith("pixels/"), np.dtype(x.dtype)
         high = 255 if dtype == np.uint8 else 1.0 if image else np.inf
-        return spaces.Box(0 if image else -np.inf, high, x.shape, dtype.type)
+        low = -1.0 if name == "pixels/normals" else 0 if image else -np.inf
+        return spaces.Box(low, high, x.shape, dtype.type)
 
     if isinstance(obs, Mapping):
         return spaces.Dict({name: box(name, x) for name, x in obs.items()})

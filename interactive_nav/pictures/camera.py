@@ -13,14 +13,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from interactive_nav.physics import resolve_backend
 from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
-from interactive_nav.pictures.shading import SKY_COLOUR, lambert
 from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
+from interactive_nav.sensing.shading import SKY_COLOUR, geom_colour, lambert
 from interactive_nav_common.errors import ConfigError, UserError
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
@@ -164,21 +163,8 @@ class _PictureModel(SceneModel):
     def __init__(self, env: Any, scene: int):
         world = env.world
         super().__init__(world.robot, world.scenes[scene], world.small_objects, env.sensors.boxes.classes)
-        self.colour = np.array([_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
+        self.colour = np.array([geom_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
         """[ngeom, 3] in [0, 1]: of the geom, or its texture's mean."""
-
-
-def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    material = model.geom_matid[geom]
-    texture = model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
-    if texture < 0:
-        return (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])[:3]
-    size = model.tex_height[texture] * model.tex_width[texture]
-    first, channels = model.tex_adr[texture], model.tex_nchannel[texture]
-    pixels = model.tex_data[first : first + size * channels].reshape(size, channels)[:, :3]
-    # Atlases are padded with black.
-    used = pixels.max(1) > 8
-    return pixels[used].mean(0) / 255.0 if used.any() else np.full(3, 0.5)
 
 
 def _by_rays(

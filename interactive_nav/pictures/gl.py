@@ -18,7 +18,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from interactive_nav.sensing.base import SKY_COLOUR, CameraPose
+from interactive_nav.sensing.base import CameraPose
+from interactive_nav.sensing.shading import SKY_COLOUR
 from interactive_nav_common.errors import UserError
 
 LIBRARIES = ("egl", "osmesa", "glfw")

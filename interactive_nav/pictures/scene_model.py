@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from interactive_nav.pictures.shading import FLOOR_COLOUR, PALETTES
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import CATEGORIES, MaskClasses, class_id

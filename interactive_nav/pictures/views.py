@@ -21,7 +21,8 @@ from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, SCENE, THINGS
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.sensing.base import SKY_COLOUR, CameraPose, Lens, look_along
+from interactive_nav.sensing.base import CameraPose, Lens, look_along
+from interactive_nav.sensing.shading import SKY_COLOUR
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses

@@ -1,9 +1,10 @@
-"""What every renderer offers: scenes, `qpos` and camera poses in, depth and class images out, for a batch at once."""
+"""What every renderer offers: scenes, `qpos` and camera poses in, images out, for a batch at once."""
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -13,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.batching import one_of_batch
+from interactive_nav.sensing.boxes import BoxTables
+from interactive_nav.sensing.surfaces import paint
 
 NEAR_M = 0.01
 FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
-SKY_COLOUR = (0.93, 0.95, 0.97)
-"""RGB in [0, 1] of pictures where nothing is met."""
 
 
 @flax.struct.dataclass
@@ -90,6 +91,7 @@ class Renderer(abc.ABC):
 
     name: str
     lens: Lens
+    tables: BoxTables
 
     @abc.abstractmethod
     def render_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
@@ -113,6 +115,32 @@ class Renderer(abc.ABC):
             Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
             -1 nothing.
         """
+
+    def images_batch(
+        self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose
+    ) -> dict[str, jax.Array]:
+        """Draws a batch in several ways.
+
+        Args:
+            names: of depth, segmentation, rgb, normals; others may come along.
+            scene: [N] i32.
+            qpos: [N, nq] f32.
+            camera: leaves [N, ...].
+
+        Returns:
+            depth and segmentation as `render_batch` gives them; rgb [N, H, W, 3] f32 in [0, 1]; normals
+            [N, H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the viewer), 0 where nothing is.
+        """
+        if not set(names) & {"rgb", "normals"}:
+            return dict(zip(("depth", "segmentation"), self.render_batch(scene, qpos, camera), strict=True))
+        _, index = self.trace_batch(scene, qpos, camera)
+        return paint(self.tables, self.lens, scene, qpos, camera, index)
+
+    def images(
+        self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose
+    ) -> dict[str, jax.Array]:
+        """One environment's `images_batch`; under any number of `vmap`s all environments are drawn in one call."""
+        return one_of_batch(functools.partial(self.images_batch, names), (scene, qpos, camera))
 
     def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
         """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""

@@ -14,8 +14,11 @@ import numpy as np
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import sorted_movables
 from interactive_nav.scenes.world import World
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, body_colours
 from interactive_nav_common.rotations import Array, matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
+
+_TINY = np.float32(1e-12)
 
 
 @flax.struct.dataclass
@@ -36,6 +39,8 @@ class BoxTables:
     """[S, B, 3] f32 half sizes; negative: padding, met by no ray."""
     class_id: jax.Array
     """[S, B] u8."""
+    colour: jax.Array | None
+    """[S, B + 1, 3] f32 in [0, 1], the floor's last; None: not asked for."""
     hinge_pos_w: jax.Array
     """[S, M, 3] f32 rest position of a hinged body's frame, m."""
     hinge_axes_w: jax.Array
@@ -67,12 +72,21 @@ def _boxes_of_slots(world: World, scene: Scene, classes: MaskClasses) -> list[tu
     return [*out, (scene.walls, 0)]
 
 
-def build_boxes(world: World, classes: MaskClasses = 4) -> BoxTables:
+def _colours_of_slots(world: World, s: int, ids: list[int], classes: MaskClasses) -> np.ndarray:
+    """[M + 2, 3]: mean colour of the visual meshes in each slot, of the walls, and the floor's; where a body has no
+    mesh, that of its class."""
+    own, names = body_colours(world.scenes[s]), (*world.names[s], "structure")
+    rows = [own[name] if name in own else PALETTES[classes][number] for name, number in zip(names, ids, strict=True)]
+    return np.stack([*rows, np.asarray(FLOOR_COLOUR)])
+
+
+def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
     Args:
         world: with its scenes.
         classes: the setting `segmentation_classes`.
+        colours: reads the textures, for images in colour.
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
@@ -96,6 +110,10 @@ def build_boxes(world: World, classes: MaskClasses = 4) -> BoxTables:
             joint = model.body_jntadr[leaf]
             hinge_pos[s, m], hinge_axes[s, m] = model.body_pos[leaf], matrix_from_quat(model.body_quat[leaf])
             hinge_axis[s, m], anchor[s, m] = model.jnt_axis[joint], model.jnt_pos[joint]
+    painted = [
+        _colours_of_slots(world, s, [number for _, number in column], classes)[[*body, -1]]
+        for s, column in enumerate(columns if colours else [])
+    ]
     f32 = jnp.float32
     return BoxTables(
         body=body,
@@ -105,6 +123,7 @@ def build_boxes(world: World, classes: MaskClasses = 4) -> BoxTables:
         axes_b=jnp.asarray(axes, f32),
         half_m=jnp.asarray(half, f32),
         class_id=jnp.asarray(ids),
+        colour=jnp.asarray(np.stack(painted), f32) if colours else None,
         classes=classes,
         hinge_pos_w=jnp.asarray(hinge_pos, f32),
         hinge_axes_w=jnp.asarray(hinge_axes, f32),
@@ -168,3 +187,17 @@ def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax
     pos, axes = body_poses(tables, scene, qpos)
     pos, axes = pos[..., tables.body, :], axes[..., tables.body, :, :]
     return pos + rotate(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
+
+
+def slab(eye: jax.Array, half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where rays enter and leave the space between two opposite faces of a box, in units of the direction's length.
+
+    Args:
+        eye: the rays' origin along the faces' normal, from the box's centre, m.
+        half: from the centre to a face, m.
+        direction: of the rays, along the normal.
+    """
+    # A ray in a face's plane would divide by 0.
+    inverse = 1.0 / (direction + _TINY)
+    middle, reach = -eye * inverse, half * jnp.abs(inverse)
+    return middle - reach, middle + reach

@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
-from interactive_nav.sensing.boxes import BoxTables, box_poses, compose, rotate
+from interactive_nav.sensing.boxes import BoxTables, box_poses, compose, rotate, slab
 from scenes_mjcf.categories import SEGMENTATIONS
 
 _EMPTY = np.int32(2**31 - 1)
-_TINY = np.float32(1e-12)
 _BOXES_AT_ONCE = 8
 _TILES_AT_ONCE = 64
 
@@ -36,18 +35,18 @@ class RayRenderer(Renderer):
             lens: of the camera.
             tiled: none: on CPUs.
         """
-        self.lens, self._tables = lens, tables
+        self.lens, self.tables = lens, tables
         self._tiled = jax.default_backend() == "cpu" if tiled is None else tiled
         self.name = "rays (tiles)" if self._tiled else "rays (scan)"
 
     def render_batch(self, scene, qpos, camera):
-        boxes = boxes_seen(self._tables, scene, qpos, camera)
-        depth, ids = self._cast(boxes, camera, _low_bits(len(SEGMENTATIONS[self._tables.classes].names) - 1))
+        boxes = boxes_seen(self.tables, scene, qpos, camera)
+        depth, ids = self._cast(boxes, camera, _low_bits(len(SEGMENTATIONS[self.tables.classes].names) - 1))
         return depth, ids.astype(jnp.uint8)
 
     def trace_batch(self, scene, qpos, camera):
-        count = self._tables.num_boxes
-        boxes = boxes_seen(self._tables, scene, qpos, camera)
+        count = self.tables.num_boxes
+        boxes = boxes_seen(self.tables, scene, qpos, camera)
         boxes["id"] = jnp.broadcast_to(jnp.arange(1, count + 1, dtype=jnp.int32), boxes["id"].shape)
         depth, ids = self._cast(boxes, camera, _low_bits(count))
         index = jnp.where(ids > 0, ids - 1, count)
@@ -55,7 +54,7 @@ class RayRenderer(Renderer):
 
     def _cast(self, boxes: dict[str, jax.Array], camera: CameraPose, mask: int) -> tuple[jax.Array, jax.Array]:
         """Depth f32, m, and the boxes' numbers i32; both 0 where nothing is met before the far plane."""
-        cast = _tiles if self._tiled and self._tables.num_boxes else _scan
+        cast = _tiles if self._tiled and self.tables.num_boxes else _scan
         keys = cast(boxes, camera, self.lens, mask)
         distance = jax.lax.bitcast_convert_type(keys & ~mask, jnp.float32)
         met = distance < FAR_M
@@ -106,10 +105,7 @@ def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
     """
     entry = leave = None
     for o, h, d in zip(eye, half, directions, strict=True):
-        # A ray in a face's plane would divide by 0.
-        inverse = 1.0 / (d + _TINY)
-        middle, reach = -o * inverse, h * jnp.abs(inverse)
-        low, high = middle - reach, middle + reach
+        low, high = slab(o, h, d)
         entry = low if entry is None else _greater(entry, low)
         leave = high if leave is None else _lesser(leave, high)
     assert entry is not None and leave is not None

@@ -8,10 +8,12 @@ its keys named as Brax's networks for pixels want them:
 | `state` | the vector (left out if no part of it is asked for) |
 | `pixels/depth` | (H, W, 1): distance along the optical axis over `depth_range_m`, cut at 1; 0 where nothing is met |
 | `pixels/segmentation` | (H, W, 1): class id over 11, or over their number (`scenes_mjcf.categories.SEGMENTATIONS`) |
+| `pixels/rgb` | (H, W, 3): colour in [0, 1] |
+| `pixels/normals` | (H, W, 3): unit vectors, camera's frame (right, up, towards the viewer); 0 where nothing is met |
 
-Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded. Noise is as in iGibson: a share of the readings
-drops out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It depends on the episode's key
-and the step alone.
+Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded; normals are in [-1, 1], and f32 where others are u8.
+Noise is as in iGibson: a share of the readings drops out (depth reads 0, a beam 1), the others get a Gaussian error in
+proportion. It depends on the episode's key and the step alone.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ class Sensors:
         model = world.models[0]
         self._joints = _own_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
-        self.boxes = build_boxes(world, config.segmentation_classes)
+        self.boxes = build_boxes(world, config.segmentation_classes, bool({"rgb", "normals"} & set(self._images)))
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
         self.renderer = make_renderer(self.boxes, self.lens, config.renderer, backend) if self._images else None
@@ -94,7 +96,9 @@ class Sensors:
             return length
         side = self._config.image_size
         shapes: dict[str, tuple[int, ...]] = {"state": (length,)} if length else {}
-        return shapes | {f"pixels/{name}": (side, side, 1) for name in self._images}
+        return shapes | {
+            f"pixels/{name}": (side, side, 3 if name in ("rgb", "normals") else 1) for name in self._images
+        }
 
     def observe(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array | dict[str, jax.Array]:
         """The observation of one environment.
@@ -108,24 +112,26 @@ class Sensors:
         if not self._images:
             return vector
         out = {"state": vector} if self.sizes else {}
-        depth_m, ids = self.render(physics, nav)
-        images = {
-            "depth": self._noisy_depth(jnp.clip(depth_m / self._config.depth_range_m, 0.0, 1.0), nav, rng),
-            "segmentation": ids.astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor,
-        }
+        seen = self.render(physics, nav)
+        depth = jnp.clip(seen["depth"] / self._config.depth_range_m, 0.0, 1.0)
+        ids = seen["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
+        images = {**seen, "depth": self._noisy_depth(depth, nav, rng)[..., None], "segmentation": ids[..., None]}
         dtype = jnp.dtype(self._config.image_dtype)
+        whole = dtype == jnp.uint8
         for name in self._images:
-            image = images[name][..., None]
-            image = jnp.round(255.0 * image) if dtype == jnp.uint8 else image
-            out[f"pixels/{name}"] = image.astype(dtype)
+            if name == "normals":
+                out[f"pixels/{name}"] = images[name].astype(jnp.float32 if whole else dtype)
+            else:
+                out[f"pixels/{name}"] = (jnp.round(255.0 * images[name]) if whole else images[name]).astype(dtype)
         return out
 
-    def render(self, physics: PhysicsState, nav: NavInfo) -> tuple[jax.Array, jax.Array]:
-        """What the robot's camera sees, without noise: depth [H, W] f32, m, and class ids [H, W] u8."""
+    def render(self, physics: PhysicsState, nav: NavInfo) -> dict[str, jax.Array]:
+        """What the robot's camera sees, without noise: the images that are observed, as `Renderer.images_batch` has
+        them, without its leading axis; depth and segmentation always."""
         assert self.renderer is not None
         # A broken world's numbers must not reach the renderer's search tree.
         qpos = jnp.where(jnp.isfinite(physics.qpos), physics.qpos, 0.0)
-        return self.renderer.render(nav.scene_index, qpos, self.mount.pose(qpos))
+        return self.renderer.images(self._images, nav.scene_index, qpos, self.mount.pose(qpos))
 
     def odometry_error(self, rng: jax.Array, step_count: jax.Array) -> jax.Array:
         """(2,) relative errors of a step's distance and angle."""

@@ -17,8 +17,9 @@ from mujoco import mjx
 
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import keep_collector_out
-from interactive_nav.sensing.base import FAR_M, NEAR_M, SKY_COLOUR, CameraPose, Lens, Renderer
+from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
 from interactive_nav.sensing.boxes import BoxTables, box_poses
+from interactive_nav.sensing.shading import SKY_COLOUR
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
 """Padding boxes lie here, below the floor, which hides them."""
@@ -32,7 +33,7 @@ class WarpRenderer(Renderer):
 
     def __init__(self, tables: BoxTables, lens: Lens):
         keep_collector_out()
-        self.lens, self._tables = lens, tables
+        self.lens, self.tables = lens, tables
         self._host = _box_model(tables.num_boxes, lens)
         self._model = uncommitted(mjx.put_model(self._host, impl="warp"))
         self._contexts: dict[int, object] = {}
@@ -55,16 +56,16 @@ class WarpRenderer(Renderer):
 
     def render_batch(self, scene, qpos, camera):
         depth, geom = self.trace_batch(scene, qpos, camera)
-        n, boxes = scene.shape[0], self._tables.num_boxes
-        ids = jnp.concatenate([self._tables.class_id, jnp.zeros((len(self._tables.class_id), 1), jnp.uint8)], 1)[scene]
+        n, boxes = scene.shape[0], self.tables.num_boxes
+        ids = jnp.concatenate([self.tables.class_id, jnp.zeros((len(self.tables.class_id), 1), jnp.uint8)], 1)[scene]
         flat = jnp.where(geom < 0, boxes, geom).reshape(n, -1)
         return depth, jnp.take_along_axis(ids, flat, 1).reshape(depth.shape)
 
     def trace_batch(self, scene, qpos, camera):
         n = scene.shape[0]
         context = self._context(n)
-        centre, axes = box_poses(self._tables, scene, qpos)
-        half = self._tables.half_m[scene]
+        centre, axes = box_poses(self.tables, scene, qpos)
+        half = self.tables.half_m[scene]
         hidden = half[..., :1] < 0
         centre = jnp.where(hidden, jnp.asarray(_HIDDEN_W), centre)
         half = jnp.where(hidden, _HIDDEN_HALF_M, half)
@@ -93,7 +94,7 @@ class WarpRenderer(Renderer):
         depth = depth.reshape(shape)
         met = (geom >= 0) & (depth > NEAR_M) & (depth < FAR_M)
         # The floor keeps its place behind the boxes.
-        index = jnp.concatenate([order, jnp.full((n, 1), self._tables.num_boxes, order.dtype)], 1)
+        index = jnp.concatenate([order, jnp.full((n, 1), self.tables.num_boxes, order.dtype)], 1)
         geom = jnp.take_along_axis(index, jnp.maximum(geom, 0).reshape(n, -1), 1).reshape(geom.shape)
         return jnp.where(met, depth, 0.0), jnp.where(met, geom, -1)
 

@@ -94,7 +94,10 @@ def test_two_words_that_only_fit_together():
             "ppo.desired_kl is 0.1, which changes nothing here: expected learning_rate_schedule adap",
         ),
         ("run.wandb_project=x", "run.wandb_project is 'x', which changes nothing here: expected wandb true"),
-        ("env.image_fov_deg=90", "image_fov_deg is 90.0, which changes nothing here: expected depth or segmentation"),
+        (
+            "env.image_fov_deg=90",
+            "image_fov_deg is 90.0, which changes nothing here: expected one of depth, segmentation, rgb",
+        ),
         ("ppo=3", "ppo: got 3 (int), expected a mapping"),
         ("ppo.num_envs", "expected key=value"),
         (

@@ -1,13 +1,13 @@
 """Observation shapes in, actor and critic networks out, as Brax's losses take them.
 
 A vector goes through Brax's own multi-layer perceptrons. With images the networks are the original benchmark's
-(reference benchmark, section 8.1): depth and segmentation stacked as channels into three convolutions, the vector
+(reference benchmark, section 8.1): images stacked as channels into three convolutions, the vector
 into a layer of its own, both concatenated, then the head. An action enters a critic through a layer of its own.
 
 Parameters of a network with images are `{"encoder": ..., "head": ...}`, so that learners can share the encoder:
 a `Split` holds both parts.
 
-Images are u8 (divided by 255 here) or floats in [0, 1]; only the vector is normalised.
+Images are u8 (divided by 255 here) or floats in [-1, 1], as each is; only the vector is normalised.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class ImageEncoder(linen.Module):
     def __call__(self, images: jax.Array) -> jax.Array:
         c = self.config
         dtype = jnp.dtype(c.compute_dtype)
-        x = images.astype(dtype) / 255 if images.dtype == jnp.uint8 else images.astype(dtype)
+        x = images.astype(dtype)
         for channels, kernel, stride in zip(c.conv_channels, c.conv_kernels, c.conv_strides, strict=True):
             conv = linen.Conv(channels, (kernel,) * 2, stride, padding="VALID", kernel_init=GLOROT, dtype=dtype)
             x = linen.relu(conv(x))
@@ -104,6 +104,9 @@ class Encoder(linen.Module):
     def __call__(self, observation: Mapping[str, jax.Array]) -> jax.Array:
         parts = []
         pixels = [observation[name] for name in sorted(observation) if name.startswith(PIXELS)]
+        # One of them may be u8 and another not.
+        dtype = jnp.dtype(self.config.compute_dtype)
+        pixels = [x.astype(dtype) / 255 if x.dtype == jnp.uint8 else x.astype(dtype) for x in pixels]
         if self.images:
             parts.append(ImageEncoder(self.config, name="image")(jnp.concatenate(pixels, -1)))
         if "state" in observation:

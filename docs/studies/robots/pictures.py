@@ -14,11 +14,11 @@ import numpy as np
 
 from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import trace
-from interactive_nav.pictures.shading import lambert
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
+from interactive_nav.sensing.shading import lambert
 from interactive_nav_common.errors import UserError
 
 _SIZE = (480, 480)

@@ -1,5 +1,6 @@
 """Pictures for people, drawn by rays: they run everywhere, so do these tests."""
 
+import functools
 import importlib.util
 import types
 
@@ -10,14 +11,15 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.pictures.camera import STREAMS, Camera
-from interactive_nav.pictures.shading import PALETTES
 from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
+from interactive_nav.sensing import build_boxes
 from interactive_nav.sensing.rays import RayRenderer
 from interactive_nav.sensing.sensors import Sensors
+from interactive_nav.sensing.shading import PALETTES
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import SEGMENTATIONS
 from tests.toys import write_room
@@ -55,15 +57,18 @@ def test_the_whole_scene_from_above(scene_and_state):
 
 def test_the_robots_own_view_is_the_sensors_view(scene_and_state):
     env, state = scene_and_state
-    frame = Camera(env, "rays").frame(state, 68, 68, ("depth", "segmentation"))
-    assert set(frame) == {"depth", "segmentation"} and not (frame["segmentation"] == 1).any()
+    frame = Camera(env, "rays").frame(state, 68, 68, ("rgb", "normals", "depth", "segmentation"))
+    assert set(frame) == {"rgb", "normals", "depth", "segmentation"} and not (frame["segmentation"] == 1).any()
     qpos = jnp.asarray(state.pipeline_state.qpos, jnp.float32)[None]
     camera = env.sensors.mount.pose(qpos)
-    draw = jax.jit(RayRenderer(env.sensors.boxes, env.sensors.lens).render_batch)
-    depth, ids = draw(jnp.ones(1, jnp.int32), qpos, camera)
+    renderer = RayRenderer(build_boxes(env.world, colours=True), env.sensors.lens)
+    seen = jax.jit(functools.partial(renderer.images_batch, ("rgb",)))(jnp.ones(1, jnp.int32), qpos, camera)
+    depth, ids = seen["depth"], seen["segmentation"]
     # The toy scene's furniture is drawn as its boxes; its walls have no visual mesh but themselves.
     assert np.mean(np.abs(frame["depth"] - depth[0]) < 0.01) > 0.99
     assert np.mean(frame["segmentation"] == ids[0]) > 0.99
+    assert np.mean(np.abs(frame["rgb"] - 255 * seen["rgb"][0]).max(-1) < 1.0) > 0.99
+    assert np.mean(np.abs(frame["normals"] - seen["normals"][0]).max(-1) < 1e-3) > 0.99
 
 
 @pytest.mark.parametrize(("classes", "own"), [(4, {4, 6, 8}), (5, {11, 6, 8}), ("all", {3, 7, 8, 9, 10})])

@@ -1,5 +1,6 @@
 """Rays of our own against C MuJoCo's and MJX-Warp's over the same scenes; distances by hand."""
 
+import functools
 import importlib.util
 import math
 
@@ -164,7 +165,7 @@ def test_beams_of_a_scanner_meet_walls_at_their_distance(world, boxes):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_WARP, reason="the package warp-lang (extra 'warp') is not installed")
-def test_mjx_warp_draws_the_same(boxes, jumble, drawn):
+def test_mjx_warp_draws_the_same(world, boxes, jumble, drawn):
     from interactive_nav.sensing.warp import WarpRenderer
 
     scene, qpos, eye, forward = jumble
@@ -183,3 +184,11 @@ def test_mjx_warp_draws_the_same(boxes, jumble, drawn):
     got = draw(*moved)
     assert np.mean(np.abs(got[0] - want[0]) < 0.01) > 0.99 and np.mean(got[1] == want[1]) > 0.99
     assert np.mean(np.abs(got[0] - depth) > 0.01) > 0.5
+    # Colours and normals are made from the boxes that either has met.
+    boxes = build_boxes(world, "all", colours=True)
+    every = [
+        jax.jit(functools.partial(kind(boxes, LENS).images_batch, ("rgb", "normals")))(*moved)
+        for kind in (RayRenderer, WarpRenderer)
+    ]
+    for name in ("rgb", "normals"):
+        assert np.mean(np.abs(every[0][name] - every[1][name]).max(-1) < 1e-4) > 0.99

@@ -18,6 +18,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.observation import advance_odometry
 from interactive_nav.sensing.sensors import Sensors, stream
+from interactive_nav.sensing.shading import FLOOR_COLOUR
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import NavInfo
 from interactive_nav_common.errors import UserError
@@ -100,6 +101,22 @@ def test_images_have_the_keys_and_numbers_that_learners_expect(world, moment):
         assert coarse["pixels/depth"].dtype == jnp.dtype(dtype)
         got = np.asarray(coarse["pixels/depth"], np.float32)[..., 0] / unit
         np.testing.assert_allclose(got, depth, atol=0.5 / 255 + 1e-6 if unit == 255 else 1e-3)
+
+
+@pytest.mark.parametrize(("dtype", "unit"), [("float32", 1), ("float16", 1), ("uint8", 255)])
+def test_colours_and_normals_stand_beside_the_other_images(world, moment, dtype, unit):
+    names = ("depth", "segmentation", "rgb", "normals")
+    sensors, obs = sense(world, moment, observations=names, image_dtype=dtype, image_size=20)
+    assert sensors.observation_size == {f"pixels/{n}": (20, 20, 3 if n in names[2:] else 1) for n in names}
+    assert {name: value.shape for name, value in obs.items()} == sensors.observation_size
+    assert obs["pixels/rgb"].dtype == jnp.dtype(dtype)
+    # Normals have signs: they are never u8.
+    assert obs["pixels/normals"].dtype == (jnp.float32 if unit == 255 else jnp.dtype(dtype))
+    # Bottom row, middle: the floor, lit by the sun alone.
+    np.testing.assert_allclose(obs["pixels/normals"][-1, 10], [0, 1, 0], atol=1e-3)
+    light = 0.45 + 0.4 * 0.9 / math.hypot(0.35, 0.25, 0.9)
+    got = np.asarray(obs["pixels/rgb"][-1, 10], np.float32) / unit
+    np.testing.assert_allclose(got, light * np.array(FLOOR_COLOUR), atol=0.5 / 255 + 1e-6)
 
 
 def test_noise_is_off_by_default_and_drawn_by_key_and_step(world, moment):

@@ -339,7 +339,10 @@ def test_desks_are_tables_in_the_mask_unless_five_classes_are_asked_for(tmp_path
         ({"backend": "native", "active_furniture": 3}, "active_furniture is 3, .*: expected backend auto, jax or warp"),
         ({"backend": "jax", "threads": 2}, "threads is 2, .*: expected backend auto or native"),
         ({"backend": "native", "contacts_per_env": 50}, "contacts_per_env is 50, .*: expected backend auto or warp"),
-        ({"image_dtype": "uint8"}, "image_dtype is 'uint8', .*: expected depth or segmentation among observations"),
+        (
+            {"image_dtype": "uint8"},
+            "image_dtype is 'uint8', .*: expected one of depth, segmentation, rgb",
+        ),
         ({"observations": ("segmentation",), "depth_noise": 0.1}, "depth_noise is 0.1, .*: expected depth among"),
         ({"lidar_rays": 3}, "lidar_rays is 3, .*: expected lidar among observations; or leave it out"),
         ({"odometry_noise": 0.1}, "odometry_noise is 0.1, .*: expected odometry among observations"),

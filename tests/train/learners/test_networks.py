@@ -64,6 +64,18 @@ def test_bytes_and_floats_of_one_image_give_the_same_features():
     np.testing.assert_allclose(apply(statistics, params, seen), apply(statistics, params, floats), rtol=1e-5, atol=1e-6)
 
 
+def test_bytes_beside_signed_floats_are_each_taken_as_they_are():
+    size = {"pixels/rgb": (SIDE, SIDE, 3), "pixels/normals": (SIDE, SIDE, 3)}
+    made = networks.make_ppo_networks(SMALL, size, 2, (8,), (8,), True)
+    params = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
+    rng = np.random.default_rng(0)
+    rgb = jnp.asarray(rng.integers(0, 256, (4, SIDE, SIDE, 3)), jnp.uint8)
+    seen = {"pixels/rgb": rgb, "pixels/normals": jnp.asarray(rng.uniform(-1, 1, rgb.shape), jnp.float32)}
+    statistics, apply = networks.init_normalizer(size), made.networks.policy_network.apply
+    floats = {**seen, "pixels/rgb": rgb.astype(jnp.float32) / 255}
+    np.testing.assert_allclose(apply(statistics, params, seen), apply(statistics, params, floats), rtol=1e-5, atol=1e-6)
+
+
 def test_only_the_vector_is_normalised():
     seen = observation((500,))
     statistics = networks.update_normalizer(networks.init_normalizer(TINY), seen)

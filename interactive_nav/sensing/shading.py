@@ -1,0 +1,58 @@
+"""Colours of classes and of bodies, and how pictures and observations are lit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from interactive_nav.scenes.objects import VISUAL_GROUP
+from interactive_nav.scenes.scene import Scene
+from scenes_mjcf.categories import SEGMENTATIONS
+
+SKY_COLOUR = (0.93, 0.95, 0.97)
+"""RGB in [0, 1] of pictures where nothing is met."""
+FLOOR_COLOUR = (0.56, 0.50, 0.43)
+PALETTES = {
+    classes: np.array([*masks.colours, FLOOR_COLOUR, SKY_COLOUR], np.float32)
+    for classes, masks in SEGMENTATIONS.items()
+}
+"""The setting `segmentation_classes` -> colours by class id, then the floor's and the background's."""
+_LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
+
+
+def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
+    """Colours [..., 3] in [0, 1] under a sun and a lamp at the camera; what is not `met` keeps its colour."""
+    light_w = xp.broadcast_to(xp.asarray(_LIGHT_W), normal_w.shape)
+    sun = xp.maximum((normal_w * light_w).sum(-1), 0.0)
+    lamp = xp.maximum(-(normal_w * forward_w).sum(-1), 0.0)
+    return base * xp.where(met, xp.minimum(0.45 + 0.4 * sun + 0.25 * lamp, 1.0), 1.0)[..., None]
+
+
+def lambert(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
+    """`lit` as u8."""
+    return xp.round(255.0 * lit(base, normal_w, forward_w, met, xp)).astype(xp.uint8)
+
+
+def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """(3,) in [0, 1]: of the geom, or its texture's mean."""
+    material = model.geom_matid[geom]
+    texture = model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
+    if texture < 0:
+        return (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])[:3]
+    size = model.tex_height[texture] * model.tex_width[texture]
+    first, channels = model.tex_adr[texture], model.tex_nchannel[texture]
+    pixels = model.tex_data[first : first + size * channels].reshape(size, channels)[:, :3]
+    # Atlases are padded with black.
+    used = pixels.max(1) > 8
+    return pixels[used].mean(0) / 255.0 if used.any() else np.full(3, 0.5)
+
+
+def body_colours(scene: Scene) -> dict[str, np.ndarray]:
+    """Name of each body that has visual meshes -> (3,) mean colour of them, in [0, 1]."""
+    model = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml"))
+    found: dict[str, list[np.ndarray]] = {}
+    for geom in np.flatnonzero(model.geom_group == VISUAL_GROUP):
+        found.setdefault(model.body(int(model.geom_bodyid[geom])).name, []).append(geom_colour(model, int(geom)))
+    return {name: np.mean(colours, 0) for name, colours in found.items()}

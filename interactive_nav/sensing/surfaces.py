@@ -1,0 +1,69 @@
+"""Which box each pixel shows in, what there is to see of it out: depth, class, normal and colour, for all renderers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+
+from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate, slab
+from interactive_nav.sensing.shading import SKY_COLOUR, lit
+
+if TYPE_CHECKING:
+    from interactive_nav.sensing.base import CameraPose, Lens
+
+_FLOOR_HALF_M = (1e4, 1e4, 1.0)
+"""The floor as one more box, whose top is z = 0."""
+
+
+def paint(
+    tables: BoxTables, lens: Lens, scene: jax.Array, qpos: jax.Array, camera: CameraPose, index: jax.Array
+) -> dict[str, jax.Array]:
+    """Images from the boxes that a renderer has met.
+
+    Each ray meets its own box once more, so that depth and face are exact and the same whoever found the box.
+
+    Args:
+        tables: of the world, with colours.
+        lens: of the camera.
+        scene: [N] i32.
+        qpos: [N, nq] f32.
+        camera: leaves [N, ...].
+        index: [N, H, W] i32 as `Renderer.trace_batch` gives it.
+
+    Returns:
+        See `Renderer.images_batch`.
+    """
+    n, shape = len(scene), index.shape
+    assert tables.colour is not None
+    centre, axes = box_poses(tables, scene, qpos)
+    boxes = jnp.concatenate([axes.reshape(n, -1, 9), centre, tables.half_m[scene]], -1)
+    floor = jnp.concatenate([jnp.eye(3).ravel(), jnp.asarray([0.0, 0.0, -_FLOOR_HALF_M[2], *_FLOOR_HALF_M])])
+    boxes = jnp.concatenate([boxes, jnp.broadcast_to(floor, (n, 1, 15))], 1)
+    ids = jnp.pad(tables.class_id, ((0, 0), (0, 1)))[scene]
+    place = jnp.where(index < 0, tables.num_boxes, index).reshape(n, -1)
+    met = index >= 0
+
+    def of_pixel(table: jax.Array) -> jax.Array:
+        """[N, B + 1, k] to [N, H, W, k]."""
+        return jnp.take_along_axis(table, place[..., None], 1).reshape(*shape, table.shape[-1])
+
+    row = of_pixel(boxes)
+    axes, centre, half = row[..., :9].reshape(*shape, 3, 3), row[..., 9:12], row[..., 12:]
+    inverse = jnp.swapaxes(axes, -1, -2)
+    forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
+    across, along = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
+    direction = rotate(inverse, forward + right * across + up * along)
+    low, _ = slab(rotate(inverse, camera.pos_w[:, None, None] - centre), half, direction)
+    outward = -jnp.sign(direction) * jax.nn.one_hot(jnp.argmax(low, -1), 3)
+    normal = rotate(axes, outward) * met[..., None]
+    sideways, upward, away = ((normal * axis).sum(-1) for axis in (right, up, forward))
+    sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
+    base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
+    return {
+        "depth": jnp.where(met, low.max(-1), 0.0),
+        "segmentation": jnp.where(met, of_pixel(ids[..., None])[..., 0], 0),
+        "normals": jnp.stack([sideways, upward, -away], -1),
+        "rgb": lit(base, normal, forward, met, jnp),
+    }
