@@ -199,6 +199,9 @@ class SensorConfig(Settings):
     odometry, collision, joints, lidar. With images (depth, segmentation, rgb, normals) the observation is a dict."""
     renderer: Literal["auto", "warp", "rays"] = "auto"
     """Who draws: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
+    image_geometry: Literal["boxes", "meshes"] = "boxes"
+    """What images show: the boxes that collide, or the visual meshes with their textures (drawn by Warp, on GPU and
+    CPU, beside any physics)."""
     image_size: AtLeastOne = 68
     """Side of the square images, pixels."""
     image_fov_deg: Annotated[float | None, Bounds(0, 180, open=True)] = None
@@ -230,7 +233,8 @@ class SensorConfig(Settings):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("image_size image_fov_deg image_dtype renderer", f"one of {', '.join(IMAGES)} among observations",
+        ("image_size image_fov_deg image_dtype image_geometry renderer",
+         f"one of {', '.join(IMAGES)} among observations",
          lambda c: any(name in c.observations for name in IMAGES)),
         ("depth_range_m depth_dropout depth_noise", "depth among observations", lambda c: "depth" in c.observations),
         ("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar among observations",
@@ -242,6 +246,8 @@ class SensorConfig(Settings):
         known = (*SIGNALS, *IMAGES)
         if not self.observations or len(set(self.observations) & set(known)) != len(self.observations):
             raise ConfigError(f"observations is {self.observations!r}, expected a choice from {', '.join(known)}")
+        if self.image_geometry == "meshes" and self.renderer == "rays":
+            raise ConfigError("renderer is 'rays', expected auto or warp with image_geometry=meshes")
         if len(self.lidar_pos_m) != 3:
             raise ConfigError(f"lidar_pos_m is {self.lidar_pos_m!r}, expected three numbers")
         super().__post_init__()

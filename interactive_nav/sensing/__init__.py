@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens, Renderer, look_along
 from interactive_nav.sensing.boxes import BoxTables, build_boxes
 
 
-def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str) -> Renderer:
+def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes: World | None = None) -> Renderer:
     """Builds a renderer.
 
     Args:
@@ -14,12 +15,18 @@ def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str) -> Ren
         lens: the camera's.
         name: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
         backend: of the physics: warp, jax or native.
+        meshes: whose visual meshes are drawn, by a Warp kernel whatever the name; None: boxes.
 
     Raises:
         ConfigError: warp where the package warp-lang is not installed.
     """
     from interactive_nav.physics import resolve_backend
 
+    if meshes is not None:
+        resolve_backend("warp")
+        from interactive_nav.sensing.meshes import MeshRenderer
+
+        return MeshRenderer(tables, lens, meshes)
     if name == "warp" or (name == "auto" and backend == "warp"):
         resolve_backend("warp")
         from interactive_nav.sensing.warp import WarpRenderer

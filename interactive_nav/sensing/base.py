@@ -15,7 +15,6 @@ import numpy as np
 
 from interactive_nav.batching import one_of_batch
 from interactive_nav.sensing.boxes import BoxTables
-from interactive_nav.sensing.surfaces import paint
 
 NEAR_M = 0.01
 FAR_M = 100.0
@@ -108,14 +107,6 @@ class Renderer(abc.ABC):
         """
 
     @abc.abstractmethod
-    def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """Which box each pixel shows: what colours and normals are made from.
-
-        Returns:
-            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
-            -1 nothing.
-        """
-
     def images_batch(
         self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose
     ) -> dict[str, jax.Array]:
@@ -131,10 +122,6 @@ class Renderer(abc.ABC):
             depth and segmentation as `render_batch` gives them; rgb [N, H, W, 3] f32 in [0, 1]; normals
             [N, H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the viewer), 0 where nothing is.
         """
-        if not set(names) & {"rgb", "normals"}:
-            return dict(zip(("depth", "segmentation"), self.render_batch(scene, qpos, camera), strict=True))
-        _, index = self.trace_batch(scene, qpos, camera)
-        return paint(self.tables, self.lens, scene, qpos, camera, index)
 
     def images(
         self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose

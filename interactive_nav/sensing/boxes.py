@@ -58,7 +58,7 @@ class BoxTables:
         return len(self.body)
 
 
-def _boxes_of_slots(world: World, scene: Scene, classes: MaskClasses) -> list[tuple[np.ndarray, int]]:
+def boxes_of_slots(world: World, scene: Scene, classes: MaskClasses) -> list[tuple[np.ndarray, int]]:
     """Boxes [n, 10] and class id of what is in each slot of a scene, then of its walls."""
     free, hinged = sorted_movables(scene)
     own, out = {"free": iter(free), "hinge": iter(hinged)}, []
@@ -90,7 +90,7 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False) -
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
-    columns = [_boxes_of_slots(world, scene, classes) for scene in scenes]
+    columns = [boxes_of_slots(world, scene, classes) for scene in scenes]
     counts = [max(len(column[m][0]) for column in columns) for m in range(slots + 1)]
     body = np.repeat(np.arange(slots + 1), counts)
     first = np.concatenate([[0], np.cumsum(counts)])

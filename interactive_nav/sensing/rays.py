@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
+from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses, compose, rotate, slab
+from interactive_nav.sensing.surfaces import BoxRenderer
 from scenes_mjcf.categories import SEGMENTATIONS
 
 _EMPTY = np.int32(2**31 - 1)
@@ -24,7 +25,7 @@ _BOXES_AT_ONCE = 8
 _TILES_AT_ONCE = 64
 
 
-class RayRenderer(Renderer):
+class RayRenderer(BoxRenderer):
     """Draws by casting a ray through the middle of each pixel."""
 
     def __init__(self, tables: BoxTables, lens: Lens, tiled: bool | None = None):

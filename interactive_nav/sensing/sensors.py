@@ -68,10 +68,13 @@ class Sensors:
         model = world.models[0]
         self._joints = _own_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
-        self.boxes = build_boxes(world, config.segmentation_classes, bool({"rgb", "normals"} & set(self._images)))
+        meshes = config.image_geometry == "meshes"
+        coloured = not meshes and bool({"rgb", "normals"} & set(self._images))
+        self.boxes = build_boxes(world, config.segmentation_classes, coloured)
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
-        self.renderer = make_renderer(self.boxes, self.lens, config.renderer, backend) if self._images else None
+        drawn = self.boxes, self.lens, config.renderer, backend, world if meshes else None
+        self.renderer = make_renderer(*drawn) if self._images else None
         angles = -0.5 * config.lidar_fov_deg + np.arange(config.lidar_rays) * config.lidar_fov_deg / config.lidar_rays
         beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
         self._beams_b = np.stack(beams, -1).astype(np.float32)

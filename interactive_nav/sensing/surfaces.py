@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import abc
 
 import jax
 import jax.numpy as jnp
 
+from interactive_nav.sensing.base import CameraPose, Lens, Renderer
 from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate, slab
 from interactive_nav.sensing.shading import SKY_COLOUR, lit
 
-if TYPE_CHECKING:
-    from interactive_nav.sensing.base import CameraPose, Lens
-
 _FLOOR_HALF_M = (1e4, 1e4, 1.0)
 """The floor as one more box, whose top is z = 0."""
+
+
+class BoxRenderer(Renderer):
+    """Draws the tables' boxes and the floor."""
+
+    @abc.abstractmethod
+    def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """Which box each pixel shows: what colours and normals are made from.
+
+        Returns:
+            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
+            -1 nothing.
+        """
+
+    def images_batch(self, names, scene, qpos, camera):
+        if not set(names) & {"rgb", "normals"}:
+            return dict(zip(("depth", "segmentation"), self.render_batch(scene, qpos, camera), strict=True))
+        _, index = self.trace_batch(scene, qpos, camera)
+        return paint(self.tables, self.lens, scene, qpos, camera, index)
 
 
 def paint(
@@ -30,7 +47,7 @@ def paint(
         scene: [N] i32.
         qpos: [N, nq] f32.
         camera: leaves [N, ...].
-        index: [N, H, W] i32 as `Renderer.trace_batch` gives it.
+        index: [N, H, W] i32 as `BoxRenderer.trace_batch` gives it.
 
     Returns:
         See `Renderer.images_batch`.
@@ -58,12 +75,27 @@ def paint(
     low, _ = slab(rotate(inverse, camera.pos_w[:, None, None] - centre), half, direction)
     outward = -jnp.sign(direction) * jax.nn.one_hot(jnp.argmax(low, -1), 3)
     normal = rotate(axes, outward) * met[..., None]
-    sideways, upward, away = ((normal * axis).sum(-1) for axis in (right, up, forward))
     sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
     base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
     return {
         "depth": jnp.where(met, low.max(-1), 0.0),
         "segmentation": jnp.where(met, of_pixel(ids[..., None])[..., 0], 0),
+        **lit_images(base, normal, camera, met),
+    }
+
+
+def lit_images(base: jax.Array, normal_w: jax.Array, camera: CameraPose, shaded: jax.Array) -> dict[str, jax.Array]:
+    """The images `rgb` and `normals`.
+
+    Args:
+        base: [N, H, W, 3] colours in [0, 1].
+        normal_w: [N, H, W, 3], 0 where nothing is met.
+        camera: leaves [N, ...].
+        shaded: [N, H, W] bool: where light falls; else the colours stay as they are.
+    """
+    forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
+    sideways, upward, away = ((normal_w * axis).sum(-1) for axis in (right, up, forward))
+    return {
         "normals": jnp.stack([sideways, upward, -away], -1),
-        "rgb": lit(base, normal, forward, met, jnp),
+        "rgb": lit(base, normal_w, forward, shaded, jnp),
     }

@@ -17,16 +17,17 @@ from mujoco import mjx
 
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import keep_collector_out
-from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens, Renderer
+from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses
 from interactive_nav.sensing.shading import SKY_COLOUR
+from interactive_nav.sensing.surfaces import BoxRenderer
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
 """Padding boxes lie here, below the floor, which hides them."""
 _HIDDEN_HALF_M = 1e-4
 
 
-class WarpRenderer(Renderer):
+class WarpRenderer(BoxRenderer):
     """Draws with `mjx.render_with_segmentation`."""
 
     name = "warp"

@@ -73,7 +73,7 @@ def test_a_bodys_colour_is_the_mean_of_its_texture():
     name = scene.movables[0].name
     own = model.geom_bodyid == model.body(name).id
     (geom,) = np.flatnonzero(own & (model.geom_group == 2))
-    np.testing.assert_allclose(colours[name], geom_colour(model, geom), atol=1e-6)
+    np.testing.assert_allclose(colours[name], geom_colour(model, int(geom)), atol=1e-6)
     assert all(value.min() > 0 and value.max() <= 1 for value in colours.values())
     world = build_world(get_robot("turtlebot"), (scene,), NavConfig.of(num_objects=1))
     tables = build_boxes(world, colours=True)

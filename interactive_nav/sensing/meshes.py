@@ -1,0 +1,333 @@
+"""Textured visual meshes of all scenes, drawn for a batch that mixes them: one Warp kernel of our own, on GPU and CPU.
+
+MJX has one set of meshes for a whole batch, so its renderer cannot mix scenes. Here all meshes of all scenes lie in one
+`wp.Mesh`, each a group with a tree of its own that is built once; what an environment shows is a list of instances
+(which mesh, which body), and a ray is taken into each body's frame that it may meet. Nothing is refitted.
+"""
+
+# What a kernel computes with is none of Python's types.
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import warp as wp
+
+from interactive_nav.physics.warp_callbacks import keep_collector_out
+from interactive_nav.scenes.objects import VISUAL_GROUP
+from interactive_nav.scenes.world import World
+from interactive_nav.sensing.base import FAR_M, NEAR_M, Lens, Renderer
+from interactive_nav.sensing.boxes import BoxTables, body_poses, boxes_of_slots, rotate
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour
+from interactive_nav.sensing.surfaces import lit_images
+from interactive_nav_common.rotations import matrix_from_quat
+
+NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
+SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))
+_BAKED_AMBIENT = 0.2
+"""Scenes whose structure is lit in its own image ask for more ambient light than this (`converters.write.emit`)."""
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+_SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                   [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+
+
+@dataclasses.dataclass
+class _Part:
+    """One body's surface of one material, in the body's frame."""
+
+    slot: int
+    points: np.ndarray
+    """[v, 3] m."""
+    faces: np.ndarray
+    """[f, 3]."""
+    uv: np.ndarray
+    """[f, 3, 2]; v falls from the image's first row."""
+    image: np.ndarray | None
+    """[h, w, 3] u8."""
+    colour: np.ndarray
+    """(3,) in [0, 1] where there is no image."""
+    baked: bool = False
+
+
+def _box_part(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Part:
+    corners = boxes[:, None, 7:10] * _CORNERS
+    points = boxes[:, None, :3] + np.einsum("nij,nvj->nvi", matrix_from_quat(boxes[:, 3:7]), corners)
+    faces = _SIDES + 8 * np.arange(len(boxes))[:, None, None]
+    faces = faces.reshape(-1, 3)
+    return _Part(slot, points.reshape(-1, 3), faces, np.zeros((len(faces), 3, 2)), None, colour)
+
+
+def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Part:
+    mesh, texture = model.geom_dataid[geom], -1
+    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+    own = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    points = vertices @ matrix_from_quat(model.geom_quat[geom]).T + model.geom_pos[geom]
+    if standing:
+        points = points + model.body_pos[model.geom_bodyid[geom]]
+    uv, image = np.zeros((own.stop - own.start, 3, 2)), None
+    if model.geom_matid[geom] >= 0:
+        texture = model.mat_texid[model.geom_matid[geom]][mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    if texture >= 0 and model.mesh_texcoordadr[mesh] >= 0:
+        uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[own]]
+        shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
+        image = model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)[..., :3]
+    baked = standing and model.vis.headlight.ambient[0] > _BAKED_AMBIENT
+    return _Part(slot, points, model.mesh_face[own], uv, image, geom_colour(model, geom), baked)
+
+
+def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[int]]:
+    """What there is to see of a scene, bodies without visual meshes as their boxes; and the class of each slot."""
+    model = mujoco.MjModel.from_xml_path(str(world.scenes[s].path / "scene.xml"))
+    column = boxes_of_slots(world, world.scenes[s], tables.classes)
+    visual: dict[str, list[int]] = {}
+    for geom in np.flatnonzero((model.geom_group == VISUAL_GROUP) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)):
+        visual.setdefault(model.body(int(model.geom_bodyid[geom])).name, []).append(int(geom))
+    parts = []
+    for slot, (name, (boxes, number)) in enumerate(zip((*world.names[s], "structure"), column, strict=True)):
+        if name in visual:
+            parts += [_mesh_part(model, geom, slot, name == "structure") for geom in visual[name]]
+        elif len(boxes):
+            parts.append(_box_part(slot, boxes, PALETTES[tables.classes][number]))
+    return parts, [number for _, number in column]
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshTables:
+    """Surfaces of all scenes, padded alike: S scenes, K surfaces a scene; equal surfaces and images are kept once."""
+
+    points: np.ndarray
+    """[v, 3] f32, m, each surface in its body's frame."""
+    faces: np.ndarray
+    """[f, 3] i32."""
+    group: np.ndarray
+    """[f] i32: the surface that a face is of."""
+    uv: np.ndarray
+    """[f, 3, 2] f32."""
+    texels: np.ndarray
+    """[t] u32: red, green, blue from the lowest byte on."""
+    surface: np.ndarray
+    """[S, K] i32, -1 for padding."""
+    slot: np.ndarray
+    """[S, K] i32 body that it moves with."""
+    sphere_b: np.ndarray
+    """[S, K, 4] f32 centre and radius of a sphere around it, m; the radius is negative for padding."""
+    look: np.ndarray
+    """[S, K, 5] i32: class, first texel, width and height of the image (0: none), 1 if it is not to be lit."""
+    colour: np.ndarray
+    """[S, K, 3] f32 where there is no image."""
+
+
+def build_meshes(world: World, tables: BoxTables) -> MeshTables:
+    """Reads the visual meshes of every scene; bodies without any are drawn as their boxes."""
+    scenes = [_parts(world, s, tables) for s in range(len(world.scenes))]
+    shape = len(scenes), max(len(parts) for parts, _ in scenes)
+    surface, slot = np.full(shape, -1, np.int32), np.zeros(shape, np.int32)
+    sphere, look, colour = np.full((*shape, 4), -1.0, np.float32), np.zeros((*shape, 5), np.int32), np.ones((*shape, 3))
+    surfaces: dict[tuple, int] = {}
+    images: dict[bytes, int] = {}
+    points, faces, uv, texels = [], [], [], [np.zeros(1, np.uint32)]
+    for s, (parts, ids) in enumerate(scenes):
+        for k, part in enumerate(parts):
+            key = np.round(part.points, 5).tobytes(), part.faces.tobytes(), part.uv.tobytes()
+            if key not in surfaces:
+                surfaces[key] = len(surfaces)
+                faces.append(part.faces + sum(map(len, points)))
+                points.append(part.points)
+                uv.append(part.uv)
+            centre = (part.points.min(0) + part.points.max(0)) / 2
+            radius = np.linalg.norm(part.points - centre, axis=1).max() + 1e-4
+            surface[s, k], slot[s, k], sphere[s, k] = surfaces[key], part.slot, [*centre, radius]
+            look[s, k, 0], look[s, k, 4], colour[s, k] = ids[part.slot], part.baked, part.colour
+            if part.image is not None:
+                pixels = (part.image.reshape(-1, 3).astype(np.uint32) << [0, 8, 16]).sum(-1, dtype=np.uint32)
+                name = pixels.tobytes()
+                if name not in images:
+                    images[name] = sum(map(len, texels))
+                    texels.append(pixels)
+                look[s, k, 1:4] = images[name], part.image.shape[1], part.image.shape[0]
+    return MeshTables(
+        points=np.concatenate(points).astype(np.float32),
+        faces=np.concatenate(faces).astype(np.int32),
+        group=np.repeat(np.arange(len(faces), dtype=np.int32), [len(f) for f in faces]),
+        uv=np.concatenate(uv).astype(np.float32),
+        texels=np.concatenate(texels),
+        surface=surface,
+        slot=slot,
+        sphere_b=sphere,
+        look=look,
+        colour=colour.astype(np.float32),
+    )
+
+
+@wp.kernel
+def _roots(mesh: wp.uint64, root: wp.array[int]):
+    i = wp.tid()
+    root[i] = wp.mesh_get_group_root(mesh, i)
+
+
+@wp.func
+def _texel(at: wp.vec2, first: int, width: int, height: int, texels: wp.array[wp.uint32]):
+    column = wp.min(int((at[0] - wp.floor(at[0])) * float(width)), width - 1)
+    row = wp.min(int((at[1] - wp.floor(at[1])) * float(height)), height - 1)
+    texel = texels[first + row * width + column]
+    red = float(texel & wp.uint32(255))
+    green = float((texel >> wp.uint32(8)) & wp.uint32(255))
+    blue = float((texel >> wp.uint32(16)) & wp.uint32(255))
+    return wp.vec3(red, green, blue) / 255.0
+
+
+@wp.func
+def _meet(
+    mesh: wp.uint64,
+    n: int,
+    s: int,
+    eye: wp.vec3,
+    ray: wp.vec3,
+    pos_w: wp.array2d[wp.vec3],
+    axes_w: wp.array2d[wp.mat33],
+    sphere_w: wp.array2d[wp.vec4],
+    root: wp.array2d[int],
+):
+    """The nearest of an environment's surfaces: distance, surface (-1: none), face, its first two weights, normal."""
+    square = wp.dot(ray, ray)
+    # Warp takes plain numbers for constants.
+    nearest = wp.float32(FAR)
+    hit = wp.int32(-1)
+    face = wp.int32(0)
+    u = wp.float32(0.0)
+    v = wp.float32(0.0)
+    normal = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(sphere_w.shape[1]):
+        sphere = sphere_w[n, k]
+        radius = sphere[3]
+        centre = wp.vec3(sphere[0], sphere[1], sphere[2]) - eye
+        along = wp.dot(centre, ray) / square
+        reach = radius * radius - wp.dot(centre, centre) + along * along * square
+        if radius > 0.0 and reach >= 0.0:
+            half = wp.sqrt(reach / square)
+            if along + half > NEAR and along - half < nearest:
+                axes = wp.transpose(axes_w[n, k])
+                start = axes * (eye + NEAR * ray - pos_w[n, k])
+                found = wp.mesh_query_ray(mesh, start, axes * ray, nearest - NEAR, root[s, k])
+                if found.result:
+                    nearest = found.t + NEAR
+                    hit = k
+                    face = found.face
+                    u = found.u
+                    v = found.v
+                    normal = wp.transpose(axes) * found.normal
+    return nearest, hit, face, u, v, normal
+
+
+@wp.kernel
+def _draw(
+    handle: wp.array[wp.uint32],
+    scene: wp.array[int],
+    pos_w: wp.array2d[wp.vec3],
+    axes_w: wp.array2d[wp.mat33],
+    sphere_w: wp.array2d[wp.vec4],
+    eye_w: wp.array[wp.vec3],
+    view_w: wp.array[wp.mat33],
+    columns: wp.array[float],
+    rows: wp.array[float],
+    root: wp.array2d[int],
+    look: wp.array3d[int],
+    colour: wp.array2d[wp.vec3],
+    uv: wp.array2d[wp.vec2],
+    texels: wp.array[wp.uint32],
+    depth: wp.array3d[float],
+    ids: wp.array3d[wp.uint8],
+    kind: wp.array3d[wp.uint8],
+    normal_w: wp.array3d[wp.vec3],
+    base: wp.array3d[wp.vec3],
+):
+    """One pixel: depth, class, 0 nothing, 1 lit or 2 shining by itself, normal, and colour before light."""
+    n, y, x = wp.tid()
+    # JAX has no integers of 64 bits.
+    mesh = (wp.uint64(handle[1]) << wp.uint64(32)) | wp.uint64(handle[0])
+    eye = eye_w[n]
+    s = scene[n]
+    ray = view_w[n] * wp.vec3(1.0, columns[x], rows[y])
+    nearest, hit, face, u, v, normal = _meet(mesh, n, s, eye, ray, pos_w, axes_w, sphere_w, root)
+    ids[n, y, x] = wp.uint8(0)
+    base[n, y, x] = wp.vec3(FLOOR[0], FLOOR[1], FLOOR[2])
+    # The plane z = 0 where no mesh lies on it.
+    floor = -eye[2] / wp.min(ray[2], -1.0e-6)
+    if ray[2] < 0.0 and floor > NEAR and floor < nearest * 0.999:
+        depth[n, y, x] = floor
+        kind[n, y, x] = wp.uint8(1)
+        normal_w[n, y, x] = wp.vec3(0.0, 0.0, 1.0)
+        return
+    if hit < 0:
+        depth[n, y, x] = 0.0
+        kind[n, y, x] = wp.uint8(0)
+        normal_w[n, y, x] = normal
+        base[n, y, x] = wp.vec3(SKY[0], SKY[1], SKY[2])
+        return
+    depth[n, y, x] = nearest
+    ids[n, y, x] = wp.uint8(look[s, hit, 0])
+    kind[n, y, x] = wp.uint8(1 + look[s, hit, 4])
+    # It may be seen from behind.
+    normal_w[n, y, x] = -wp.sign(wp.dot(normal, ray)) * normal
+    if look[s, hit, 2] == 0:
+        base[n, y, x] = colour[s, hit]
+        return
+    at = u * uv[face, 0] + v * uv[face, 1] + (1.0 - u - v) * uv[face, 2]
+    base[n, y, x] = _texel(at, look[s, hit, 1], look[s, hit, 2], look[s, hit, 3], texels)
+
+
+class MeshRenderer(Renderer):
+    """Draws the textured meshes of any mix of scenes."""
+
+    name = "warp (meshes)"
+
+    def __init__(self, tables: BoxTables, lens: Lens, world: World):
+        """Puts the meshes of all scenes on the device and builds their trees, once.
+
+        Args:
+            tables: of the world, for the poses of its bodies.
+            lens: of the camera.
+            world: whose scenes are drawn.
+        """
+        keep_collector_out()
+        self.lens, self.tables = lens, tables
+        made = build_meshes(world, tables)
+        device = "cpu" if jax.default_backend() == "cpu" else "cuda"
+        self._mesh = wp.Mesh(
+            wp.array(made.points, dtype=wp.vec3, device=device),
+            wp.array(made.faces.ravel(), dtype=int, device=device),
+            groups=wp.array(made.group, dtype=int, device=device),
+        )
+        root = wp.zeros(int(made.group[-1]) + 1, dtype=int, device=device)
+        wp.launch(_roots, len(root), [self._mesh.id], [root], device=device)
+        self._slot, self._sphere_b = made.slot, jnp.asarray(made.sphere_b)
+        self._handle = jnp.asarray([self._mesh.id & 0xFFFFFFFF, self._mesh.id >> 32], jnp.uint32)
+        self._constants = tuple(
+            map(jnp.asarray, (root.numpy()[made.surface], made.look, made.colour, made.uv, made.texels))
+        )
+        self._draw = wp.jax_kernel(_draw, num_outputs=5)
+
+    def render_batch(self, scene, qpos, camera):
+        seen = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
+        return seen["depth"], seen["segmentation"]
+
+    def images_batch(self, names, scene, qpos, camera):
+        pos, axes = body_poses(self.tables, scene, qpos)
+        slot = jnp.asarray(self._slot)[scene]
+        pos = jnp.take_along_axis(pos, slot[..., None], -2)
+        axes = jnp.take_along_axis(axes, slot[..., None, None], -3)
+        sphere = self._sphere_b[scene]
+        sphere = jnp.concatenate([pos + rotate(axes, sphere[..., :3]), sphere[..., 3:]], -1)
+        columns, rows = jnp.asarray(self.lens.columns), jnp.asarray(self.lens.rows)
+        size = (len(scene), self.lens.height, self.lens.width)
+        depth, ids, kind, normal, base = self._draw(
+            self._handle, scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants,
+            launch_dims=size,
+        )  # fmt: skip
+        return {"depth": depth, "segmentation": ids, **lit_images(base, normal, camera, kind == 1)}
