@@ -23,8 +23,7 @@ from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import simplify_parts
-from converters.geometry.simplify import simplify_open
+from converters.geometry.simplify import simplify_open, simplify_parts
 from converters.propose.proposals import propose_instances
 from converters.propose.report import floor_of
 from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation

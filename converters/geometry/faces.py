@@ -7,16 +7,11 @@ from collections.abc import Iterator
 
 import fast_simplification
 import numpy as np
-import trimesh
 
 from converters.records.limits import SAMPLES, check_count
 
-LEAST_FACES = 24
-"""Of a part, however many there are."""
 BLOCK, LARGE = 1_000_000, 10_000
 """Points that are sampled at a time; points on a face from which on it is a large one."""
-SMALL_M = 0.6
-"""Longest side of a thing that may be drawn as its hull."""
 
 
 def face_labels(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -149,22 +144,3 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[n
         vertices, faces, _ = merge_vertices(np.asarray(points, float), np.asarray(triangles, np.int64))
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3)
-
-
-def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """All parts as one mesh of about so many faces, shared out by the roots of their areas.
-
-    A level plane that is simplified as part of a larger mesh loses its outline; by itself it has few enough faces to
-    stay. A small thing of many loose pieces, which cannot be simplified, becomes its convex hull.
-    """
-    weight = np.sqrt([face_areas(*part).sum() for part in parts])
-    most = np.maximum((max_faces * weight / weight.sum()).astype(int), LEAST_FACES)
-    done = []
-    for part, n in zip(parts, most.tolist(), strict=True):
-        vertices, faces = simplify(*part, n)
-        if len(faces) > 2 * n and np.ptp(vertices, axis=0).max() < SMALL_M:
-            hull = trimesh.convex.convex_hull(vertices)
-            vertices, faces = simplify(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64), n)
-        done.append((vertices, faces))
-    first = np.cumsum([0, *(len(vertices) for vertices, _ in done)])
-    return np.vstack([v for v, _ in done]), np.vstack([f + k for (_, f), k in zip(done, first, strict=False)])

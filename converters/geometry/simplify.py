@@ -25,6 +25,10 @@ RIM_ROUNDS = 5
 """Tries to meet a number of faces where faces on rims count too."""
 LOSS_M = 0.03
 """Sampling of a surface whose loss is measured."""
+LEAST_FACES = 24
+"""Of a part, however many there are."""
+SMALL_M = 0.6
+"""Longest side of a thing that may be drawn as its hull."""
 
 
 def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
@@ -175,3 +179,38 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
             break
         target = max(target * most_faces // len(left), 4)
     return simplify(vertices, left, len(left))
+
+
+def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """All parts as one mesh of about so many faces, shared out by the roots of their areas.
+
+    What plain parts leave of their shares goes to the others; one that has too many faces still is simplified within
+    `MOST_M` and `LEAST_AREA`, and further only where all together have too many then. A level plane that is simplified
+    as part of a larger mesh loses its outline; by itself it has few enough faces to stay. A small thing of many loose
+    pieces, which cannot be simplified so far, becomes its convex hull.
+    """
+    done = [merge_vertices(*part)[:2] for part in parts]
+    weight = np.sqrt([face_areas(*part).sum() for part in done])
+    most = _shares(done, weight, max_faces)
+    done = [simplify_within(*part) if len(part[1]) > n else part for part, n in zip(done, most, strict=True)]
+    for k, n in enumerate(_shares(done, weight, max_faces)):
+        vertices, faces = simplify(*done[k], n)
+        if len(faces) > 2 * n and np.ptp(vertices, axis=0).max() < SMALL_M:
+            hull = trimesh.convex.convex_hull(vertices)
+            vertices, faces = simplify(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64), n)
+        done[k] = vertices, faces
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in done)])
+    return np.vstack([v for v, _ in done]), np.vstack([f + k for (_, f), k in zip(done, first, strict=False)])
+
+
+def _shares(parts: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, total: int) -> list[int]:
+    """Of so many faces those of each part: by its weight, or all that it has where that is less."""
+    need = np.array([len(faces) for _, faces in parts])
+    taken, left = np.zeros(len(need), bool), total
+    while not taken.all():
+        share = left * weight / max(weight[~taken].sum(), 1e-12)
+        fits = ~taken & (need <= share)
+        if not fits.any():
+            return np.where(taken, need, np.maximum(share, LEAST_FACES)).astype(int).tolist()
+        taken, left = taken | fits, left - int(need[fits].sum())
+    return need.tolist()

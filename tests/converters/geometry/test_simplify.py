@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.geometry.simplify import Surface, simplify_open
+from converters.geometry.simplify import Surface, simplify_open, simplify_parts, surface_loss
 
 
 def wall() -> tuple[np.ndarray, np.ndarray]:
@@ -48,3 +48,15 @@ def test_the_farthest_point_is_the_one_that_all_exact_distances_name():
     assert surface.farthest(points, 0.1) == pytest.approx(exact.max(), abs=1e-12)
     assert exact.max() <= surface.farthest(points, 1.0) <= 1.0
     assert surface.farthest(vertices, 0.01) <= 0.01
+
+
+def test_what_plain_parts_leave_goes_to_fine_ones():
+    plain = [trimesh.creation.box([3, 0.1, 2.5]) for _ in range(20)]
+    fine = trimesh.creation.torus(0.3, 0.05, 128, 48)
+    parts = tuple((np.asarray(m.vertices, float), np.asarray(m.faces, np.int64)) for m in (*plain, fine))
+    vertices, faces = simplify_parts(parts, 1200)
+    own = faces[faces.min(axis=1) >= 8 * len(plain)]
+    assert len(faces) <= 1200 and len(faces) - len(own) == 12 * len(plain)
+    kept, off_m = surface_loss(*parts[-1], vertices, own)
+    assert kept > 0.97 and off_m < 0.011
+    assert len(simplify_parts(parts, 400)[1]) < 420
