@@ -284,9 +284,9 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     with clock.stage("cut"):
         cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated, raw.scan.furnished)
     with clock.stage("map"):
-        plan = stages.call(
-            make_floor_plan, vertices_w, raw.scan.faces[cut.keep], raw.scan.labels, annotated, raw.given_map, walls_yaw
-        )
+        kept = raw.scan.faces[cut.keep]
+        seen = vertices_w, kept, raw.scan.labels, annotated, raw.given_map, walls_yaw
+        plan = stages.call(make_floor_plan, *seen, bool(raw.picture))
         walls = stages.call(wall_boxes, plan)
         traversable, origin = resample(plan.grid, plan.traversable, plan.grid.resolution_m)
         if not traversable.any():

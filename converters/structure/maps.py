@@ -218,6 +218,7 @@ def make_floor_plan(
     objects: tuple[PlacedObject, ...],
     given: GivenMap | None,
     yaw: float,
+    exact: bool = False,
     resolution_m: float = RESOLUTION_M,
 ) -> FloorPlan:
     """Reads floor and obstacles off the cleaned scan.
@@ -229,6 +230,7 @@ def make_floor_plan(
         objects: their footprints stand on floor that the scan could not see; door leaves need room to swing.
         given: the source's own traversable map, or None.
         yaw: of the grid: the building's `main_direction`, rad.
+        exact: leaves and walls lie where they are: what a leaf passes stays free of boxes, wall or unseen.
         resolution_m: cell side.
 
     Raises:
@@ -249,7 +251,6 @@ def make_floor_plan(
             swept |= swept_by_door(grid, placed)
     # What is left of the door's scan in its sweep goes, walls stay.
     occupied &= ~swept | (shown.solid_wall >= 3)
-    leaf = occupied & swept
     closed = ndimage.binary_closing(floor_seen, iterations=CLOSE_CELLS) | under | floor_seen
     if given is not None:
         closed |= _given_floor(grid, given)
@@ -264,7 +265,7 @@ def make_floor_plan(
             "scan: no traversable floor is left (no floor label below 1.2 m of free height); "
             "check the floor's labels and height"
         )
-    height = _heights(shown, occupied)
+    height, leaf = _heights(shown, occupied), swept & (~traversable if exact else occupied)
     return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height)
 
 

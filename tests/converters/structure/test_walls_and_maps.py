@@ -108,10 +108,12 @@ def test_main_direction_finds_the_rooms_turn(yaw):
     assert main_direction(vertices @ yaw_matrix(yaw).T, faces, labels) == pytest.approx(yaw, abs=1e-3)
 
 
-def room_plan(yaw: float = 0.0, given=None, keep=None, objects=()):
+def room_plan(yaw: float = 0.0, given=None, keep=None, objects=(), exact=False):
     vertices, faces, labels = tiny_raw.scan()
     faces = faces[np.isin(labels[faces[:, 0]], (1, 2))] if keep is None else faces[keep(labels[faces[:, 0]])]
-    return make_floor_plan((vertices - [0, 0, 0.3]) @ yaw_matrix(yaw).T, faces, labels, objects, given, yaw)
+    return make_floor_plan(
+        (vertices - [0, 0, 0.3]) @ yaw_matrix(yaw).T, faces, labels, objects, given, yaw, exact=exact
+    )
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3])
@@ -199,19 +201,20 @@ def test_the_sources_map_adds_floor_that_the_scan_missed():
     assert plan.traversable.sum() == room_plan().traversable.sum()
 
 
-def door_at_the_wall() -> PlacedObject:
+def door_at_the_wall(x_m: float = 0.43) -> PlacedObject:
     """A leaf of 0.8 x 0.04 m, square to the wall x = 0, its hinge in it, that turns flat against it both ways."""
     leaf = convex_hull(np.array([(x, y, z) for x in (-0.4, 0.4) for y in (-0.02, 0.02) for z in (0.0, 1.4)]))
     hinge = BodyHinge(np.array([-0.4, 0.0, 0.0]), (-math.pi / 2, math.pi / 2), False)
-    place = np.array([0.43, 1.25, 0.0])
+    place = np.array([x_m, 1.25, 0.0])
     colours = np.zeros((len(leaf.faces), 3), np.uint8)
     turn = np.array([1.0, 0, 0, 0])
     return PlacedObject("door_0", "door", "d", leaf.vertices, leaf.faces, colours, (leaf,), (), place, turn, hinge)
 
 
-def test_walls_beside_a_doors_sweep_stay_and_the_leaf_meets_no_box():
-    door = door_at_the_wall()
-    bare, plan = room_plan(), room_plan(objects=(door,))
+@pytest.mark.parametrize(("x_m", "exact"), [(0.43, False), (0.43, True), (0.33, True)])
+def test_walls_beside_a_doors_sweep_stay_and_the_leaf_meets_no_box(x_m, exact):
+    door = door_at_the_wall(x_m)
+    bare, plan = room_plan(), room_plan(objects=(door,), exact=exact)
     np.testing.assert_array_equal(plan.occupied, bare.occupied)
     assert not (plan.traversable & bare.occupied).any()
     assert plan.leaf is not None and plan.leaf.sum() >= 20  # the leaf lies along 1.6 m of wall, in cells of 5 cm
