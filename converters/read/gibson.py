@@ -88,7 +88,6 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
     floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
     maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
     licence = read_licence(source)
-    attribution = source.use(ATTRIBUTION, "").read_text(encoding="utf-8") if source.has(ATTRIBUTION) else ""
     return RawScene(
         name=source.root.resolve().name,
         source_format=layout,
@@ -103,7 +102,7 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
         sources=dict(sorted(source.sha256.items())),
         storeys=tuple(Storey(h, m) for h, m in zip(heights, maps, strict=True)) if len(heights) > 1 else (),
         warnings=tuple(source.warnings),
-        attribution=attribution,
+        attribution=read_attribution(source),
     )
 
 
@@ -189,6 +188,12 @@ def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, flo
             "expected maps of the same mesh at 0.01 m a pixel"
         )
     return GivenMap(free, MAP_RESOLUTION_M, (-half, -half))
+
+
+def read_attribution(source: SourceFolder) -> str:
+    """Whose the models are, as the folder's own file says."""
+    has = source.has(ATTRIBUTION)
+    return source.use(ATTRIBUTION, "").read_text(encoding="utf-8", errors="replace") if has else ""
 
 
 def read_licence(source: SourceFolder) -> str:

@@ -22,6 +22,7 @@ from converters.geometry.boxes import convex_hull
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.homes.sh3d import OURS
 from converters.records.errors import SceneRejected
+from converters.records.raw import ATTRIBUTION
 from converters.structure.walls import cover_rectangles
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
@@ -123,6 +124,8 @@ class _Export:
 
     def __init__(self, folder: Path, name: str, licence: str) -> None:
         self.folder, self.files = folder, {"LICENCE": licence.encode()} if licence else {}
+        if (folder / ATTRIBUTION).is_file():
+            self.files[ATTRIBUTION] = (folder / ATTRIBUTION).read_bytes()
         try:
             self.spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
         except (ValueError, RuntimeError, OSError) as error:

@@ -18,7 +18,7 @@ from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
-from converters.read.gibson import read_licence
+from converters.read.gibson import read_attribution, read_licence
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes
@@ -163,6 +163,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         given_map=None,
         storeys=tuple(Storey(z, None) for z in floors_m) if len(floors_m) > 1 else (),
         licence=read_licence(source),
+        attribution=read_attribution(source),
         picture=tuple((shell.vertices, shell.faces) for shell in shells),
         sources=dict(sorted(source.sha256.items())),
         warnings=tuple(source.warnings),

@@ -19,6 +19,8 @@ from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import CATEGORIES, load_manifest, load_maps
 
 HOME = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
+DRAWN = HOME.parent / "drawn" / "flat"
+"""The example of the tutorial, beside its drawing."""
 CUT_M = 1.05
 
 
@@ -111,6 +113,27 @@ def test_a_scene_comes_back(tiny_scene, tmp_path, hull_cache):
     maps = [load_maps(folder) for folder in (tiny_scene[0], tmp_path / "back")]
     assert np.array_equal(maps[0].traversable, maps[1].traversable) and maps[0].origin_w == maps[1].origin_w
     assert footprint(tiny_scene[0]).symmetric_difference(footprint(tmp_path / "back")).area < 1e-6
+
+
+def test_the_example_was_made_of_its_drawing():
+    raw, own = read_sh3d(DRAWN.with_suffix(".sh3d")), load_manifest(DRAWN)
+    assert raw.sources == own.source["sha256"] and raw.licence == own.licence
+    assert sorted(a.category for a in raw.annotations) == sorted(o.category for o in own.objects)
+    assert (DRAWN / "ATTRIBUTION.md").read_text() == raw.attribution and raw.attribution.count("| CC BY 3.0") == 8
+
+
+@pytest.mark.heavy
+def test_the_example_is_what_its_drawing_becomes(tmp_path, hull_cache):
+    config = ConvertConfig(structure_texture=64, object_texture=32)
+    made = convert(DRAWN.with_suffix(".sh3d"), tmp_path / "flat", config, cache=hull_cache)
+    own, again = load_manifest(DRAWN), load_manifest(made.folder)
+    assert {g.name for g in made.gates if not g.passed} == set()
+    assert {o.name: o.category for o in own.objects} == {o.name: o.category for o in again.objects}
+    specs = of_scene(DRAWN), of_scene(made.folder)
+    rest, found = (np.array([spec.body(o.name).pos for o in own.objects]) for spec in specs)
+    assert len(rest) == 16 and np.abs(rest - found).max() < 0.01
+    walls, same = (np.array([[*g.pos, *g.size] for g in spec.geoms if g.name.startswith("wall_")]) for spec in specs)
+    assert walls.shape == same.shape == (25, 6) and np.abs(walls - same).max() < 0.01
 
 
 def test_overlapping_boxes_become_walls_side_by_side():
