@@ -42,8 +42,8 @@ MIN_APART_M2 = 1.0
 PAD_M = 0.4
 HEIGHT_STEP_M = 0.1
 """Heights of low static furniture are rounded up to this: few boxes."""
-LEAF_MARGIN_M = 0.04
-"""Kept free around the space that a door's leaf sweeps."""
+LEAF_MARGIN_M, BOXED_M = 0.04, 0.01
+"""Kept free around the space that a door's leaf sweeps; how far a leaf's box may stand out of its hulls."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _footprint(grid: Grid, placed: PlacedObject) -> np.ndarray:
     return mask
 
 
-def swept_by_door(grid: Grid, placed: PlacedObject) -> np.ndarray:
+def swept_by_door(grid: Grid, placed: PlacedObject, margin_m: float = LEAF_MARGIN_M) -> np.ndarray:
     """(rows, columns) bool: cells that the leaf passes over its whole range, with a margin."""
     assert placed.hinge is not None
     mask = np.zeros(grid.shape, bool)
@@ -147,7 +147,7 @@ def swept_by_door(grid: Grid, placed: PlacedObject) -> np.ndarray:
     low, high = placed.hinge.range_rad
     for angle in np.linspace(low, high, max(int((high - low) / math.radians(3)), 2)):
         turned = (flat - placed.hinge.origin_b) @ yaw_matrix(angle).T + placed.hinge.origin_b
-        grid.add_below(mask, to_world(placed, turned), LEAF_MARGIN_M)
+        grid.add_below(mask, to_world(placed, turned), margin_m)
     return mask
 
 
@@ -248,7 +248,7 @@ def make_floor_plan(
     for placed in objects:
         under |= _footprint(grid, placed)
         if placed.hinge is not None:
-            swept |= swept_by_door(grid, placed)
+            swept |= swept_by_door(grid, placed, LEAF_MARGIN_M + BOXED_M * exact)
     # What is left of the door's scan in its sweep goes, walls stay.
     occupied &= ~swept | (shown.solid_wall >= 3)
     closed = ndimage.binary_closing(floor_seen, iterations=CLOSE_CELLS) | under | floor_seen

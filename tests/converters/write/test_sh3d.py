@@ -133,7 +133,7 @@ def test_the_example_is_what_its_drawing_becomes(tmp_path, hull_cache):
     rest, found = (np.array([spec.body(o.name).pos for o in own.objects]) for spec in specs)
     assert len(rest) == 16 and np.abs(rest - found).max() < 0.01
     walls, same = (np.array([[*g.pos, *g.size] for g in spec.geoms if g.name.startswith("wall_")]) for spec in specs)
-    assert walls.shape == same.shape == (25, 6) and np.abs(walls - same).max() < 0.01
+    assert walls.shape == same.shape == (23, 6) and np.abs(walls - same).max() < 0.01
 
 
 def test_overlapping_boxes_become_walls_side_by_side():
