@@ -180,6 +180,16 @@ METRICS, PACKED_METRICS = "metrics.jsonl", "metrics.jsonl.gz"
 """Of a run, and of one that was exported."""
 
 
+def read_packaged(path: Path, hint: Any) -> Any:
+    """A YAML table that comes with the package, as the type `hint`.
+
+    Raises:
+        FileError: it is damaged.
+    """
+    reader = Reader(FileError, "install the package again", finite=False)
+    return reader.typed(reader.decoded(path.read_bytes(), "YAML", str(path)), hint, str(path))
+
+
 def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
     """Writes a metrics.jsonl, or, where the name ends in .gz, a packed one."""
     text = "".join(json.dumps(line) + "\n" for line in lines)

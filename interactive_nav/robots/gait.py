@@ -22,9 +22,9 @@ from interactive_nav.robots.spec import (
     RobotState,
     TwistMap,
     check_mode,
-    read_rows,
     set_servo,
 )
+from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import yaw_from_quat
 
 
@@ -131,7 +131,7 @@ class Row(Figures):
 @functools.cache
 def legged_row(name: str) -> Row:
     """A legged robot's row."""
-    rows = read_rows(FOLDER.parent / "models" / "legged.yaml", Row)
+    rows = read_packaged(FOLDER.parent / "models" / "legged.yaml", tuple[Row, ...])
     return next(row for row in rows if row.legs.name == name)
 
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from interactive_nav_common.errors import ConfigError, FileError
-from interactive_nav_common.records import Reader
+from interactive_nav_common.errors import ConfigError
 
 
 class RobotState(NamedTuple):
@@ -196,16 +194,3 @@ class Figures:
     def figures(self, *others: str) -> dict[str, Any]:
         """By name, without the row's other columns."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in others}
-
-
-Row = TypeVar("Row", bound=Figures)
-
-
-def read_rows(path: Path, kind: type[Row]) -> tuple[Row, ...]:
-    """A table of robots that comes with the package.
-
-    Raises:
-        FileError: it is missing or damaged.
-    """
-    reader = Reader(FileError, "install the package again")
-    return reader.typed(reader.decoded(path.read_bytes(), "YAML", str(path)), tuple[kind, ...], str(path))

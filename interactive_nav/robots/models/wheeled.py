@@ -13,7 +13,8 @@ import functools
 from pathlib import Path
 
 from interactive_nav.robots.build import WheeledBase, wheeled_robot
-from interactive_nav.robots.spec import Figures, read_rows
+from interactive_nav.robots.spec import Figures
+from interactive_nav_common.records import read_packaged
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +27,6 @@ class _Row(Figures):
 
 WHEELED = {
     row.base.name: functools.partial(wheeled_robot, row.base, **row.figures("base"))
-    for row in read_rows(Path(__file__).with_suffix(".yaml"), _Row)
+    for row in read_packaged(Path(__file__).with_suffix(".yaml"), tuple[_Row, ...])
 }
 """Name -> control mode -> spec."""
