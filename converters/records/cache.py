@@ -42,10 +42,11 @@ NOT_HASHED = {"hashed": False}
 
 @functools.cache
 def fingerprint(packages: tuple[Path, ...] = PACKAGES) -> bytes:
-    """Digest of the converter's source files and the computing libraries' versions."""
+    """Digest of the converter's modules, of the tables that have their names, and of the libraries' versions."""
     digest = hashlib.sha256(repr([(name, version(name)) for name in COMPUTING]).encode())
     for package in packages:
-        for path in sorted(package.rglob("*.py")):
+        modules = sorted(package.rglob("*.py"))
+        for path in (*modules, *(table for p in modules if (table := p.with_suffix(".yaml")).is_file())):
             content = path.read_bytes()
             digest.update(f"{path.relative_to(package.parent).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.digest()

@@ -148,16 +148,19 @@ def test_the_fingerprint_follows_every_source_file_by_its_place(tmp_path):
     (tmp_path / "mesh" / "cut.py").write_text("a = 2")
     fingerprint.cache_clear()
     digests.append(fingerprint((tmp_path,)))
+    (tmp_path / "mesh" / "cut.yaml").write_text("- 1")  # its table
+    fingerprint.cache_clear()
+    digests.append(fingerprint((tmp_path,)))
     (tmp_path / "mesh").rename(tmp_path / "scan")
     fingerprint.cache_clear()
     digests.append(fingerprint((tmp_path,)))
-    assert len(set(digests)) == 3
+    assert len(set(digests)) == 4
 
 
 def test_the_fingerprint_follows_what_the_converter_is_built_on():
     """A category's labels decide what is cut: an edited table must not be served old cuts."""
     assert {p.name for p in PACKAGES} == {"converters", "scenes_mjcf", "interactive_nav_common"}
-    assert any((p / "categories.py").is_file() for p in PACKAGES) and fingerprint() != fingerprint(PACKAGES[:1])
+    assert any((p / "categories.yaml").is_file() for p in PACKAGES) and fingerprint() != fingerprint(PACKAGES[:1])
 
 
 def test_what_cannot_be_hashed_is_refused(tmp_path):
