@@ -37,7 +37,7 @@ SELECTION = Path(__file__).with_name("selection.yaml")
 MOST_FACES = 3000
 MOST_LOST, MOST_OFF_M = 0.1, 0.04
 """What a model may lose of its area, and lie off, at that number."""
-LEAN_FACES, LEAN_LOST, LEAN_OFF_M = 1200, 0.05, 0.02
+LEAN_FACES, LEAN_LOST, LEAN_OFF_M = (1200, 2000), 0.05, 0.02
 """Faces that do where no more than so much is lost."""
 SOLID_M = 0.004
 """Error of the surface that is decomposed."""
@@ -148,7 +148,7 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
     size_m = np.ptp(surface.vertices, axis=0)
     foot_m = FOOT_SHARE * size_m[1]
     hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in made.hulls[chosen.key])
-    for most in (LEAN_FACES, MOST_FACES):
+    for most in (*LEAN_FACES, MOST_FACES):
         low = simplify_to(vertices, faces, most)
         kept, off_m = surface_loss(vertices, faces, *low)
         lost = 1 - kept
