@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 
 from converters.generate.design.instance import Instance, place
-from converters.generate.homes.groups import GROUPS, Group, Satellite
+from converters.generate.homes.groups import TABLES, Group, Satellite
 from converters.generate.models.cad import LIBRARY, CadModel, cad_model
 from scenes_mjcf.categories import CATEGORIES
 
@@ -254,7 +254,7 @@ def arrange(name: str, show: Showroom, rng: np.random.Generator, fewer: int = 0)
     """Chooses models for a group and stands them against each other.
 
     Args:
-        name: key of `GROUPS`, or a category that stands alone anywhere.
+        name: key of `TABLES.groups`, or a category that stands alone anywhere.
         show: the models.
         rng: random stream.
         fewer: pieces that a row does without.
@@ -262,7 +262,7 @@ def arrange(name: str, show: Showroom, rng: np.random.Generator, fewer: int = 0)
     Returns:
         The group; None where there is no model of its anchor.
     """
-    group = GROUPS.get(name) or Group(name, "anywhere", most=99)
+    group = TABLES.groups.get(name) or Group(name, "anywhere", most=99)
     if not show.has(group.anchor):
         return None
     draw = show.set_of(rng)

@@ -15,7 +15,7 @@ from converters.generate.design.plan import Plan, Rect
 from converters.generate.homes.arrange import Arrangement, Piece, Showroom, arrange, on_floor, stand
 from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
 from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
-from converters.generate.homes.groups import GROUPS, MOST, PLENTY_M2, ROOM_SETS, RoomSet
+from converters.generate.homes.groups import PLENTY_M2, TABLES, RoomSet
 from converters.geometry.density import ROBOTS
 
 LOOKS = 8
@@ -65,9 +65,9 @@ class Home:
     def takes(self, categories: Sequence[str], room: int) -> bool:
         """True where these pieces more are not more of a kind than a room and a home have."""
         larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)
-        for category, more in Counter(c for c in categories if c in MOST).items():
+        for category, more in Counter(c for c in categories if c in TABLES.most).items():
             here = [s.room == room for s in self.floor.standing if s.item.model.category == category]
-            in_room, in_home = MOST[category]
+            in_room, in_home = TABLES.most[category]
             if sum(here) + more > in_room or len(here) + more > in_home * larger:
                 return False
         return True
@@ -76,7 +76,7 @@ class Home:
         """The first room without what it needs, and what that is; empty where there is none."""
         for room, use in enumerate(self.uses):
             have = {s.item.model.category for s in self.floor.standing if s.room == room}
-            without = [c for c in ROOM_SETS[use].needs if self.show.has(c) and c not in have]
+            without = [c for c in TABLES.rooms[use].needs if self.show.has(c) and c not in have]
             if without:
                 return f"the {use} of {self.plan.rooms[room].area_m2:.1f} m2 has no place for: {', '.join(without)}"
         return ""
@@ -173,11 +173,11 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
     Returns:
         False where it does not fit, or is more than the share asked for or than rooms have of a kind.
     """
-    if not home.takes([GROUPS[name].anchor if name in GROUPS else name], room):
+    if not home.takes([TABLES.groups[name].anchor if name in TABLES.groups else name], room):
         return False
-    rows = any(s.relation == "next" for s in GROUPS[name].satellites) if name in GROUPS else False
+    rows = any(s.relation == "next" for s in TABLES.groups[name].satellites) if name in TABLES.groups else False
     most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
-    for fewer in range(FEWEST + 1 if rows else REDRAWS if name in GROUPS else 1):
+    for fewer in range(FEWEST + 1 if rows else REDRAWS if name in TABLES.groups else 1):
         arrangement = arrange(name, home.show, home.rng, fewer if rows else 0)
         arrangement = arrangement and _few(home, arrangement, room)
         if arrangement is None:
@@ -192,7 +192,7 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
 def _room_set(home: Home, room: int) -> RoomSet:
     """What a room has; the living room has the table where there is no dining room and the kitchen is small."""
     use = home.uses[room]
-    chosen = ROOM_SETS[use]
+    chosen = TABLES.rooms[use]
     if use == "living" and "dining" not in home.uses:
         return dataclasses.replace(chosen, base=(chosen.base[0], ("dining table", 0.7), *chosen.base[1:]))
     if use == "living" and len(home.uses) <= 2:
@@ -235,7 +235,7 @@ def stand_clutter(home: Home) -> None:
 
 def clutter_category(home: Home, room: int) -> str | None:
     """A category of what lies about in a room; None where there are no models of any."""
-    odds = [(c, w) for c, w in ROOM_SETS[home.uses[room]].clutter if home.show.has(c) and home.takes([c], room)]
+    odds = [(c, w) for c, w in TABLES.rooms[home.uses[room]].clutter if home.show.has(c) and home.takes([c], room)]
     if not odds:
         return None
     weights = np.array([w for _, w in odds])
@@ -259,11 +259,11 @@ def grow(home: Home) -> None:
     for _ in range(MOST_ADDED):
         if floor.share >= cfg.furniture_share - SHARE_TOLERANCE / 2:
             return
-        hungry = {k: floor.room_share(k) / ROOM_SETS[use].appetite for k, use in enumerate(home.uses)}
+        hungry = {k: floor.room_share(k) / TABLES.rooms[use].appetite for k, use in enumerate(home.uses)}
         for room in sorted(hungry, key=lambda k: hungry[k]):
             chosen = _room_set(home, room)
             groups = [(g, w) for g, w in (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
-                      if (room, g) not in tired and home.count(g, room) < GROUPS[g].most]  # fmt: skip
+                      if (room, g) not in tired and home.count(g, room) < TABLES.groups[g].most]  # fmt: skip
             more_clutter = (room, "clutter") not in tired
             if not groups and (radius_m == WIDE_M or not more_clutter):
                 continue
@@ -281,7 +281,7 @@ def grow(home: Home) -> None:
                 break
             radius_m, tired = home.narrow_m, set()
     if abs(floor.share - cfg.furniture_share) > SHARE_TOLERANCE:
-        fullest = min(range(len(home.uses)), key=lambda k: floor.room_share(k) / ROOM_SETS[home.uses[k]].appetite)
+        fullest = min(range(len(home.uses)), key=lambda k: floor.room_share(k) / TABLES.rooms[home.uses[k]].appetite)
         without = ", ".join(sorted(name for room, name in tired if room == fullest)) or "anything"
         raise Full(
             f"furniture_share is {cfg.furniture_share}: nothing more fits at {floor.share:.2f} (the emptiest room, "

@@ -18,7 +18,7 @@ from converters.generate.homes.arrange import Arrangement, Piece
 from converters.generate.homes.config import SHARE_TOLERANCE, Range
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import Home, clutter_category, settle
-from converters.generate.homes.groups import LIGHT, Group
+from converters.generate.homes.groups import TABLES, Group
 from converters.geometry.density import ROBOTS, Ways, clearance_m, must_push_shares
 
 MOST_MOVES = 400
@@ -96,7 +96,7 @@ class Passages:
 
     def light(self) -> list[Standing]:
         """What can be moved: light pieces, seats round tables among them."""
-        return [s for s in self.home.floor.standing if s.item.model.category in LIGHT]
+        return [s for s in self.home.floor.standing if s.item.model.category in TABLES.light]
 
     def trial(self, change: Callable[[], bool]) -> bool:
         """Keeps a change of what stands where that is nearer to what is asked for; undoes it otherwise.
@@ -207,7 +207,7 @@ def _narrow(home: Home, passages: Passages) -> None:
     if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
         piece = alone[rng.integers(len(alone))]
         model, scale = piece.item.model, piece.item.scale
-    elif category in LIGHT and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
+    elif category in TABLES.light and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
         model, scale = home.show.draw(category, rng)
     else:
         return

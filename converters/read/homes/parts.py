@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,28 +29,10 @@ from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
 from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, Storey
+from interactive_nav_common.records import read_packaged
 from scenes_mjcf.categories import CATEGORIES, Category
 
-ALIASES = {
-    "ball": "toy",
-    "bedsidetable": "nightstand",
-    "bookshelf": "bookcase",
-    "cabinet": "sideboard",
-    "chestofdrawers": "dresser",
-    "couch": "sofa",
-    "cupboard": "wardrobe",
-    "dustbin": "bin",
-    "foldingdoor": "structure",
-    "garbage": "bin",
-    "kitchencabinet": "counter",
-    "refrigerator": "fridge",
-    "settee": "sofa",
-    "slidingdoor": "structure",
-    "trash": "bin",
-    "trashcan": "bin",
-    "tvcabinet": "tv_bench",
-    "tvstand": "tv_bench",
-}
+ALIASES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Names that others give to our categories."""
 KNOWN = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
 KNOWN |= {word: CATEGORIES[of] for word, of in ALIASES.items()}

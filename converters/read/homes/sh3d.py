@@ -32,6 +32,7 @@ from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
 from converters.records.limits import DRAWN, UNPACKED, check_count
 from converters.records.raw import RawScene
+from interactive_nav_common.records import read_packaged
 
 ENDING = ".sh3d"
 PIECES = ("pieceOfFurniture", "doorOrWindow", "light")
@@ -56,29 +57,8 @@ OURS = "interactive_nav#"
 """Ids of drawings that `converters.write.sh3d` makes: their categories are known."""
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
 """Ids, less what stands before #, of shapes that people build all kinds of things from."""
-IDS = {
-    "chest": "dresser", "tvunit": "tv_bench", "flooruplight": "floor_lamp", "floorlamp": "floor_lamp",
-    "cooker": "stove",
-    "fridgefreezer": "fridge", "clotheswasher": "washer", "dishwasher": "washer", "kitchenuppercabinet": "shelf",
-    "kitchencabinet": "counter", "toiletunit": "toilet", "fittedbath": "tub", "bath": "tub", "piano": "structure",
-    "washbasinwithcabinet": "washbasin", "crib": "bed", "cradle": "bed", "aquarium": "structure",
-    "fireplace": "structure",
-    "flowers": "pot", "spiralstaircase": "structure", "chimney": "structure", "railing": "structure",
-}  # fmt: skip
-"""Ids whose last words do not tell the category."""
-WORDS = {
-    "chair": "chaise stuhl silla sedia cadeira stoel krzeslo stol", "armchair": "fauteuil sessel sillon poltrona fotel",
-    "table": "tisch mesa tavolo tafel table stolik", "desk": "bureau schreibtisch escritorio scrivania biurko",
-    "sofa": "canape divano kanapee bank", "bed": "lit bett cama letto lozko",
-    "wardrobe": "armoire schrank armario armadio kast szafa", "dresser": "commode kommode comoda",
-    "stool": "tabouret hocker taburete sgabello", "plant": "plante pflanze pianta",
-    "nightstand": "chevet nachttisch mesilla comodino", "bookcase": "bibliotheque etagere regal estanteria libreria",
-    "floor_lamp": "lampadaire stehlampe", "bin": "poubelle mulleimer papelera cestino", "bench": "banc banco panca",
-    "fridge": "refrigerateur kuhlschrank frigorifico nevera frigorifero", "tub": "baignoire badewanne banera vasca",
-    "sink": "evier spule fregadero lavello", "washbasin": "lavabo waschbecken", "shower": "douche dusche ducha doccia",
-}  # fmt: skip
-"""Category -> what it is called in other languages, without accents."""
-FOREIGN = {word: category for category, words in WORDS.items() for word in words.split()}
+_TABLES: dict[str, dict[str, Any]] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, Any]])
+FOREIGN = {word: category for category, words in _TABLES["words"].items() for word in words}
 
 
 def looks_like(root: Path) -> bool:
@@ -124,7 +104,9 @@ def kind_of(catalogue_id: str, name: str, height_m: float = 1.0) -> str:
     bare = re.sub("[^a-z]", "", own.lower())
     if bare in BLOCKS or "stair" in bare:
         return "structure"
-    found = IDS.get(bare) or next((c.name for words in (own, name) if (c := category_of(words)) is not None), None)
+    found = _TABLES["ids"].get(bare) or next(
+        (c.name for words in (own, name) if (c := category_of(words)) is not None), None
+    )
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
     for word in re.findall("[a-z]{3,}", plain) if found is None else ():
         # In compounds of German and Dutch the last part tells what it is.

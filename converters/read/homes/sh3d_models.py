@@ -23,31 +23,9 @@ from converters.read.obj import GREY, TexturedMesh, join_textures, read_material
 from converters.read.urdf import placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M, GEOMS, check_count
+from interactive_nav_common.records import read_packaged
 
-_NAMED = """
-amber:934400 amber_trans:934400 charcoal:010101 lavendar:381758 navy_blue:00000e pale_green:12610c
-pale_pink:a7346a pale_yellow:b09e33 peach:a22f04 periwinkle:000ad3 redwood:420800 smoked_glass:010101
-aqua_filter:5fab94 yellow_green:306800 bluetint:0cb5f4 plasma:ff1472 emerald:0cff00 ruby:ff0000 sapphire:0600ff
-white:ffffff red:c50000 blue_pure:0000ff lime:00ff00 green:004000 yellow:ffaa00 purple:8000ff orange:ff2b00
-grey:2f2f2f rubber:030303 flaqua:008080 flblack:010101 flblue_pure:0000b5 flgrey:808080 fllime:00ff00
-florange:ff2b00 flpurple:6000c0 flred:ff0000 flyellow:ffaa00 pink:fc2bab flbrown:1c0300 brown:160400
-glass:7c7d87 flesh:866956 aqua:008080 black:010101 silver:9d9d9d dkblue_pure:000022 fldkblue_pure:000022
-dkgreen:010600 dkgrey:0c0c0c ltbrown:471d0e fldkgreen:010600 flltbrown:471d0e tan:a98538 fltan:a97421
-brzskin:614a36 lips:ec434a redorange:c10500 blutan:144234 bluteal:144234 pinktan:af4237 brnhair:170803
-blondhair:92540b flblonde:92540b yelloworng:e23f00 bone:e6c26d teeth:fbcb78 brass:7a3200 dkred:3a0000
-taupe:341f1b dkteal:00110b dkdkgrey:030303 dkblue:00010f gold:ff7d00 redbrick:540a02 flmustard:e35a02
-flpinegreen:1b3716 fldkred:3a0202 fldkgreen2:061201 flmintgreen:214a2b olivegreen:060900 skin:1c0804
-redbrown:480200 deepgreen:000501 flltolivegreen:0a0e03 jetflame:f37e19 brownskn:050200 greenskn:001300
-ltgrey:626262 bronze:110903 bone1:fbcb78 flwhite1:ffffff flwhite:fbedd6 shadow:090605 fldkolivegreen:040501
-fldkdkgrey:030303 lcdgreen:96ff81 brownlips:24110a muscle:6b1216 flltgrey:d2d2d2 offwhite.warm:d5b072
-offwhite.cool:d5ae91 yellowbrt:ffc800 chappie:952e09 archwhite:fefefe archwhite2:d6d6d6 lighttan:b36b38
-lighttan2:503019 lighttan3:2e1504 lightyellow:fff356 lighttannew:c99b52 default:b5b3a7 ship2:ffffff
-dkpurple:06000c dkorange:b60900 mintgrn:067a15 fgreen:000b00 glassblutint:8eccc5 bflesh:060201 meh:8eccc5
-violet:070722 iris:000f51 blugrn:15a347 glasstransparent:787878 fleshtransparent:b04b21 fldkgrey:181818
-sky_blue:2097cc fldkpurple:290055 dkbrown:020100 bone2:fbdca6 bluegrey:30474a metal:e6c26d sand_stone:201d19
-hair:000000
-"""
-BUILT_IN = {name: code for name, _, code in (word.partition(":") for word in _NAMED.split())}
+BUILT_IN = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Colours of the materials that models name without a file: those of the first OBJ viewers, diffuse."""
 PANE = "sweethome3d_window_pane"
 """Groups that begin so are glass: a piece's one colour leaves them."""

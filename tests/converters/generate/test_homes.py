@@ -24,7 +24,7 @@ from converters.generate.homes.arrange import Showroom, apart, arrange, stand
 from converters.generate.homes.config import MOST_SHARE, TIERS, home_config, home_fields
 from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
-from converters.generate.homes.groups import GROUPS, LIGHT, MOST, ROOM_SETS
+from converters.generate.homes.groups import TABLES
 from converters.generate.homes.rooms import USES, assign_uses, home_plan, programme
 from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY
 from converters.geometry.density import ROBOTS
@@ -96,7 +96,7 @@ def size_m(item: Instance) -> np.ndarray:
 @given(st.integers(1, 12), st.integers(0, 1000))
 def test_a_programme_has_a_living_room_and_no_more_of_a_use_than_homes_have(n, seed):
     uses = programme(n, np.random.default_rng(seed))
-    assert len(uses) == n and uses.count("living") == 1 and set(uses) <= set(ROOM_SETS)
+    assert len(uses) == n and uses.count("living") == 1 and set(uses) <= set(TABLES.rooms)
     assert all(uses.count(u) <= USES[u].most for u in uses if u != "bedroom")
     assert n < 4 or {"bedroom", "bathroom", "kitchen"} <= set(uses)
 
@@ -197,10 +197,14 @@ def test_every_room_is_reached_with_the_movables_away(seed):
 def test_no_home_has_more_of_a_kind_than_people_keep(seed, tier):
     b = building(seed, tier)
     room_of = [[r.x0 < x < r.x1 and r.y0 < y < r.y1 for r in b.plan.rooms] for x, y in map(middle, b.items)]
-    for category, (in_room, in_home) in MOST.items():
+    for category, (in_room, in_home) in TABLES.most.items():
         per_room = np.sum([here for i, here in zip(b.items, room_of, strict=True) if i.model.category == category], 0)
         assert np.max(per_room) <= in_room and np.sum(per_room) <= in_home, category
-    assert MOST["bag"] == (2, 4) and MOST["stool"] == (2, 3) and MOST["cart"][0] == MOST["laundry_basket"][0] == 1
+    assert (
+        TABLES.most["bag"] == (2, 4)
+        and TABLES.most["stool"] == (2, 3)
+        and TABLES.most["cart"][0] == TABLES.most["laundry_basket"][0] == 1
+    )
 
 
 def test_what_belongs_together_is_alike():
@@ -403,14 +407,16 @@ def test_settings_that_make_no_sense_are_refused_by_name(tier, settings, message
 
 def test_tables_name_what_there_is():
     relations = {"beside", "before", "around", "flank", "next"}
-    for name, group in GROUPS.items():
+    for name, group in TABLES.groups.items():
         assert group.at in ("wall", "corner", "window", "free"), name
         assert {s.relation for s in group.satellites} <= relations, name
-    for use, room in ROOM_SETS.items():
-        assert use in USES and {g for g, _ in (*room.base, *room.more)} <= set(GROUPS)
-    named = {g.anchor for g in GROUPS.values()} | {s.category for g in GROUPS.values() for s in g.satellites}
-    named |= {c for room in ROOM_SETS.values() for c, _ in room.clutter} | set(MOST) | LIGHT
-    named |= {c for room in ROOM_SETS.values() for c in room.needs}
+    for use, room in TABLES.rooms.items():
+        assert use in USES and {g for g, _ in (*room.base, *room.more)} <= set(TABLES.groups)
+    named = {g.anchor for g in TABLES.groups.values()} | {
+        s.category for g in TABLES.groups.values() for s in g.satellites
+    }
+    named |= {c for room in TABLES.rooms.values() for c, _ in room.clutter} | set(TABLES.most) | TABLES.light
+    named |= {c for room in TABLES.rooms.values() for c in room.needs}
     assert "bed" not in CATEGORIES or named <= set(CATEGORIES)
     assert "models" not in home_fields() and "n_chairs" not in home_fields()
     assert isinstance(home_config("furnished", {}), HomeConfig)
