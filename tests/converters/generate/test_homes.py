@@ -415,7 +415,7 @@ def test_tables_name_what_there_is():
     named = {g.anchor for g in TABLES.groups.values()} | {
         s.category for g in TABLES.groups.values() for s in g.satellites
     }
-    named |= {c for room in TABLES.rooms.values() for c, _ in room.clutter} | set(TABLES.most) | TABLES.light
+    named |= {c for room in TABLES.rooms.values() for c, _ in room.clutter} | {*TABLES.most, *TABLES.light}
     named |= {c for room in TABLES.rooms.values() for c in room.needs}
     assert "bed" not in CATEGORIES or named <= set(CATEGORIES)
     assert "models" not in home_fields() and "n_chairs" not in home_fields()
