@@ -14,8 +14,8 @@ import hashlib
 
 import numpy as np
 
-from converters.generate.models import fixtures, furniture, laundry, storage, things
-from converters.generate.models.parts import MATERIALS, Drawing, Part, on_floor
+from converters.generate.models.drawings import DRAWN, SPARSE, Drawing
+from converters.generate.models.parts import MATERIALS, Part, on_floor
 from converters.geometry.pieces import convex_pieces
 from converters.library.store import read_index, read_shape
 from converters.read.cad import MOST_OWN, OWN_SLACK
@@ -57,50 +57,6 @@ class CadModel:
         return np.diff(self.bounds, axis=0)[0] / 2
 
 
-_f = functools.partial
-_SPARSE: dict[str, Drawing] = {
-    "chair_slat": Drawing("chair", furniture.chair_slat),
-    "chair_panel": Drawing("chair", furniture.chair_panel, front=-1),
-    "chair_arm": Drawing("chair", furniture.chair_arm),
-    "chair_office": Drawing("chair", furniture.chair_office),
-    "chair_sled": Drawing("chair", furniture.chair_sled, front=-1),
-    "chair_tub": Drawing("chair", furniture.chair_tub),
-    "chair_ladder": Drawing("chair", _f(furniture.chair_slat, 0.41, 0.40, 0.47, 0.55, 5, "walnut"), front=-1),
-    "chair_shell": Drawing("chair", _f(furniture.chair_panel, 0.52, 0.50, 0.44, 0.34, "navy", "steel")),
-    "table_apron": Drawing("table", furniture.table_legs, "__SYM_ROTATE_UP_2"),
-    "table_round": Drawing("table", furniture.table_round, "__SYM_ROTATE_UP_INF"),
-    "table_coffee": Drawing("table", furniture.table_coffee, "__SYM_ROTATE_UP_2"),
-    "table_square": Drawing(
-        "table", _f(furniture.table_legs, 0.8, 0.8, 0.75, "walnut", "black", 0.06), "__SYM_ROTATE_UP_4"
-    ),
-    "table_trestle": Drawing("table", furniture.table_trestle, "__SYM_ROTATE_UP_2"),
-    "table_panel": Drawing("table", furniture.table_panel, "__SYM_ROTATE_UP_2"),
-    "desk_panel": Drawing("desk", furniture.desk_panel),
-    "desk_drawers": Drawing("desk", furniture.desk_drawers, front=-1),
-    "desk_frame": Drawing("desk", furniture.desk_frame),
-    "desk_hutch": Drawing("desk", furniture.desk_hutch),
-    "sofa_two": Drawing("sofa", furniture.sofa),
-    "sofa_three": Drawing("sofa", _f(furniture.sofa, 1.95, 0.85, 0.43, 0.38, 0.14, 3, "linen", 0.06), front=-1),
-    "sofa_armless": Drawing("sofa", _f(furniture.sofa, 1.35, 0.78, 0.40, 0.40, 0.0, 2, "moss", 0.12)),
-    "sofa_club": Drawing("sofa", _f(furniture.sofa, 1.45, 0.86, 0.42, 0.30, 0.24, 2, "rust", 0.0)),
-    "door_panel": Drawing("door", furniture.door),
-    "door_flush": Drawing("door", _f(furniture.door, 0.86, 2.0, 0.042, "oak", 0, True)),
-    "door_three": Drawing("door", _f(furniture.door, 0.9, 2.02, 0.04, "linen", 3)),
-    "door_dark": Drawing("door", _f(furniture.door, 0.87, 1.99, 0.044, "walnut", 4, True)),
-    "chair_spindle": Drawing("chair", furniture.chair_spindle),
-    "table_tripod": Drawing("table", furniture.table_tripod, "__SYM_ROTATE_UP_INF"),
-    "desk_pedestals": Drawing("desk", furniture.desk_pedestals, front=-1),
-    "sofa_chaise": Drawing("sofa", furniture.sofa_chaise),
-    "door_battens": Drawing("door", furniture.door_battens),
-}
-"""What sparse homes have. They draw models by their place among these names: a new one would change each home."""
-_ROOMS = (storage, fixtures, laundry, things)
-_DRAWN: dict[str, Drawing] = {
-    **_SPARSE,
-    **{name: drawing for room in _ROOMS for name, drawing in room.DRAWINGS.items()},
-}
-
-
 def _library_parts(name: str) -> list[Part]:
     """The hulls of a library model, as the converter joins them, in the colour nearest to the model's."""
     shape = read_shape(name)
@@ -114,11 +70,8 @@ def _library_parts(name: str) -> list[Part]:
     return [Part(v, f, material) for v, f in pieces]
 
 
-_PACKAGED = {
-    name: Drawing(model.category, functools.partial(_library_parts, name), held_out=model.split == "test")
-    for name, model in read_index().items()
-}
-LIBRARY: dict[str, Drawing] = _DRAWN | _PACKAGED
+_PACKAGED = {name: Drawing(model.category, held_out=model.split == "test") for name, model in read_index().items()}
+LIBRARY: dict[str, Drawing] = DRAWN | _PACKAGED
 """Model name -> how it is drawn."""
 
 TEST_MODELS = (
@@ -127,7 +80,7 @@ TEST_MODELS = (
 )  # fmt: skip
 """Held out: no sparse training building uses them."""
 
-TRAIN_MODELS = tuple(name for name in _SPARSE if name not in TEST_MODELS)
+TRAIN_MODELS = tuple(name for name in SPARSE if name not in TEST_MODELS)
 """All others of sparse buildings."""
 
 
@@ -137,7 +90,7 @@ def _home_models(test: bool) -> tuple[str, ...]:
     have = {d.category for d in packaged.values()}
     return (
         *packaged,
-        *(n for n, d in _DRAWN.items() if d.category not in have and (d.held_out or n in TEST_MODELS) == test),
+        *(n for n, d in DRAWN.items() if d.category not in have and (d.held_out or n in TEST_MODELS) == test),
     )
 
 
@@ -162,7 +115,8 @@ def cad_model(name: str) -> CadModel:
         The model in its CAD frame: bounding box diagonal 1, y up.
     """
     drawing = LIBRARY[name]
-    parts = drawing.draw() if name in _SPARSE or name in _PACKAGED else on_floor(drawing.draw())
+    parts = _library_parts(name) if name in _PACKAGED else drawing.draw()
+    parts = parts if name in SPARSE or name in _PACKAGED else on_floor(parts)
     if drawing.front < 0:
         flip = np.diag([-1.0, 1.0, -1.0])
         parts = [dataclasses.replace(p, vertices=p.vertices @ flip) for p in parts]

@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-MATERIALS: dict[str, tuple[float, float, float]] = {
-    "oak": (0.72, 0.53, 0.34), "walnut": (0.38, 0.25, 0.17), "white": (0.90, 0.89, 0.86),
-    "black": (0.13, 0.13, 0.14), "steel": (0.60, 0.61, 0.63), "navy": (0.18, 0.24, 0.40),
-    "moss": (0.34, 0.42, 0.27), "rust": (0.62, 0.31, 0.19), "linen": (0.78, 0.73, 0.64),
-    "slate": (0.36, 0.40, 0.44),
-    "pine": (0.84, 0.70, 0.49), "birch": (0.88, 0.80, 0.66), "cherry": (0.56, 0.32, 0.20),
-    "cream": (0.90, 0.85, 0.74), "charcoal": (0.24, 0.25, 0.27), "grey": (0.62, 0.62, 0.61),
-    "teal": (0.17, 0.43, 0.45), "mustard": (0.79, 0.62, 0.22), "blush": (0.80, 0.58, 0.55),
-    "denim": (0.33, 0.44, 0.60), "sage": (0.56, 0.64, 0.51), "red": (0.68, 0.16, 0.15),
-    "leather": (0.45, 0.28, 0.18), "mattress": (0.94, 0.93, 0.89), "lampshade": (0.95, 0.88, 0.70),
-    "ceramic": (0.95, 0.95, 0.94), "enamel": (0.91, 0.92, 0.93), "glass": (0.66, 0.78, 0.80),
-    "chrome": (0.78, 0.79, 0.81), "brass": (0.76, 0.61, 0.31), "granite": (0.27, 0.27, 0.29),
-    "marble": (0.86, 0.85, 0.83), "leaf": (0.20, 0.43, 0.19), "fern": (0.36, 0.56, 0.26),
-    "bark": (0.40, 0.30, 0.21), "soil": (0.24, 0.17, 0.12), "terracotta": (0.74, 0.43, 0.30),
-    "cardboard": (0.74, 0.58, 0.40), "tape": (0.84, 0.76, 0.60), "wicker": (0.70, 0.55, 0.36),
-}  # fmt: skip
+from interactive_nav_common.records import read_packaged
+
+MATERIALS: dict[str, tuple[float, float, float]] = read_packaged(
+    Path(__file__).with_suffix(".yaml"), dict[str, tuple[float, float, float]]
+)
 """Material name -> diffuse RGB in 0..1."""
 
 
@@ -40,20 +29,6 @@ class Part:
     """Key of `MATERIALS`."""
     open: bool = False
     """Written without its underside."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Drawing:
-    """How a model is drawn: a function of no argument that gives parts in metres, base at y = 0, front +z."""
-
-    category: str
-    draw: Callable[[], list[Part]]
-    sym: str = "__SYM_NONE"
-    """Scan2CAD's symmetry class."""
-    front: int = 1
-    """+1: the model faces +z; -1: it faces -z, as some ShapeNet models do."""
-    held_out: bool = False
-    """Only homes to test in have it."""
 
 
 def box(center, size, material, tilt_rad=0.0, open=False) -> Part:
@@ -107,11 +82,6 @@ def bar(start, end, radius, material, sides=8) -> Part:
     low = np.stack([np.zeros_like(k), k + 1, k], 1)
     high = np.stack([np.zeros_like(k), k, k + 1], 1) + sides
     return Part(vertices, np.concatenate([around, low, high]), material)
-
-
-def corners(x, z) -> list[tuple[float, float]]:
-    """The four (x, z) at these distances from the middle."""
-    return [(sx * x, sz * z) for sx in (-1, 1) for sz in (-1, 1)]
 
 
 def rail(reach, y, z, radius, material, sides=8) -> Part:
@@ -218,14 +188,6 @@ def on_floor(parts) -> list[Part]:
         if y < 0
         else part
         for part, y in zip(parts, low, strict=True)
-    ]
-
-
-def feet(width, depth, height, radius, material) -> list[Part]:
-    """Short round feet under the corners of a `width` x `depth` underside at `height`."""
-    x, z = width / 2 - radius, depth / 2 - radius
-    return [
-        pillar((sx * x, 0, sz * z), height, (0.8 * radius, radius), material, 8) for sx in (-1, 1) for sz in (-1, 1)
     ]
 
 

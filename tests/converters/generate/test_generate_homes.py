@@ -25,7 +25,6 @@ from converters.generate.models.parts import (
     ball,
     beam,
     block,
-    corners,
     fronts,
     hull,
     leaf,
@@ -203,7 +202,6 @@ def test_pieces_lie_where_they_are_put():
     assert np.ptp(rail(0.5, 1.0, 2.0, 0.01, "steel").vertices, axis=0)[0] == pytest.approx(1.0)
     assert np.ptp(beam(0.5, 1.0, 0.3, 0.01, "steel").vertices, axis=0)[2] == pytest.approx(0.6)
     assert pillar((0, 0.2, 0), 0.5, 0.1, "oak").vertices[:, 1].max() == pytest.approx(0.7)
-    assert sorted(corners(1, 2)) == [(-1, -2), (-1, 2), (1, -2), (1, 2)]
     drawers = fronts((-0.4, 0.1), (0.4, 0.7), 0.25, 2, 3, "oak", "knob")
     assert len(drawers) == 12 and {round(float(p.vertices[:, 0].mean()), 3) for p in drawers} == {-0.2, 0.2}
     assert min(p.vertices[:, 1].min() for p in drawers) > 0.1 and len(fronts((0, 0), (1, 1), 0, 1, 1, "oak", "")) == 1
