@@ -10,7 +10,7 @@ import pytest
 
 from interactive_nav_common.config import Bounds, Natural
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.records import Reader
+from interactive_nav_common.records import Reader, read_packaged
 
 READER = Reader(FileError, "make it again")
 
@@ -104,3 +104,12 @@ def test_files_that_may_be_absent_and_scores_that_may_be_none(tmp_path):
         READER.json(path)
     path.write_text('{"score": NaN}')
     assert math.isnan(dataclasses.replace(READER, finite=False).json(path)["score"])
+
+
+def test_a_table_of_the_package_is_typed_and_may_be_unbounded(tmp_path):
+    path = tmp_path / "masses.yaml"
+    path.write_text("box: [0.01, .inf]\n")
+    assert read_packaged(path, dict[str, tuple[float, float]]) == {"box": (0.01, math.inf)}
+    path.write_text("box: [0.01]\n")
+    with pytest.raises(FileError, match=r"masses\.yaml: box is \[0\.01\], expected a list of 2; install the package"):
+        read_packaged(path, dict[str, tuple[float, float]])

@@ -20,6 +20,7 @@ from converters.generate.models.cad import (
     TRAIN_MODELS,
     cad_model,
 )  # fmt: skip
+from converters.generate.models.drawings import Drawing
 from converters.generate.models.parts import (
     Part,
     ball,
@@ -207,3 +208,16 @@ def test_pieces_lie_where_they_are_put():
     assert min(p.vertices[:, 1].min() for p in drawers) > 0.1 and len(fronts((0, 0), (1, 1), 0, 1, 1, "oak", "")) == 1
     sunk = on_floor([block((0, -0.1, 0), (1, 0.3, 1), "oak"), hull(np.eye(3).tolist() + [[0, 0, 0]], "oak")])
     assert sunk[0].vertices[:, 1].min() == 0 and solids(sunk)[0] == pytest.approx([0.2, 1 / 6])
+
+
+def test_a_row_draws_what_its_shapes_are_called_to_draw():
+    rows = (
+        ["plate", ["oval", 0, 0, 0.2, 0.1, 8], 0, 0.3, "oak", ["rectangle", 0, 0, 0.5, 0.4]],
+        ["turned", [0, 0, 0], [[0.1, 0], [0.2, 0.3], [0.1, 0.5]], "steel", {"sides": 6}],
+    )
+    drawn = Drawing("bin", rows).draw()
+    outlines = oval(0, 0, 0.2, 0.1, 8), rectangle(0, 0, 0.5, 0.4)
+    called = [plate(outlines[0], 0, 0.3, "oak", outlines[1]),
+              *turned((0, 0, 0), [(0.1, 0), (0.2, 0.3), (0.1, 0.5)], "steel", 6)]  # fmt: skip
+    assert [p.material for p in drawn] == [p.material for p in called] == ["oak", "steel", "steel"]
+    assert all((a.vertices == b.vertices).all() for a, b in zip(drawn, called, strict=True))
