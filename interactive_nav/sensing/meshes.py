@@ -248,7 +248,12 @@ def _draw(
     base: wp.array3d[wp.vec3],
 ):
     """One pixel: depth, class, 0 nothing, 1 lit or 2 shining by itself, normal, and colour before light."""
-    n, y, x = wp.tid()
+    n, tile_y, tile_x, lane = wp.tid()
+    # A warp's 32 rays go the same way.
+    y = tile_y * 8 + lane / 4
+    x = tile_x * 4 + lane % 4
+    if y >= rows.shape[0] or x >= columns.shape[0]:
+        return
     # JAX has no integers of 64 bits.
     mesh = (wp.uint64(handle[1]) << wp.uint64(32)) | wp.uint64(handle[0])
     eye = eye_w[n]
@@ -302,6 +307,9 @@ class MeshRenderer(Renderer):
         self._mesh = wp.Mesh(
             wp.array(made.points, dtype=wp.vec3, device=device),
             wp.array(made.faces.ravel(), dtype=int, device=device),
+            # Built slowly and with care, once: rays take a third less time.
+            bvh_constructor="sah",
+            bvh_leaf_size=1,
             groups=wp.array(made.group, dtype=int, device=device),
         )
         root = wp.zeros(int(made.group[-1]) + 1, dtype=int, device=device)
@@ -328,6 +336,6 @@ class MeshRenderer(Renderer):
         size = (len(scene), self.lens.height, self.lens.width)
         depth, ids, kind, normal, base = self._draw(
             self._handle, scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants,
-            launch_dims=size,
+            launch_dims=(size[0], -(-size[1] // 8), -(-size[2] // 4), 32), output_dims=size,
         )  # fmt: skip
         return {"depth": depth, "segmentation": ids, **lit_images(base, normal, camera, kind == 1)}
