@@ -186,9 +186,7 @@ def test_mjx_warp_draws_the_same(world, boxes, jumble, drawn):
     assert np.mean(np.abs(got[0] - depth) > 0.01) > 0.5
     # Colours and normals are made from the boxes that either has met.
     boxes = build_boxes(world, "all", colours=True)
-    every = [
-        jax.jit(functools.partial(kind(boxes, LENS).images_batch, ("rgb", "normals")))(*moved)
-        for kind in (RayRenderer, WarpRenderer)
-    ]
+    renderers = [kind(boxes, LENS) for kind in (RayRenderer, WarpRenderer)]  # kept while their programs run
+    every = [jax.jit(functools.partial(r.images_batch, ("rgb", "normals")))(*moved) for r in renderers]
     for name in ("rgb", "normals"):
         assert np.mean(np.abs(every[0][name] - every[1][name]).max(-1) < 1e-4) > 0.99
