@@ -228,7 +228,7 @@ def test_a_share_that_does_not_fit_is_refused_within_bounded_work(monkeypatch):
         GenerationError,
         match=r"is 0\.37: nothing more fits at 0\.\d\d \(the emptiest room, .*, has no place for: [a-z]",
     ):
-        design_building(3, cfg)
+        design_building(2, cfg)
     assert len(tries) < 2 * 1000
     assert len(plans) <= design.MOST_PLANS
 
