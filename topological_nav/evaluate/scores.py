@@ -29,16 +29,11 @@ OF_SUCCESSES = {"rc": "contact", "aadc_s": "aadc_s", "duration_s": "duration_s"}
 
 
 @dataclasses.dataclass(frozen=True)
-class Score:
-    """A mean and its 95 % interval; NaN where there is nothing to average."""
-
-    mean: float
-    low: float
-    high: float
-    count: int
+class Score(Estimate):
+    """A mean over so many episodes, or scenes, and its 95 % interval; NaN where there is nothing to average."""
 
     def __str__(self) -> str:
-        if not self.count:
+        if not self.runs:
             return "-"
         digits = 2 if abs(self.mean) < 10 else 0
         if np.isnan(self.low):
@@ -69,10 +64,10 @@ def where(rows: pa.Table, **wanted: str) -> pa.Table:
     return rows.filter(pa.array(kept))
 
 
-def over_scenes(rows: pa.Table, name: str) -> Estimate:
+def over_scenes(rows: pa.Table, name: str) -> Score:
     """Mean over scenes of their scores; scenes without any (RC where nothing succeeded) are left out."""
     means = (score(where(rows, scene=scene), name).mean for scene in _in_order(rows, "scene"))
-    return estimate(m for m in means if not np.isnan(m))
+    return Score(*dataclasses.astuple(estimate(m for m in means if not np.isnan(m))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,13 +94,8 @@ def summary(rows: pa.Table) -> list[Line]:
         if len(scenes) > 1:
             for group, part in parts.items():
                 if len(part):
-                    lines.append(Line(contender, group, len(part), {name: _mean(part, name) for name in SCORES}))
+                    lines.append(Line(contender, group, len(part), {name: over_scenes(part, name) for name in SCORES}))
     return lines
-
-
-def _mean(rows: pa.Table, name: str) -> Score:
-    found = over_scenes(rows, name)
-    return Score(found.mean, found.low, found.high, found.runs)
 
 
 def _in_order(rows: pa.Table, name: str) -> list[str]:
@@ -123,7 +113,7 @@ class Difference:
     def __str__(self) -> str:
         if isinstance(self.result, Contrast):
             return str(self.result)
-        return str(Score(self.result.mean, self.result.low, self.result.high, self.result.runs))
+        return str(Score(*dataclasses.astuple(self.result)))
 
 
 def differences(rows: pa.Table) -> list[Difference]:

@@ -67,7 +67,7 @@ def test_scores_by_hand():
             "within": 0.5,  # the third believed to be at the goal's node, 2 m away
         }
     )
-    assert [found[name].count for name in ("success", "rc")] == [4, 3]
+    assert [found[name].runs for name in ("success", "rc")] == [4, 3]
     # Wilson's interval of 3 in 4 (z = 1.96): centre (0.75 + z^2/8) / (1 + z^2/4).
     z = 1.959964
     centre, half = (0.75 + z**2 / 8) / (1 + z**2 / 4), z * math.sqrt(0.75 * 0.25 / 4 + z**2 / 64) / (1 + z**2 / 4)
