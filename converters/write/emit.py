@@ -350,7 +350,8 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
         assert visual is not None
         if look.mesh == name:
             mesh = visual.vertices, visual.faces, visual.uv, visual.uv_faces
-            digits = 3 if name == "structure" else 4, 3 if max(visual.image.shape) <= 256 else 4
+            small = name != "structure" and max(visual.image.shape) <= 256
+            digits = 3 if name == "structure" else 4, 3 if small else 4
             write_obj(assets / f"{name}_visual.obj", *mesh, *digits)
         if look.image == name:
             image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)

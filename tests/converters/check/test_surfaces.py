@@ -55,13 +55,14 @@ def test_a_scene_without_a_tables_top_fails_by_name(tiny_scene, tmp_path):
     data["alignment"][0]["drawn_area_share"] = 0.5
     (folder / "scene.json").write_text(json.dumps(data))
     path = folder / "assets" / "basket_0_visual.obj"
-    lines = path.read_text().splitlines()
-    points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
-    bottom = [
-        not line.startswith("f ") or points[[int(c.split("/")[0]) - 1 for c in line.split()[1:]], 2].max() < 0.01
-        for line in lines
-    ]
-    path.write_text("\n".join(line for line, stays in zip(lines, bottom, strict=True) if stays) + "\n")
+    lines = [line.split() for line in path.read_text().splitlines()]
+    points = np.array([words[1:] for words in lines if words[0] == "v"], float)
+    polygons = [words[1:] for words in lines if words[0] == "f"]
+    triangles = [(c[0], c[k], c[k + 1]) for c in polygons for k in range(1, len(c) - 1)]
+    bottom = [t for t in triangles if points[[int(c.split("/")[0]) - 1 for c in t], 2].max() < 0.01]
+    assert 0 < len(bottom) < len(triangles)
+    kept = [words for words in lines if words[0] != "f"] + [["f", *t] for t in bottom]
+    path.write_text("\n".join(map(" ".join, kept)) + "\n")
     gates = {gate.name: gate for gate in check_folder(folder)[1]}
     assert {name for name, gate in gates.items() if not gate.passed} == {"unseen_hulls", "surface_kept"}
     assert gates["unseen_hulls"].warnings == ("unseen_hulls: basket_0 is worst",)
