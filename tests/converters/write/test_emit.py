@@ -54,7 +54,7 @@ def test_equal_objects_share_their_files_and_keep_their_vertices(tmp_path):
         turned = np.concatenate([np.roll(corners, k, axis=1) for k in range(3)]).reshape(-1, 15)
         found = np.concatenate([drawn.vertices[drawn.faces], drawn.corner_uv], axis=2).reshape(-1, 15)
         far, index = KDTree(turned).query(found)
-        assert far.max() < 2e-3 and sorted(index % len(corners)) == list(range(len(corners)))
+        assert far.max() < 2e-3 and np.sort(np.asarray(index) % len(corners)).tolist() == list(range(len(corners)))
         assert (drawn.texture == visual.image).all()
         hull = geom_mesh(model, model.geom(f"{placed.name}_hull_0").id)[0]
         assert np.abs(np.sort(hull, axis=0) - np.sort(placed.hulls_b[0].vertices, axis=0)).max() < 2e-5
