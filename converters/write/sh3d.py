@@ -146,17 +146,19 @@ class _Export:
         self.low_m = min(WALL_M, 0.8 * max((w.height for w in self.walls), default=0.0))
         self.high = [w for w in self.walls if w.height > self.low_m]
         self.stands = shapely.union_all([w.polygon() for w in self.high])
-        told, hinged = ["left out: windows, colours of walls and floors, and masses"], 0
+        told, doors, pieces = ["left out: windows, colours of walls and floors, and masses"], 0, 0
         if len(self.high) < len(self.walls):
             told.append("built-in furniture is drawn as low walls")
         bodies = [b for b in self.spec.bodies if b.name in category]
         for body in bodies:
             mesh = self._mesh(body)
             hinge = mesh is not None and any(j.type == mujoco.mjtJoint.mjJNT_HINGE for j in body.joints)
-            hinged += hinge
             if mesh is None:
                 told.append(f"left out: {body.name}, which has no mesh to look at")
-            elif not (hinge and self._door(body, mesh)):
+            elif hinge and self._door(body, mesh):
+                doors += 1
+            else:
+                pieces += 1
                 self._piece(body, mesh, category[body.name])
                 told += [f"{body.name}: stands in no gap of a wall; drawn as a piece that does not turn"] * hinge
         every = shapely.union_all([w.polygon() for w in self.walls])
@@ -179,7 +181,7 @@ class _Export:
                 self._add("point", room, x=x, y=y)
         ElementTree.indent(self.root)
         self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
-        count = f"{len(self.walls)} walls, {len(rooms)} rooms, {hinged} doors, {len(bodies) - hinged} other things"
+        count = f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {pieces} other things"
         return [count, *told]
 
     def _mesh(self, body: Any) -> Mesh | None:

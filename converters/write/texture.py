@@ -183,6 +183,9 @@ def share_plain(visual: VisualMesh) -> VisualMesh:
 
     Args:
         visual: as baked; one with an image that is not square is left as it is.
+
+    Returns:
+        Vertices and faces as they were, with another `uv` and `uv_faces`, and an image of the same size.
     """
     side, faces = len(visual.image), np.arange(len(visual.faces))
     if visual.image.shape[1] != side or not len(faces):
@@ -199,8 +202,8 @@ def share_plain(visual: VisualMesh) -> VisualMesh:
     if not plain.any():
         return visual
     # Each colour is looked up in the largest of its faces.
-    order = np.lexsort([-np.bincount(face, minlength=len(faces))[plain]])
-    chosen = np.flatnonzero(plain)[order]
+    chosen = np.flatnonzero(plain)
+    chosen = chosen[np.argsort(-np.bincount(face, minlength=len(faces))[chosen], kind="stable")]
     _, first, of = np.unique(visual.image[row, column][chosen], axis=0, return_index=True, return_inverse=True)
     places = chosen[first]
     uv_faces = visual.uv_faces.copy()

@@ -80,7 +80,7 @@ class HomeConfig:
             raise GenerationError(f"artefacts is {self.artefacts!r}: expected one of {', '.join(ARTEFACTS)}{near}")
         if not 0.0 <= self.furniture_share <= MOST_SHARE:
             raise GenerationError(
-                f"furniture_share is {self.furniture_share}: expected 0 to {MOST_SHARE}, no home takes more"
+                f"furniture_share is {self.furniture_share}: expected 0 to {MOST_SHARE}, which the fullest homes take"
             )
         low, high = self.clutter_per_10_m2
         if not 0 <= low <= high:
@@ -92,7 +92,7 @@ class HomeConfig:
 
 
 MOST_SHARE = 0.37
-"""Largest `furniture_share`: what the fullest of homes of four rooms and more took."""
+"""Largest `furniture_share`: about what the fullest of homes of four rooms and more take."""
 TIERS: dict[str, dict[str, Any]] = {
     "furnished": {},
     "cluttered": {

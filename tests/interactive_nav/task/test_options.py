@@ -356,6 +356,8 @@ def test_a_setting_that_changes_nothing_is_refused(settings, message):
 
 
 def test_settings_that_say_what_holds_anyway_are_taken():
-    make_config(backend="native", active_furniture=0, threads=2)
-    make_config(active_furniture=3, contacts_per_env=50, threads=2)  # auto: for whichever it becomes
-    make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=20)
+    assert make_config(backend="native", active_furniture=0, threads=2).active_furniture == 0
+    either = make_config(active_furniture=3, contacts_per_env=50, threads=2)  # auto: for whichever it becomes
+    assert (either.active_furniture, either.contacts_per_env, either.threads) == (3, 50, 2)
+    seen = make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=20)
+    assert (seen.lidar_rays, seen.depth_noise, seen.image_size) == (3, 0.1, 20)
