@@ -191,6 +191,59 @@ class PhysicsConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
+class CameraNoise(Settings):
+    """Errors of cameras, drawn anew each step; 0: none. Formulas and sources: `docs/sensors.md`."""
+
+    rgb_exposure: NotNegative = 0.0
+    """Standard deviation of a frame's exposure, stops: its colours times 2 to that power, cut at 1."""
+    rgb_blur_px: Annotated[float, Bounds(0, 16)] = 0.0
+    """Standard deviation of a Gaussian blur, pixels."""
+    rgb_noise: NotNegative = 0.0
+    """Standard deviation of each colour of a pixel whatever it reads (read noise), of 1."""
+    rgb_shot_noise: NotNegative = 0.0
+    """Standard deviation at full brightness of the error that grows with the root of brightness (shot noise), of 1."""
+    rgb_dropout: Share = 0.0
+    """Share of pixels whose colour reads 0."""
+    depth_disparity_noise: NotNegative = 0.0
+    """Standard deviation of 1 / depth, 1/m: that of depth is this times its square (a Kinect's: 0.0014)."""
+    depth_disparity_step: NotNegative = 0.0
+    """Steps that 1 / depth is read in, 1/m (a Kinect's: 0.0028)."""
+    depth_grazing_deg: Annotated[float, Bounds(0, 90)] = 0.0
+    """Depth reads 0 on surfaces seen at less than this angle to them."""
+    depth_edge_m: NotNegative = 0.0
+    """Depth reads 0 where a pixel beside is nearer by more than this."""
+    depth_min_m: NotNegative = 0.0
+    """What is nearer reads 0."""
+    depth_max_m: NotNegative = 0.0
+    """What is farther reads 0; 0: no limit."""
+    frame_dropout: Share = 0.0
+    """Share of a camera's frames that are lost: all its images are 0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.depth_max_m <= self.depth_min_m:
+            raise ConfigError(f"depth_max_m is {self.depth_max_m}, expected more than depth_min_m ({self.depth_min_m})")
+
+
+KINECT: dict[str, Any] = {
+    "depth_disparity_noise": 0.0014,
+    "depth_disparity_step": 0.0028,
+    "depth_grazing_deg": 10.0,
+    "depth_edge_m": 0.1,
+    "depth_min_m": 0.5,
+    "depth_max_m": 5.0,
+}
+"""Settings of `CameraNoise` like the first Kinect (Khoshelham and Elberink 2012)."""
+
+
+_NOISE = {
+    part: " ".join([*own, *(f.name for f in dataclasses.fields(CameraNoise) if f.name.startswith(part))])
+    for part, own in {"depth": ("depth_range_m", "depth_dropout", "depth_noise"), "rgb": ()}.items()
+}
+"""Image -> the settings that act on it alone."""
+
+
+@dataclasses.dataclass(frozen=True)
 class SensorConfig(Settings):
     """What the robot perceives, and with how much noise."""
 
@@ -217,6 +270,8 @@ class SensorConfig(Settings):
     """Share of depth pixels that read 0, drawn anew each step."""
     depth_noise: NotNegative = 0.0
     """Standard deviation of depth, as a share of it."""
+    camera_noise: CameraNoise = flat(CameraNoise)
+    """Errors of cameras."""
     lidar_rays: AtLeastOne = 228
     """Beams of the planar scan, evenly over `lidar_fov_deg` from the right; by default the TurtleBot's Hokuyo."""
     lidar_fov_deg: Annotated[Positive, (0, 360)] = 240.0
@@ -233,10 +288,11 @@ class SensorConfig(Settings):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("image_size image_fov_deg image_dtype image_geometry renderer",
+        ("image_size image_fov_deg image_dtype image_geometry renderer frame_dropout",
          f"one of {', '.join(IMAGES)} among observations",
          lambda c: any(name in c.observations for name in IMAGES)),
-        ("depth_range_m depth_dropout depth_noise", "depth among observations", lambda c: "depth" in c.observations),
+        (_NOISE["depth"], "depth among observations", lambda c: "depth" in c.observations),
+        (_NOISE["rgb"], "rgb among observations", lambda c: "rgb" in c.observations),
         ("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar among observations",
          lambda c: "lidar" in c.observations),
         ("odometry_noise", "odometry among observations", lambda c: "odometry" in c.observations),

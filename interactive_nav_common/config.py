@@ -71,7 +71,7 @@ class Settings:
 
     IDLE: ClassVar[Sequence[tuple[str, str, Callable[[Any], bool]]]] = ()
     """Settings that change nothing but where something holds: their names, what, and the test of it. Where it does not,
-    they are refused unless they are 0 or their default."""
+    they are refused unless they are 0 or their default (of flat sections: 0)."""
 
     def __post_init__(self) -> None:
         for name, (section, hint) in _places(type(self)).items():
@@ -81,7 +81,7 @@ class Settings:
                 _check(name, getattr(self, name), hint)
         for names, needs, used in self.IDLE:
             for name in () if used(self) else names.split():
-                if (value := getattr(self, name)) not in (0, getattr(type(self), name)):
+                if (value := getattr(self, name)) not in (0, getattr(type(self), name, 0)):
                     told = f"{name} is {value!r}, which changes nothing here"
                     raise ConfigError(f"{told}: expected {needs}; or leave it out")
 

@@ -12,8 +12,9 @@ its keys named as Brax's networks for pixels want them:
 | `pixels/normals` | (H, W, 3): unit vectors, camera's frame (right, up, towards the viewer); 0 where nothing is met |
 
 Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded; normals are in [-1, 1], and f32 where others are u8.
-Noise is as in iGibson: a share of the readings drops out (depth reads 0, a beam 1), the others get a Gaussian error in
-proportion. It depends on the episode's key and the step alone.
+Cameras have the errors of `interactive_nav.sensing.noise`. Other noise is as in iGibson: a share of the readings drops
+out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It depends on the episode's key and the
+step alone.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.boxes import rotate
 from interactive_nav.sensing.mount import make_mount
+from interactive_nav.sensing.noise import disturbed
 from interactive_nav.sensing.observation import task_parts
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.types import NavInfo
@@ -69,7 +71,8 @@ class Sensors:
         self._joints = _own_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
         meshes = config.image_geometry == "meshes"
-        coloured = not meshes and bool({"rgb", "normals"} & set(self._images))
+        self._drawn = (*self._images, *(["normals"] if config.camera_noise.depth_grazing_deg else []))
+        coloured = not meshes and bool({"rgb", "normals"} & set(self._drawn))
         self.boxes = build_boxes(world, config.segmentation_classes, coloured)
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
@@ -115,7 +118,12 @@ class Sensors:
         if not self._images:
             return vector
         out = {"state": vector} if self.sizes else {}
-        seen = self.render(physics, nav)
+        seen = disturbed(
+            self._config.camera_noise,
+            self.lens,
+            self.render(physics, nav),
+            lambda name: stream(rng, name, nav.step_count),
+        )
         depth = jnp.clip(seen["depth"] / self._config.depth_range_m, 0.0, 1.0)
         ids = seen["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
         images = {**seen, "depth": self._noisy_depth(depth, nav, rng)[..., None], "segmentation": ids[..., None]}
@@ -129,12 +137,12 @@ class Sensors:
         return out
 
     def render(self, physics: PhysicsState, nav: NavInfo) -> dict[str, jax.Array]:
-        """What the robot's camera sees, without noise: the images that are observed, as `Renderer.images_batch` has
-        them, without its leading axis; depth and segmentation always."""
+        """What the robot's camera sees, without noise: the images that are observed or needed for it, as
+        `Renderer.images_batch` has them, without its leading axis; depth and segmentation always."""
         assert self.renderer is not None
         # A broken world's numbers must not reach the renderer's search tree.
         qpos = jnp.where(jnp.isfinite(physics.qpos), physics.qpos, 0.0)
-        return self.renderer.images(self._images, nav.scene_index, qpos, self.mount.pose(qpos))
+        return self.renderer.images(self._drawn, nav.scene_index, qpos, self.mount.pose(qpos))
 
     def odometry_error(self, rng: jax.Array, step_count: jax.Array) -> jax.Array:
         """(2,) relative errors of a step's distance and angle."""

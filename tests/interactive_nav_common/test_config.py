@@ -99,6 +99,10 @@ def test_what_types_do_not_allow_is_refused_in_words(settings, message):
 
 
 def test_no_two_sections_of_the_environment_have_a_setting_of_one_name():
-    parts = dataclasses.fields(NavConfig)
-    names = [field.name for part in parts for field in dataclasses.fields(getattr(NavConfig(), part.name))]
+    def names_of(section):
+        for field in dataclasses.fields(section):
+            value = getattr(section, field.name)
+            yield from names_of(value) if dataclasses.is_dataclass(value) else [field.name]
+
+    names = list(names_of(NavConfig()))
     assert len(set(names)) == len(names) == len(flatten(NavConfig()))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import interactive_nav
-from interactive_nav.config import NavConfig
+from interactive_nav.config import KINECT, NavConfig
 from interactive_nav.physics import PhysicsState
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
@@ -225,3 +225,20 @@ def test_no_sensor_uses_the_key_that_the_next_episode_is_drawn_from():
         np.testing.assert_array_equal(stream(key, name, step), jax.random.fold_in(base, 0))
     # What a small number does: the base of the depth's stream was the next episode's key.
     np.testing.assert_array_equal(jax.random.fold_in(key, 1), jax.random.split(key)[1])
+
+
+def test_a_noisy_camera_reads_anew_each_step_of_what_its_renderer_drew(world, moment):
+    images = {"observations": ("depth", "rgb"), "image_size": 32}
+    clean = sense(world, moment, **images)[1]
+    sensors, first = sense(world, moment, **images, **KINECT, rgb_noise=0.02)
+    z, read = (np.asarray(obs["pixels/depth"])[..., 0] * 5 for obs in (clean, first))
+    # Nearer than half a metre, seen at a grazing angle or behind an edge: a hole.
+    assert (read[(z > 0) & (z < 0.48)] == 0).all() and 0.1 < (read == 0).mean() < 0.9
+    kept = (read > 0) & (z < 3)
+    assert (np.abs(read - z)[kept] < 6 * 0.0014 * z[kept] ** 2 + 1e-3).all() and kept.any()
+    assert (read != z)[kept].mean() > 0.9
+    error = np.asarray(first["pixels/rgb"] - clean["pixels/rgb"])
+    assert error.std() == pytest.approx(0.02, rel=0.1)
+    physics, nav, rng = moment
+    later = jax.jit(sensors.observe)(physics, nav.replace(step_count=nav.step_count + 1), rng)
+    assert (np.asarray(later["pixels/rgb"]) != np.asarray(first["pixels/rgb"])).mean() > 0.9
