@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from interactive_nav_common.config import AtLeastOne, Bounds, Natural, NotNegative, Positive, Settings, Share, flat
+from interactive_nav.camera_config import CameraNoise, CameraView, FovDeg, ImageSide
+from interactive_nav_common.config import (
+    AtLeastOne,
+    Bounds,
+    Natural,
+    NotNegative,
+    Positive,
+    Settings,
+    Share,
+    flat,
+    overlay,
+)
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.categories import MaskClasses
 
@@ -190,52 +202,6 @@ class PhysicsConfig(Settings):
         return round(self.control_dt_s / self.sim_dt_s)
 
 
-@dataclasses.dataclass(frozen=True)
-class CameraNoise(Settings):
-    """Errors of cameras, drawn anew each step; 0: none. Formulas and sources: `docs/sensors.md`."""
-
-    rgb_exposure: NotNegative = 0.0
-    """Standard deviation of a frame's exposure, stops: its colours times 2 to that power, cut at 1."""
-    rgb_blur_px: Annotated[float, Bounds(0, 16)] = 0.0
-    """Standard deviation of a Gaussian blur, pixels."""
-    rgb_noise: NotNegative = 0.0
-    """Standard deviation of each colour of a pixel whatever it reads (read noise), of 1."""
-    rgb_shot_noise: NotNegative = 0.0
-    """Standard deviation at full brightness of the error that grows with the root of brightness (shot noise), of 1."""
-    rgb_dropout: Share = 0.0
-    """Share of pixels whose colour reads 0."""
-    depth_disparity_noise: NotNegative = 0.0
-    """Standard deviation of 1 / depth, 1/m: that of depth is this times its square (a Kinect's: 0.0014)."""
-    depth_disparity_step: NotNegative = 0.0
-    """Steps that 1 / depth is read in, 1/m (a Kinect's: 0.0028)."""
-    depth_grazing_deg: Annotated[float, Bounds(0, 90)] = 0.0
-    """Depth reads 0 on surfaces seen at less than this angle to them."""
-    depth_edge_m: NotNegative = 0.0
-    """Depth reads 0 where a pixel beside is nearer by more than this."""
-    depth_min_m: NotNegative = 0.0
-    """What is nearer reads 0."""
-    depth_max_m: NotNegative = 0.0
-    """What is farther reads 0; 0: no limit."""
-    frame_dropout: Share = 0.0
-    """Share of a camera's frames that are lost: all its images are 0."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if 0 < self.depth_max_m <= self.depth_min_m:
-            raise ConfigError(f"depth_max_m is {self.depth_max_m}, expected more than depth_min_m ({self.depth_min_m})")
-
-
-KINECT: dict[str, Any] = {
-    "depth_disparity_noise": 0.0014,
-    "depth_disparity_step": 0.0028,
-    "depth_grazing_deg": 10.0,
-    "depth_edge_m": 0.1,
-    "depth_min_m": 0.5,
-    "depth_max_m": 5.0,
-}
-"""Settings of `CameraNoise` like the first Kinect (Khoshelham and Elberink 2012)."""
-
-
 _NOISE = {
     part: " ".join([*own, *(f.name for f in dataclasses.fields(CameraNoise) if f.name.startswith(part))])
     for part, own in {"depth": ("depth_range_m", "depth_dropout", "depth_noise"), "rgb": ()}.items()
@@ -255,9 +221,11 @@ class SensorConfig(Settings):
     image_geometry: Literal["boxes", "meshes"] = "boxes"
     """What images show: the boxes that collide, or the visual meshes with their textures (drawn by Warp, on GPU and
     CPU, beside any physics)."""
-    image_size: AtLeastOne = 68
+    cameras: Sequence[Mapping[str, Any]] = ()
+    """Cameras in place of the robot's one, each a mapping of settings of `CameraView`."""
+    image_size: ImageSide = 68
     """Side of the square images, pixels."""
-    image_fov_deg: Annotated[float | None, Bounds(0, 180, open=True)] = None
+    image_fov_deg: FovDeg = None
     """Field of view; none: the robot's camera's (120 degrees)."""
     image_dtype: Literal["float32", "float16", "uint8"] = "float32"
     """Of images: float32 or float16 in [0, 1], or uint8, 255 times that; normals are in [-1, 1] and never uint8."""
@@ -288,7 +256,7 @@ class SensorConfig(Settings):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("image_size image_fov_deg image_dtype image_geometry renderer frame_dropout",
+        ("cameras image_size image_fov_deg image_dtype image_geometry renderer frame_dropout",
          f"one of {', '.join(IMAGES)} among observations",
          lambda c: any(name in c.observations for name in IMAGES)),
         (_NOISE["depth"], "depth among observations", lambda c: "depth" in c.observations),
@@ -307,6 +275,18 @@ class SensorConfig(Settings):
         if len(self.lidar_pos_m) != 3:
             raise ConfigError(f"lidar_pos_m is {self.lidar_pos_m!r}, expected three numbers")
         super().__post_init__()
+        names = [view.name for view in self.views]
+        if self.cameras and (len(set(names)) < len(names) or not all(name.isidentifier() for name in names)):
+            raise ConfigError(f"cameras have the names {names}, expected a different one for each, a word as front")
+
+    @property
+    def views(self) -> tuple[CameraView, ...]:
+        """The cameras; where none are listed, the robot's, without a name.
+
+        Raises:
+            ConfigError: `cameras` has an unknown setting or an impossible value.
+        """
+        return tuple(overlay(CameraView(), view, "cameras") for view in self.cameras) or (CameraView(),)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,7 +70,7 @@ def observation_space_of(env: InteractiveNav) -> spaces.Space:
     def box(name: str, x: Any) -> spaces.Box:
         image, dtype = name.startswith("pixels/"), np.dtype(x.dtype)
         high = 255 if dtype == np.uint8 else 1.0 if image else np.inf
-        low = -1.0 if name == "pixels/normals" else 0 if image else -np.inf
+        low = -1.0 if name.endswith("/normals") else 0 if image else -np.inf
         return spaces.Box(low, high, x.shape, dtype.type)
 
     if isinstance(obs, Mapping):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 import functools
 import math
@@ -91,6 +92,12 @@ class Renderer(abc.ABC):
     name: str
     lens: Lens
     tables: BoxTables
+
+    def through(self, lens: Lens) -> Renderer:
+        """What draws the same through another lens; what does not depend on that is shared."""
+        other = copy.copy(self)
+        other.lens = lens
+        return other
 
     @abc.abstractmethod
     def render_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:

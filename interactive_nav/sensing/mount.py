@@ -64,13 +64,14 @@ class Mount:
         return look_along(where, rotate(axes, constant(self.forward_b)))
 
 
-def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera) -> Mount:
+def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera, yaw_rad: float = 0.0) -> Mount:
     """Finds the chain of bodies from a robot's base to its camera.
 
     Args:
         model: with the robot.
         base_body: the body with the free joint.
         camera: its body lies in the base's subtree.
+        yaw_rad: how far it looks to the left of its body's x axis.
 
     Raises:
         ConfigError: no such body, or one that is not part of the robot.
@@ -93,9 +94,10 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera) -> Mo
             joints.append((bool(slides), address, zero, model.jnt_axis[j].copy(), model.jnt_pos[j].copy()))
         links.append(_Link(model.body_pos[body].copy(), matrix_from_quat(model.body_quat[body]), tuple(joints)))
         body = model.body_parentid[body]
+    cos = math.cos(camera.pitch_rad)
     return Mount(
         base_qpos=int(model.jnt_qposadr[model.body_jntadr[base]]),
         links=tuple(reversed(links)),
         pos_b=np.asarray(camera.pos_m, float),
-        forward_b=np.array([math.cos(camera.pitch_rad), 0.0, -math.sin(camera.pitch_rad)]),
+        forward_b=np.array([cos * math.cos(yaw_rad), cos * math.sin(yaw_rad), -math.sin(camera.pitch_rad)]),
     )

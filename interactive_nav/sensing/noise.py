@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.config import CameraNoise
+from interactive_nav.camera_config import CameraNoise
 from interactive_nav.sensing.base import Lens
 
 KeyOf = Callable[[str], jax.Array]

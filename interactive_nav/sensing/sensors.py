@@ -11,6 +11,8 @@ its keys named as Brax's networks for pixels want them:
 | `pixels/rgb` | (H, W, 3): colour in [0, 1] |
 | `pixels/normals` | (H, W, 3): unit vectors, camera's frame (right, up, towards the viewer); 0 where nothing is met |
 
+With several cameras (`cameras`) the keys are `pixels/<camera>/depth` and so on.
+
 Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded; normals are in [-1, 1], and f32 where others are u8.
 Cameras have the errors of `interactive_nav.sensing.noise`. Other noise is as in iGibson: a share of the readings drops
 out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It depends on the episode's key and the
@@ -19,6 +21,8 @@ step alone.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import zlib
 
 import jax
@@ -26,12 +30,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.config import IMAGES, NavConfig
+from interactive_nav.config import IMAGES, NavConfig, SensorConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.boxes import rotate
-from interactive_nav.sensing.mount import make_mount
+from interactive_nav.sensing.mount import Mount, make_mount
 from interactive_nav.sensing.noise import disturbed
 from interactive_nav.sensing.observation import task_parts
 from interactive_nav.sensing.rays import cast_fan
@@ -50,6 +54,17 @@ def stream(rng: jax.Array, name: str, step_count: jax.Array) -> jax.Array:
     do: `fold_in(key, 1)` is `split(key)[1]`, which the next episode is drawn from.
     """
     return jax.random.fold_in(jax.random.fold_in(rng, zlib.crc32(name.encode())), step_count)
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorCamera:
+    """A camera of the robot's, and what draws for it."""
+
+    prefix: str
+    """Of its images' names: empty for the robot's own, else its name and a slash."""
+    mount: Mount
+    lens: Lens
+    renderer: Renderer
 
 
 class Sensors:
@@ -78,6 +93,7 @@ class Sensors:
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
         drawn = self.boxes, self.lens, config.renderer, backend, world if meshes else None
         self.renderer = make_renderer(*drawn) if self._images else None
+        self.cameras = _cameras(world, config, self.renderer) if self.renderer else ()
         angles = -0.5 * config.lidar_fov_deg + np.arange(config.lidar_rays) * config.lidar_fov_deg / config.lidar_rays
         beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
         self._beams_b = np.stack(beams, -1).astype(np.float32)
@@ -100,11 +116,12 @@ class Sensors:
         length = sum(self.sizes.values())
         if not self._images:
             return length
-        side = self._config.image_size
         shapes: dict[str, tuple[int, ...]] = {"state": (length,)} if length else {}
-        return shapes | {
-            f"pixels/{name}": (side, side, 3 if name in ("rgb", "normals") else 1) for name in self._images
-        }
+        for camera in self.cameras:
+            side = camera.lens.height, camera.lens.width
+            own = {name: (*side, 3 if name in ("rgb", "normals") else 1) for name in self._images}
+            shapes |= {f"pixels/{camera.prefix}{name}": shape for name, shape in own.items()}
+        return shapes
 
     def observe(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array | dict[str, jax.Array]:
         """The observation of one environment.
@@ -118,31 +135,38 @@ class Sensors:
         if not self._images:
             return vector
         out = {"state": vector} if self.sizes else {}
-        seen = disturbed(
-            self._config.camera_noise,
-            self.lens,
-            self.render(physics, nav),
-            lambda name: stream(rng, name, nav.step_count),
-        )
-        depth = jnp.clip(seen["depth"] / self._config.depth_range_m, 0.0, 1.0)
-        ids = seen["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
-        images = {**seen, "depth": self._noisy_depth(depth, nav, rng)[..., None], "segmentation": ids[..., None]}
-        dtype = jnp.dtype(self._config.image_dtype)
-        whole = dtype == jnp.uint8
-        for name in self._images:
-            if name == "normals":
-                out[f"pixels/{name}"] = images[name].astype(jnp.float32 if whole else dtype)
-            else:
-                out[f"pixels/{name}"] = (jnp.round(255.0 * images[name]) if whole else images[name]).astype(dtype)
+        for camera in self.cameras:
+            out |= self._pixels(camera, physics, nav, rng)
         return out
 
-    def render(self, physics: PhysicsState, nav: NavInfo) -> dict[str, jax.Array]:
-        """What the robot's camera sees, without noise: the images that are observed or needed for it, as
+    def _pixels(self, camera: SensorCamera, physics: PhysicsState, nav: NavInfo, rng: jax.Array):
+        """What one camera adds to the observation."""
+        config, out = self._config, {}
+
+        def key_of(name: str) -> jax.Array:
+            return stream(rng, f"{camera.prefix}{name}", nav.step_count)
+
+        seen = disturbed(config.camera_noise, camera.lens, self.render(physics, nav, camera), key_of)
+        depth = jnp.clip(seen["depth"] / config.depth_range_m, 0.0, 1.0)
+        depth = _noisy(depth, config.depth_noise, config.depth_dropout, 0.0, key_of("depth"))
+        ids = seen["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
+        images = {**seen, "depth": depth[..., None], "segmentation": ids[..., None]}
+        dtype = jnp.dtype(config.image_dtype)
+        whole = dtype == jnp.uint8
+        for name in self._images:
+            key = f"pixels/{camera.prefix}{name}"
+            if name == "normals":
+                out[key] = images[name].astype(jnp.float32 if whole else dtype)
+            else:
+                out[key] = (jnp.round(255.0 * images[name]) if whole else images[name]).astype(dtype)
+        return out
+
+    def render(self, physics: PhysicsState, nav: NavInfo, camera: SensorCamera) -> dict[str, jax.Array]:
+        """What a camera sees, without noise: the images that are observed or needed for it, as
         `Renderer.images_batch` has them, without its leading axis; depth and segmentation always."""
-        assert self.renderer is not None
         # A broken world's numbers must not reach the renderer's search tree.
         qpos = jnp.where(jnp.isfinite(physics.qpos), physics.qpos, 0.0)
-        return self.renderer.images(self._drawn, nav.scene_index, qpos, self.mount.pose(qpos))
+        return camera.renderer.images(self._drawn, nav.scene_index, qpos, camera.mount.pose(qpos))
 
     def odometry_error(self, rng: jax.Array, step_count: jax.Array) -> jax.Array:
         """(2,) relative errors of a step's distance and angle."""
@@ -186,9 +210,21 @@ class Sensors:
         key = stream(rng, "lidar", nav.step_count)
         return _noisy(scan, config.lidar_noise, config.lidar_dropout, 1.0, key)
 
-    def _noisy_depth(self, depth: jax.Array, nav: NavInfo, rng: jax.Array) -> jax.Array:
-        key = stream(rng, "depth", nav.step_count)
-        return _noisy(depth, self._config.depth_noise, self._config.depth_dropout, 0.0, key)
+
+def _cameras(world: World, config: SensorConfig, renderer: Renderer) -> tuple[SensorCamera, ...]:
+    """The cameras that are asked for; those of one lens share a renderer."""
+    own, drawn = world.robot.camera, {renderer.lens: renderer}
+    out = []
+    for view in config.views:
+        side = view.size or config.image_size
+        lens = Lens(side, side, view.fov_deg or config.image_fov_deg or own.fov_deg)
+        if lens not in drawn:
+            drawn[lens] = renderer.through(lens)
+        pitch = own.pitch_rad if view.pitch_deg is None else math.radians(view.pitch_deg)
+        seat = dataclasses.replace(own, pos_m=view.pos_m or own.pos_m, pitch_rad=pitch)
+        mount = make_mount(world.models[0], world.robot.base_body, seat, math.radians(view.yaw_deg))
+        out.append(SensorCamera(f"{view.name}/" if view.name else "", mount, lens, drawn[lens]))
+    return tuple(out)
 
 
 def _noisy(reading: jax.Array, noise: float, dropout: float, lost: float, key: jax.Array) -> jax.Array:

@@ -39,6 +39,9 @@ class WarpRenderer(BoxRenderer):
         self._model = uncommitted(mjx.put_model(self._host, impl="warp"))
         self._contexts: dict[int, object] = {}
 
+    def through(self, lens):
+        return WarpRenderer(self.tables, lens)
+
     def _context(self, n: int):
         if n not in self._contexts:
             gpus = [d for d in jax.local_devices() if d.platform == "gpu"]

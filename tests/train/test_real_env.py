@@ -108,14 +108,14 @@ def test_a_policy_that_sees_trains_and_is_scored(tmp_path, capsys):
         episode_steps=6,
         num_objects=1,
         observations=("waypoints", "goal", "velocity", "depth", "segmentation"),
-        image_size=12,
+        image_size=32,
         image_dtype="uint8",
     )
     config = TrainConfig(env=env, network=SMALL, ppo=toy.ppo, run=toy.run)
     result, folder, _ = train_run(config, Console(file=io.StringIO()))
     assert result.completed
     meta = checkpoint.list_checkpoints(folder.checkpoints)[-1]
-    images = {"pixels/depth": [12, 12, 1], "pixels/segmentation": [12, 12, 1]}
+    images = {"pixels/depth": [32, 32, 1], "pixels/segmentation": [32, 32, 1]}
     assert meta.observation_size == {"state": [29], **images}
     assert evaluate.main([str(folder.path), "--episodes", "2", "--policies", "learned,follower"]) == 0
     rows = pq.read_table(folder.path / "evaluation" / "episodes.parquet").to_pydict()
@@ -123,8 +123,8 @@ def test_a_policy_that_sees_trains_and_is_scored(tmp_path, capsys):
     assert (np.array(rows["nonfinite"]) == 0).all()
     # Another eye does not fit what was learned.
     capsys.readouterr()
-    assert evaluate.main([str(folder.path), "--episodes", "2", "env.image_size=16"]) == 2
-    assert "observation size of the checkpoint: {'state': [29], 'pixels/depth': [12, 12, 1]" in capsys.readouterr().err
+    assert evaluate.main([str(folder.path), "--episodes", "2", "env.image_size=36"]) == 2
+    assert "observation size of the checkpoint: {'state': [29], 'pixels/depth': [32, 32, 1]" in capsys.readouterr().err
 
 
 def test_a_run_that_cannot_begin_leaves_no_folder(tmp_path, capsys):

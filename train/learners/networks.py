@@ -154,8 +154,12 @@ class TwinHead(linen.Module):
 
 
 def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
-    """Raises ConfigError where the images are too small for the convolutions."""
+    """Raises ConfigError where the images are too small for the convolutions, or of several sizes."""
     sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)} if isinstance(size, Mapping) else ()
+    if len(sides) > 1:
+        raise ConfigError(
+            f"images have sides of {sorted(sides)} pixels, expected one size of all cameras (env.cameras)"
+        )
     for side in sides:
         left = side
         for kernel, stride in zip(config.conv_kernels, config.conv_strides, strict=True):

@@ -232,15 +232,15 @@ def test_gymnasiums_statistics_wrapper_counts_our_episodes(same_step):
 
 @pytest.mark.parametrize(("dtype", "high"), [("float32", 1.0), ("float16", 1.0), ("uint8", 255)])
 def test_images_are_bounded_in_their_own_type(room, dtype, high):
-    env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0, image_size=8, image_dtype=dtype,
+    env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0, image_size=32, image_dtype=dtype,
                                observations=("goal", "depth", "segmentation", "rgb", "normals"))  # fmt: skip
     space = gym_env.observation_space_of(env)
     assert isinstance(space, gymnasium.spaces.Dict)
     for name in ("pixels/depth", "pixels/segmentation"):
-        assert space[name] == gymnasium.spaces.Box(0, high, (8, 8, 1), np.dtype(dtype).type)
-    assert space["pixels/rgb"] == gymnasium.spaces.Box(0, high, (8, 8, 3), np.dtype(dtype).type)
+        assert space[name] == gymnasium.spaces.Box(0, high, (32, 32, 1), np.dtype(dtype).type)
+    assert space["pixels/rgb"] == gymnasium.spaces.Box(0, high, (32, 32, 3), np.dtype(dtype).type)
     signed = np.float16 if dtype == "float16" else np.float32
-    assert space["pixels/normals"] == gymnasium.spaces.Box(-1.0, 1.0, (8, 8, 3), signed)
+    assert space["pixels/normals"] == gymnasium.spaces.Box(-1.0, 1.0, (32, 32, 3), signed)
     assert space["state"] == gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
 
 

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from interactive_nav.config import KINECT, CameraNoise, NavConfig
+from interactive_nav.camera_config import KINECT, CameraNoise
+from interactive_nav.config import NavConfig
 from interactive_nav.sensing.base import Lens
 from interactive_nav.sensing.noise import blurred, disturbed, noisy_depth
 from interactive_nav_common.errors import ConfigError

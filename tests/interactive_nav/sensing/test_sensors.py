@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import interactive_nav
-from interactive_nav.config import KINECT, NavConfig
+from interactive_nav.camera_config import KINECT
+from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
@@ -24,6 +25,7 @@ from interactive_nav.types import NavInfo
 from interactive_nav_common.errors import UserError
 
 YAW = 0.3
+SEES = {"observations": ("depth",)}
 ALL = ("goal", "velocity", "waypoints", "localisation", "odometry", "collision", "joints", "lidar")
 
 
@@ -106,16 +108,16 @@ def test_images_have_the_keys_and_numbers_that_learners_expect(world, moment):
 @pytest.mark.parametrize(("dtype", "unit"), [("float32", 1), ("float16", 1), ("uint8", 255)])
 def test_colours_and_normals_stand_beside_the_other_images(world, moment, dtype, unit):
     names = ("depth", "segmentation", "rgb", "normals")
-    sensors, obs = sense(world, moment, observations=names, image_dtype=dtype, image_size=20)
-    assert sensors.observation_size == {f"pixels/{n}": (20, 20, 3 if n in names[2:] else 1) for n in names}
+    sensors, obs = sense(world, moment, observations=names, image_dtype=dtype, image_size=32)
+    assert sensors.observation_size == {f"pixels/{n}": (32, 32, 3 if n in names[2:] else 1) for n in names}
     assert {name: value.shape for name, value in obs.items()} == sensors.observation_size
     assert obs["pixels/rgb"].dtype == jnp.dtype(dtype)
     # Normals have signs: they are never u8.
     assert obs["pixels/normals"].dtype == (jnp.float32 if unit == 255 else jnp.dtype(dtype))
     # Bottom row, middle: the floor, lit by the sun alone.
-    np.testing.assert_allclose(obs["pixels/normals"][-1, 10], [0, 1, 0], atol=1e-3)
+    np.testing.assert_allclose(obs["pixels/normals"][-1, 16], [0, 1, 0], atol=1e-3)
     light = 0.45 + 0.4 * 0.9 / math.hypot(0.35, 0.25, 0.9)
-    got = np.asarray(obs["pixels/rgb"][-1, 10], np.float32) / unit
+    got = np.asarray(obs["pixels/rgb"][-1, 16], np.float32) / unit
     np.testing.assert_allclose(got, light * np.array(FLOOR_COLOUR), atol=0.5 / 255 + 1e-6)
 
 
@@ -163,7 +165,7 @@ def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
         backend="native",
         num_objects=1,
         episode_steps=3,
-        image_size=20,
+        image_size=32,
         observations=("goal", "odometry", "collision", "depth", "segmentation"),
     )
     auto, drawn = AutoResetEnv(env), []
@@ -205,6 +207,14 @@ def test_a_batched_loop_draws_once_a_step_and_shows_new_episodes(room):
         ({"depth_dropout": 1.5}, "depth_dropout is 1.5, expected between 0 and 1"),
         ({"lidar_pos_m": (0.0, 0.1)}, "lidar_pos_m is .*, expected three numbers"),
         ({"image_fov_deg": 180.0}, "image_fov_deg is 180.0"),
+        ({"image_size": 31}, "image_size is 31, expected between 32 and 512"),
+        ({"cameras": [{"name": "left"}]}, "cameras is .*, which changes nothing here: expected one of depth"),
+        ({"cameras": [{}], **SEES}, r"cameras have the names \[''\], expected a different one for each"),
+        ({"cameras": [{"name": "a"}, {"name": "a"}], **SEES}, r"cameras have the names \['a', 'a'\], expected a diff"),
+        ({"cameras": [{"name": "a", "size": 600}], **SEES}, "cameras: size is 600, expected between 32 and 512"),
+        ({"cameras": [{"name": "a", "yaw": 9}], **SEES}, "cameras: unknown key 'yaw', did you mean 'yaw_deg'"),
+        ({"cameras": [{"name": "a", "pos_m": [1]}], **SEES}, "cameras: pos_m is .1.0,., expected three numbers"),
+        ({"cameras": ["left"], **SEES}, "cameras: .* got 'left' .str., expected a mapping of settings"),
         ({"renderer": "opengl"}, "renderer is 'opengl', expected one of auto, warp, rays"),
     ],
 )
@@ -242,3 +252,29 @@ def test_a_noisy_camera_reads_anew_each_step_of_what_its_renderer_drew(world, mo
     physics, nav, rng = moment
     later = jax.jit(sensors.observe)(physics, nav.replace(step_count=nav.step_count + 1), rng)
     assert (np.asarray(later["pixels/rgb"]) != np.asarray(first["pixels/rgb"])).mean() > 0.9
+
+
+def test_several_cameras_look_each_its_own_way_with_its_own_lens(world, moment):
+    images = {"observations": ("depth", "rgb", "goal"), "image_size": 33}
+    alone = sense(world, moment, **images)[1]
+    cameras = [
+        {"name": "front"},
+        {"name": "left", "yaw_deg": 90, "fov_deg": 60, "size": 49},
+        {"name": "back", "yaw_deg": 180.0, "pitch_deg": 0, "pos_m": [0.0, 0.0, 0.5]},
+    ]
+    sensors, obs = sense(world, moment, **images, cameras=cameras)
+    sides = {"front": 33, "left": 49, "back": 33}
+    shapes = {f"pixels/{c}/{n}": (s, s, k) for c, s in sides.items() for n, k in (("depth", 1), ("rgb", 3))}
+    assert {name: value.shape for name, value in obs.items()} == sensors.observation_size == {"state": (3,), **shapes}
+    for name in ("depth", "rgb"):
+        np.testing.assert_array_equal(obs[f"pixels/front/{name}"], alone[f"pixels/{name}"])
+    # The robot's camera is 0.087 m behind and 0.0125 m right of (-1, 0.2), yaw 0.3; walls are x = +/- 2, y = +/- 1.5.
+    s, c = math.sin(YAW), math.cos(YAW)
+    left_m = (1.5 - (0.2 - 0.087 * s - 0.0125 * c)) / c
+    assert float(obs["pixels/left/depth"][24, 24, 0]) * 5 == pytest.approx(left_m, abs=1e-3)
+    assert float(obs["pixels/back/depth"][16, 16, 0]) * 5 == pytest.approx(1.0 / c, abs=1e-3)
+    # One pixel up and aside of the middle, through a lens of 60 degrees: farther along the ray, as deep along the axis.
+    assert sensors.cameras[1].lens.fov_deg == 60 and sensors.cameras[0].renderer is sensors.cameras[2].renderer
+    noisy = sense(world, moment, **images, cameras=cameras, depth_dropout=0.5)[1]
+    lost = [np.asarray(noisy[f"pixels/{name}/depth"] == 0)[16, :33] for name in sides]
+    assert (lost[0] != lost[2]).any()

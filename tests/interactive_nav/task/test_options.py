@@ -325,12 +325,12 @@ def test_desks_are_tables_in_the_mask_unless_five_classes_are_asked_for(tmp_path
     scene = write_room(tmp_path / "desks", (4.0, 3.0), blocks)
     found: tuple[tuple[MaskClasses, set[int]], ...] = ((4, {0, 4}), (5, {0, 4, 11}), ("all", {0, 3, 6}))
     for classes, ids in found:
-        env = make(scene, observations=("segmentation",), segmentation_classes=classes, image_size=20)
+        env = make(scene, observations=("segmentation",), segmentation_classes=classes, image_size=32)
         state = jax.jit(jax.vmap(env.reset_to))(start(), jax.random.split(jax.random.PRNGKey(0), N))
         mask = np.asarray(state.obs["pixels/segmentation"])[0, ..., 0] * SEGMENTATIONS[classes].divisor
         assert set(np.round(mask).astype(int).ravel()) == ids
         if classes == 5:  # y to the left: the desk is in the left half of the picture
-            assert (np.round(mask) == 11)[:, :10].any() and not (np.round(mask) == 11)[:, 10:].any()
+            assert (np.round(mask) == 11)[:, :16].any() and not (np.round(mask) == 11)[:, 16:].any()
 
 
 @pytest.mark.parametrize(
@@ -359,5 +359,5 @@ def test_settings_that_say_what_holds_anyway_are_taken():
     assert make_config(backend="native", active_furniture=0, threads=2).active_furniture == 0
     either = make_config(active_furniture=3, contacts_per_env=50, threads=2)  # auto: for whichever it becomes
     assert (either.active_furniture, either.contacts_per_env, either.threads) == (3, 50, 2)
-    seen = make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=20)
-    assert (seen.lidar_rays, seen.depth_noise, seen.image_size) == (3, 0.1, 20)
+    seen = make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=32)
+    assert (seen.lidar_rays, seen.depth_noise, seen.image_size) == (3, 0.1, 32)
