@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 from interactive_nav.camera_config import CameraNoise, CameraView, FovDeg, ImageSide
 from interactive_nav_common.config import (
     AtLeastOne,
-    Bounds,
     Natural,
     NotNegative,
     Positive,

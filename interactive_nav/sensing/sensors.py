@@ -93,7 +93,7 @@ class Sensors:
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
         drawn = self.boxes, self.lens, config.renderer, backend, world if meshes else None
         self.renderer = make_renderer(*drawn) if self._images else None
-        self.cameras = _cameras(world, config, self.renderer) if self.renderer else ()
+        self.cameras: tuple[SensorCamera, ...] = _cameras(world, config, self.renderer) if self.renderer else ()
         angles = -0.5 * config.lidar_fov_deg + np.arange(config.lidar_rays) * config.lidar_fov_deg / config.lidar_rays
         beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
         self._beams_b = np.stack(beams, -1).astype(np.float32)
