@@ -10,6 +10,7 @@ import io
 import math
 import xml.etree.ElementTree as ElementTree
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +22,15 @@ from PIL import Image
 from converters.geometry.boxes import convex_hull
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.homes.sh3d import OURS
+from converters.read.homes.sh3d_models import HULLS
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION
 from converters.structure.walls import cover_rectangles
+from converters.write.sh3d_rooms import rooms_of
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
-from scenes_mjcf.schema import load_manifest
+from scenes_mjcf.schema import SceneMaps, load_manifest, load_maps
 
 WALL_M = 1.8
 """What is built in and lower is furniture or a parapet: it bounds no room."""
@@ -46,6 +49,10 @@ WALL, FLOOR = "FFEDEAE4", "FFC8B9A0"
 LEAF = "sweethome3d_opening_on_hinge_1"
 
 
+Place = Callable[[np.ndarray], np.ndarray]
+"""(n, 3) points in one frame -> in another."""
+
+
 class Wall(NamedTuple):
     """A straight wall, m."""
 
@@ -59,12 +66,14 @@ class Wall(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """What shows a body: (n, 3) vertices (body frame, m), the OBJ's other lines, its texture, and the names of both."""
+    """What shows a body: (n, 3) vertices (body frame, m), the OBJ's other lines, its texture, the names of both."""
 
     vertices: np.ndarray
     rest: str
     image: bytes
     key: tuple[str, str]
+    hulls: list[np.ndarray]
+    """(n, 3) vertices of each, as the mesh's."""
 
 
 def export_sh3d(folder: Path, target: Path) -> list[str]:
@@ -84,7 +93,7 @@ def export_sh3d(folder: Path, target: Path) -> list[str]:
         state = "exists" if target.exists() else "has another ending"
         raise FileError(f"{target}: {state}, expected a new file that ends in .sh3d; choose another name")
     drawing = _Export(folder, manifest.name, manifest.licence)
-    told = drawing.fill({o.name: o.category for o in manifest.objects})
+    told = drawing.fill({o.name: o.category for o in manifest.objects}, load_maps(folder))
     with whole_file(target) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in drawing.files.items():
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED)
@@ -139,7 +148,7 @@ class _Export:
         text = {k: f"{v:.5f}" if isinstance(v, float) else str(v) for k, v in words.items()}
         return ElementTree.SubElement(self.root if parent is None else parent, tag, text)
 
-    def fill(self, category: dict[str, str]) -> list[str]:
+    def fill(self, category: dict[str, str], maps: SceneMaps) -> list[str]:
         """All of it; what there is and what is left out, a line each."""
         geoms = [g for g in self.spec.geoms if g.name.startswith("wall_")]
         self.walls = merged_walls([(np.array(g.pos), np.array(g.size), _yaw(g.quat)) for g in geoms])
@@ -170,10 +179,13 @@ class _Export:
             words = {"height": 100 * wall.height, "thickness": 100 * (wall.thickness - 2 * IN_M), "pattern": "hatchUp"}
             words |= {"leftSideColor": WALL, "rightSideColor": WALL}
             self._add("wall", id=f"wall{k}", xStart=x0, yStart=y0, xEnd=x1, yEnd=y1, **words)
-        high = (w.polygon() for w in self.walls if w.height > self.low_m)
-        stands = shapely.union_all([p.buffer(1e-4, join_style="mitre") for p in high])
-        holes = (shapely.Polygon(ring) for part in shapely.get_parts(stands) for ring in part.interiors)
-        rooms = [hole.simplify(1e-3) for hole in holes if hole.area > ROOM_M2]
+        low, high = (
+            shapely.union_all([w.polygon() for w in self.walls if (w.height > self.low_m) == tall])
+            for tall in (False, True)
+        )
+        across = any(abs(math.remainder(_yaw(g.quat), math.pi / 2)) > 1e-3 for g in geoms)
+        stands = high.buffer(1e-4, join_style="mitre")
+        rooms = rooms_of(maps, low, stands, ROOM_M2, maps.resolution_m if across else 0.0)
         for k, plan in enumerate(rooms):
             words = {"areaVisible": "true", "floorColor": FLOOR, "ceilingVisible": "false"}
             room = self._add("room", id=f"room{k}", name=f"Room {k + 1}", **words)
@@ -191,13 +203,15 @@ class _Export:
             return None
         path = self.folder
         try:
-            mesh = self.spec.mesh(geom.meshname)
+            solid = [self.spec.mesh(g.meshname) for g in body.geoms if g.name.startswith(f"{body.name}_hull_")]
+            clouds, rows = [], []
+            for mesh in (*solid, self.spec.mesh(geom.meshname)):
+                path = self.folder / self.spec.meshdir / mesh.file
+                rows = path.read_text(encoding="ascii").splitlines()
+                clouds.append(np.array([row.split()[1:4] for row in rows if row[:2] == "v "], float) * mesh.scale)
+                if clouds[-1].ndim != 2 or not np.isfinite(clouds[-1]).all():
+                    raise ValueError("has no vertices")
             look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]
-            path = self.folder / self.spec.meshdir / mesh.file
-            rows = path.read_text(encoding="ascii").splitlines()
-            vertices = np.array([row.split()[1:4] for row in rows if row[:2] == "v "], float) * mesh.scale
-            if vertices.ndim != 2 or not np.isfinite(vertices).all():
-                raise ValueError("has no vertices")
             path = self.folder / self.spec.texturedir / self.spec.texture(look).file
             data = path.read_bytes()
             Image.open(io.BytesIO(data)).verify()
@@ -206,23 +220,27 @@ class _Export:
             why = f"not readable ({reason}), {body.name} needs it"
             raise SceneRejected(f"{path}: {why}; convert the scene again") from None
         rest = "\n".join(row for row in rows if row[:2] in ("vt", "f "))
-        return Mesh(vertices, rest, data, (f"{mesh.file} {mesh.scale}", look))
+        return Mesh(clouds.pop(), rest, data, (f"{mesh.file} {mesh.scale}", look), clouds)
 
-    def _model(
-        self, key: Any, vertices: np.ndarray, mesh: Mesh, group: str = "piece", frame: np.ndarray | None = None
-    ) -> str:
-        """Entry of a model, written once, of vertices in a frame that is z up and corners of a door frame's bars."""
+    def _model(self, key: Any, place: Place, mesh: Mesh, group: str = "piece", frame: np.ndarray | None = None) -> str:
+        """Entry of a model, written once, of a mesh placed in a frame that is z up and a door frame's bars' corners."""
         if key in self.models:
             return self.models[key]
-        number = len(self.models) + 1
+        number, vertices = len(self.models) + 1, place(mesh.vertices)
         bars = [] if frame is None else [convex_hull(bar) for bar in frame]
-        points = 100 * np.vstack([vertices, *(bar.vertices for bar in bars)]) @ Y_UP_TO_Z_UP + 0.0
-        text = "mtllib model.mtl\n" + "".join(f"v {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in points)
+        text = "mtllib model.mtl\n" + _lines(np.vstack([vertices, *(bar.vertices for bar in bars)]))
         text += f"g {group}\nusemtl look\n{mesh.rest}\n" + ("g frame\nusemtl frame\n" if bars else "")
         first = len(vertices) + 1
         for bar in bars:
             text += "".join(f"f {a} {b} {c}\n" for a, b, c in bar.faces + first)
             first += len(bar.vertices)
+        solid, first = "", 1
+        for k, hull in enumerate(convex_hull(place(points)) for points in mesh.hulls):
+            solid += f"g hull_{k}\n" + _lines(hull.vertices)
+            solid += "".join(f"f {a} {b} {c}\n" for a, b, c in hull.faces + first)
+            first += len(hull.vertices)
+        if solid:
+            self.files[f"{number}/{HULLS}"] = solid.encode()
         materials = "newmtl look\nKd 1 1 1\nillum 1\nmap_Kd model.png\nnewmtl frame\nKd 0.85 0.83 0.8\nillum 1\n"
         for name, data in (("obj", text.encode()), ("mtl", materials.encode()), ("png", mesh.image)):
             self.files[f"{number}/model.{name}"] = data
@@ -243,7 +261,7 @@ class _Export:
         rest = yaw_matrix(yaw).T @ matrix_from_quat(np.array(body.quat))
         rest = rest if math.acos(np.clip(rest[2, 2], -1, 1)) > TILT_RAD else np.eye(3)
         vertices = mesh.vertices @ rest.T
-        model = self._model((mesh.key, rest.round(6).tobytes()), vertices, mesh)
+        model = self._model((mesh.key, rest.round(6).tobytes()), lambda points: points @ rest.T, mesh)
         box = np.array([vertices.min(axis=0), vertices.max(axis=0)])
         self._add("pieceOfFurniture", movable="true", **self._words(kind, model, box, yaw, np.array(body.pos)))
 
@@ -269,11 +287,15 @@ class _Export:
         wall = _between(self.stands, gap, max(w.height for w in self.high))
         self.walls.append(wall)
         back, centre = yaw_matrix(yaw), np.array([*wall.ends.mean(axis=0), 0.0])
-        vertices, pin = (leaf - centre) @ back, ((hinge - centre[:2]) @ back[:2, :2])
+
+        def place(points: np.ndarray) -> np.ndarray:
+            return (points @ own.T + at - centre) @ back
+
+        vertices, pin = place(mesh.vertices), ((hinge - centre[:2]) @ back[:2, :2])
         x, y, top = wide / 2, wall.thickness / 2, vertices[:, 2].max() + 0.01
         out, up = x + FRAME_M, top + FRAME_M
         bars = np.array([_bar(-out, -x, 0.0, top, y), _bar(x, out, 0.0, top, y), _bar(-out, out, top, up, y)])
-        model = self._model((mesh.key, body.name), vertices, mesh, LEAF, bars)
+        model = self._model((mesh.key, body.name), place, mesh, LEAF, bars)
         every = np.vstack([vertices, bars.reshape(-1, 3)])
         box = np.array([every.min(axis=0), every.max(axis=0)])
         width, depth = (box[1] - box[0])[:2]
@@ -285,6 +307,11 @@ class _Export:
         sash = {"xAxis": (pin[0] - box[0, 0]) / width, "yAxis": (box[1, 1] - pin[1]) / depth}
         self._add("sash", door, **sash, width=length / width, startAngle=start, endAngle=end)
         return True
+
+
+def _lines(vertices: np.ndarray) -> str:
+    """An OBJ's, in cm and y up, of (n, 3) vertices in m and z up."""
+    return "".join(f"v {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in 100 * vertices @ Y_UP_TO_Z_UP + 0.0)
 
 
 def _yaw(quat: Any) -> float:

@@ -231,17 +231,24 @@ class _Drawing:
         name = f"{name} {self.named[name]}"
         if SLIDES.search(" ".join([e.get("catalogId") or "", name, *np.unique(group)])):
             self.source.note(f"{name}: its sliding or folding parts stay as drawn")
+        solid = self.models.solid(e, surface) if (e.get("catalogId") or "").startswith(OURS) else None
         if e.tag == "doorOrWindow":
-            return self._door(e, name, pose, surface, group)
+            return self._door(e, name, pose, surface, group, solid)
         kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
         if e.tag == "light":
             self.dropped["lights' shine (their lamps stay)"] += 1
             kind = kind if kind == "floor_lamp" else "other"
         held = e.get("movable") == "false" or kind == "structure"
-        return [Part(name, pose, surface, None, False, held=held, known_as=kind)]
+        return [Part(name, pose, surface, solid, False, held=held, known_as=kind)]
 
     def _door(
-        self, e: ElementTree.Element, name: str, pose: np.ndarray, surface: TexturedMesh, group: np.ndarray
+        self,
+        e: ElementTree.Element,
+        name: str,
+        pose: np.ndarray,
+        surface: TexturedMesh,
+        group: np.ndarray,
+        solid: TexturedMesh | None,
     ) -> list[Part]:
         """Frame and leaves of a door, a window in one piece."""
         sashes = e.findall("sash")
@@ -255,9 +262,8 @@ class _Drawing:
             faces = np.flatnonzero(leaf == k)
             own = _part_of(surface, faces) if len(faces) else _plain_leaf(e, sash, surface)
             own = _beside(own, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
-            made.append(
-                Part(f"{name} leaf {k}", pose, own, None, False, known_as="door", swing=_swing(e, sash, own.vertices))
-            )
+            swing, hulls = _swing(e, sash, own.vertices), solid if len(sashes) == 1 else None
+            made.append(Part(f"{name} leaf {k}", pose, own, hulls, False, known_as="door", swing=swing))
         if not leaf.any():
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
             return made

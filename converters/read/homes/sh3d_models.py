@@ -31,6 +31,9 @@ PANE = "sweethome3d_window_pane"
 """Groups that begin so are glass: a piece's one colour leaves them."""
 GLASS = np.array([176, 200, 214], np.uint8).reshape(1, 1, 3)
 LEAF = re.compile(r"sweethome3d_(?:opening|window_pane)_on_hinge_(\d{1,2})")
+HULLS = "hulls.obj"
+"""Beside a model in its folder: convex pieces to collide with, each a group with vertices of its own."""
+APART = 1e-4
 MOST_FACES = 2_000_000
 """Of all pieces together."""
 
@@ -166,6 +169,29 @@ class Models:
         tilt[:3, :3] = Y_UP_TO_Z_UP @ tilt[:3, :3]
         mesh = placed(mesh, tilt)
         return dataclasses.replace(mesh, vertices=mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), group
+
+    def solid(self, element: ElementTree.Element, surface: TexturedMesh) -> TexturedMesh | None:
+        """The hulls that a drawing of ours brings beside a piece's model, in the piece's frame; None without them.
+
+        Args:
+            element: the piece.
+            surface: what `surface` made of it.
+        """
+        model, folder = self.model(element), (element.get("model") or "").rpartition("/")[0]
+        path = model_path(self.source.root, f"{folder}/{HULLS}", self.budget) if folder else None
+        if model is None or path is None or element.find("transformation") is not None:
+            return None
+        mesh = read_obj(self.source.use(path, ""))
+        check_count(path, len(mesh.faces), GEOMS, "faces", "simplify the hulls")
+        # Sizes, turns and mirrors of the model are the hulls' as well.
+        own = np.column_stack([model.vertices[np.unique(model.faces)], np.ones(len(surface.vertices))])
+        placing = np.linalg.lstsq(own, surface.vertices, rcond=None)[0]
+        # Hulls that touch stay apart: each is drawn in by as little as that.
+        vertices = np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]) @ placing
+        for k in np.unique(mesh.group):
+            of = np.unique(mesh.faces[mesh.group == k])
+            vertices[of] += APART * (vertices[of].mean(axis=0) - vertices[of])
+        return TexturedMesh(vertices, mesh.faces, None, None)
 
     def _deformed(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and faces of a model whose parts are opened, turned or slid as drawn.

@@ -29,7 +29,7 @@ def drawing(tmp_path_factory) -> Path:
     """A committed home with two doors, drawn."""
     path = tmp_path_factory.mktemp("drawn") / "apartment.sh3d"
     told = export_sh3d(HOME, path)
-    assert told[0] == "36 walls, 2 rooms, 2 doors, 7 other things"
+    assert told[0] == "36 walls, 4 rooms, 2 doors, 7 other things"
     return path
 
 
@@ -91,6 +91,24 @@ def test_leaves_turn_as_far_to_the_same_side(drawing):
         hinge = ends[int(np.argmin(off))].hinge
         assert min(off) < 0.002 and hinge is not None
         assert hinge.range_rad == pytest.approx(body.joints[0].range, abs=0.1)
+
+
+def test_hulls_come_back_in_their_pieces(drawing):
+    raw, spec = read_sh3d(drawing), of_scene(HOME)
+    for thing in load_manifest(HOME).objects:
+        body = spec.body(thing.name)
+        own = [spec.mesh(g.meshname).file for g in body.geoms if g.name.startswith(f"{thing.name}_hull_")]
+        points = np.vstack([trimesh.load_mesh(HOME / "assets" / f, process=False).vertices for f in own])
+        points = points @ matrix_from_quat(np.array(body.quat)).T + body.pos
+        found = []
+        for a in raw.annotations:
+            pieces = raw.cads[a.cad_id].pieces
+            assert pieces is not None
+            if a.category == thing.category and len(pieces) == len(own):
+                again = np.vstack([p for p, _ in pieces]) @ a.pose[:3, :3].T + a.pose[:3, 3]
+                corners = [[p.min(axis=0), p.max(axis=0)] for p in (again, points)]
+                found.append(max(np.abs(np.subtract(*corners)).max(), KDTree(points).query(again)[0].max()))
+        assert min(found) < 0.002, thing.name
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
@@ -157,7 +175,7 @@ def test_one_mesh_is_written_once(tmp_path):
     (folder / "scene.xml").write_text(text)
     export_sh3d(folder, tmp_path / "twins.sh3d")
     with zipfile.ZipFile(tmp_path / "twins.sh3d") as archive:
-        assert sum(name.endswith(".obj") for name in archive.namelist()) == 8
+        assert sum(name.endswith("/model.obj") for name in archive.namelist()) == 8
         assert archive.read("Home.xml").count(b"<pieceOfFurniture") == 7
 
 
