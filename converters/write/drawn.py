@@ -41,7 +41,10 @@ def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | Non
         return None
     # Corners of different charts lie in one place: the place is written once.
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-    _, first, faces = np.unique(np.round(corners, 5), axis=0, return_index=True, return_inverse=True)
+    # In order of appearance, which a scale does not change: copies in other proportions share the mesh.
+    _, first, place = np.unique(np.round(corners, 5), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    first, faces = first[order], np.argsort(order)[place.reshape(-1)]
     uv, uv_faces = np.unique(np.clip(mesh.corner_uv, 0, 1).reshape(-1, 2), axis=0, return_inverse=True)
     shape = (-1, 3)
     return VisualMesh(corners[first], faces.reshape(shape), uv, uv_faces.reshape(shape), mesh.texture, True)

@@ -91,8 +91,8 @@ class HomeConfig:
         return self
 
 
-MOST_SHARE = 0.37
-"""Largest `furniture_share`: about what the fullest of homes of four rooms and more take."""
+MOST_SHARE = 0.42
+"""Largest `furniture_share`: of sixteen homes of four and five rooms 13 take 0.37, 7 take 0.40 and 2 take 0.43."""
 TIERS: dict[str, dict[str, Any]] = {
     "furnished": {},
     "cluttered": {

@@ -103,3 +103,17 @@ def test_an_image_of_its_own_is_written_to_the_bit(colours: int, mode: str) -> N
     made.save(file, "PNG")
     assert made.mode == mode
     assert (np.asarray(Image.open(file).convert("RGB")) == image.reshape(40, 50, 3)).all()
+
+
+def test_copies_in_other_proportions_have_the_same_faces() -> None:
+    """Two corners 4 um apart in x, 2 um in the half-sized copy: sorted by place, they would change theirs."""
+    vertices, faces = chair(0)
+    vertices[:2, 0], vertices[:2, 1] = (0.100004, 0.100008), (0.2, -0.2)
+    scale = np.array([0.5, 0.7, 1.1])
+    surface = painted(vertices, faces)
+    drawn, copy = (
+        as_it_is(dataclasses.replace(surface, vertices=vertices * k), len(faces), 32) for k in (np.ones(3), scale)
+    )
+    assert drawn is not None and copy is not None
+    assert (drawn.faces == copy.faces).all() and (drawn.uv_faces == copy.uv_faces).all()
+    assert np.allclose(drawn.vertices * scale, copy.vertices, rtol=0, atol=1e-5)
