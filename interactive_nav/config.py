@@ -222,6 +222,8 @@ class SensorConfig(Settings):
     CPU, beside any physics)."""
     cameras: Sequence[Mapping[str, Any]] = ()
     """Cameras in place of the robot's one, each a mapping of settings of `CameraView`."""
+    robot_visible: bool = False
+    """Images show the robot's own body but for the housing of its camera."""
     image_size: ImageSide = 68
     """Side of the square images, pixels."""
     image_fov_deg: FovDeg = None
@@ -255,7 +257,7 @@ class SensorConfig(Settings):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("cameras image_size image_fov_deg image_dtype image_geometry renderer frame_dropout",
+        ("cameras robot_visible image_size image_fov_deg image_dtype image_geometry renderer frame_dropout",
          f"one of {', '.join(IMAGES)} among observations",
          lambda c: any(name in c.observations for name in IMAGES)),
         (_NOISE["depth"], "depth among observations", lambda c: "depth" in c.observations),

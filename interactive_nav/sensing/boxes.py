@@ -1,29 +1,121 @@
 """What cameras and scanners see: a `World` in, its collision boxes with class ids as arrays, and their world poses out.
 
-Every backend draws the same boxes and the floor, the plane z = 0. The robot is not among them: it is
-invisible to itself.
+Every backend draws the same boxes and the floor, the plane z = 0. The robot is among them where that is asked for; else
+it is invisible to itself.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import flax.struct
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
+from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.spec import sorted_movables
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, body_colours
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, body_colours, geom_colour
 from interactive_nav_common.rotations import Array, matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
 
 _TINY = np.float32(1e-12)
+HOUSING_M = 0.01
+"""What is as near to the robot's camera is its housing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """A body of the robot's in its parent's frame at rest, and the joints that carry it."""
+
+    parent: int
+    """Its index among the links; 0 is the base."""
+    pos: np.ndarray
+    axes: np.ndarray
+    joints: tuple[tuple[bool, int, float, np.ndarray, np.ndarray], ...]
+    """(slides, address in qpos, qpos0, axis, anchor) in order."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Links:
+    """The robot's bodies, its base first and parents before their children."""
+
+    base_qpos: int
+    rest: tuple[Link, ...]
+    """All but the base."""
+
+    def frames(self, qpos: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+        """World frames of the base and the rest: positions [..., 3], m, and axes as columns [..., 3, 3].
+
+        Args:
+            qpos: [..., nq].
+        """
+        at = self.base_qpos
+
+        def constant(value: np.ndarray) -> jax.Array:
+            return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
+
+        found = [(qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7]))]
+        for link in self.rest:
+            pos, axes = found[link.parent]
+            pos, axes = pos + rotate(axes, constant(link.pos)), compose(axes, constant(link.axes))
+            for slides, address, zero, axis, anchor in link.joints:
+                value, axis = qpos[..., address] - zero, constant(axis)
+                if slides:
+                    pos = pos + rotate(axes, axis) * value[..., None]
+                    continue
+                arm, turn = swing(axis, constant(anchor), value)
+                pos = pos + rotate(axes, arm)
+                axes = compose(axes, turn)
+            found.append((pos, axes))
+        return found
+
+
+def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:
+    """The links of a model's bodies: the one with the free joint first, parents before children."""
+    rest = []
+    for body in bodies[1:]:
+        joints = []
+        for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            slides = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
+            address = int(model.jnt_qposadr[j])
+            joints.append((bool(slides), address, float(model.qpos0[address]), model.jnt_axis[j], model.jnt_pos[j]))
+        parent = list(bodies).index(model.body_parentid[body])
+        rest.append(Link(parent, model.body_pos[body], matrix_from_quat(model.body_quat[body]), tuple(joints)))
+    return Links(int(model.jnt_qposadr[model.body_jntadr[bodies[0]]]), tuple(rest))
+
+
+def robot_geoms(world: World) -> list[list[int]]:
+    """What is seen of each of the robot's bodies: geoms for show, or those that collide where it has none, but for the
+    housing of its camera."""
+    model, camera = world.models[0], world.robot.camera
+    bodies = world.layout.robot_bodies
+    own = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+    shown = own[model.geom_group[own] == VISUAL_GROUP]
+    found: list[list[int]] = [[] for _ in bodies]
+    for geom in map(int, shown if len(shown) else own):
+        name = model.body(int(model.geom_bodyid[geom])).name
+        box = geom_box(model, geom)
+        inside = np.abs((np.asarray(camera.pos_m) - box[:3]) @ matrix_from_quat(box[3:7])) <= box[7:] + HOUSING_M
+        if name != camera.body or not inside.all():
+            found[list(bodies).index(model.geom_bodyid[geom])].append(geom)
+    return found
+
+
+def geom_box(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """(10,) box around a geom in its body's frame: centre, orientation, half sizes."""
+    around, turn = model.geom_aabb[geom], model.geom_quat[geom]
+    return np.concatenate([model.geom_pos[geom] + matrix_from_quat(turn) @ around[:3], turn, around[3:]])
 
 
 @flax.struct.dataclass
 class BoxTables:
-    """Boxes of all scenes, padded alike; S scenes, B boxes, M bodies that move, then one that stands (the walls)."""
+    """Boxes of all scenes, padded alike; S scenes, B boxes, M bodies that move, then one that stands (the walls), then
+    the robot's if it is seen."""
 
     body: np.ndarray = flax.struct.field(pytree_node=False)
     """[B] index of each box's body; M for walls."""
@@ -51,6 +143,8 @@ class BoxTables:
     """[S, M, 3] f32, m."""
     classes: MaskClasses = flax.struct.field(pytree_node=False, default=4)
     """How `class_id` tells categories apart: the setting `segmentation_classes`."""
+    robot: Links | None = flax.struct.field(pytree_node=False, default=None)
+    """None: it is not seen."""
 
     @property
     def num_boxes(self) -> int:
@@ -73,26 +167,33 @@ def boxes_of_slots(world: World, scene: Scene, classes: MaskClasses) -> list[tup
 
 
 def _colours_of_slots(world: World, s: int, ids: list[int], classes: MaskClasses) -> np.ndarray:
-    """[M + 2, 3]: mean colour of the visual meshes in each slot, of the walls, and the floor's; where a body has no
-    mesh, that of its class."""
+    """[M + 2 or more, 3]: mean colour of the visual meshes in each slot, of the walls, of the robot's bodies, and the
+    floor's; where a body has no mesh, that of its class."""
     own, names = body_colours(world.scenes[s]), (*world.names[s], "structure")
-    rows = [own[name] if name in own else PALETTES[classes][number] for name, number in zip(names, ids, strict=True)]
+    rows = [own[name] if name in own else PALETTES[classes][number] for name, number in zip(names, ids, strict=False)]
+    model, geoms = world.models[0], robot_geoms(world)[: len(ids) - len(rows)]
+    rows += [np.mean([geom_colour(model, geom) for geom in own], 0) if own else np.zeros(3) for own in geoms]
     return np.stack([*rows, np.asarray(FLOOR_COLOUR)])
 
 
-def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False) -> BoxTables:
+def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, robot: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
     Args:
         world: with its scenes.
         classes: the setting `segmentation_classes`.
         colours: reads the textures, for images in colour.
+        robot: its bodies are seen, each geom as the box around it.
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
     columns = [boxes_of_slots(world, scene, classes) for scene in scenes]
-    counts = [max(len(column[m][0]) for column in columns) for m in range(slots + 1)]
-    body = np.repeat(np.arange(slots + 1), counts)
+    if robot:
+        model, number = world.models[0], class_id("robot", classes)
+        boxes = [np.reshape([geom_box(model, geom) for geom in own], (-1, 10)) for own in robot_geoms(world)]
+        columns = [[*column, *((rows, number) for rows in boxes)] for column in columns]
+    counts = [max(len(column[m][0]) for column in columns) for m in range(len(columns[0]))]
+    body = np.repeat(np.arange(len(counts)), counts)
     first = np.concatenate([[0], np.cumsum(counts)])
     shape = (len(scenes), len(body))
     pos, half, ids = np.zeros((*shape, 3)), np.full((*shape, 3), -1.0), np.zeros(shape, np.uint8)
@@ -125,6 +226,7 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False) -
         class_id=jnp.asarray(ids),
         colour=jnp.asarray(np.stack(painted), f32) if colours else None,
         classes=classes,
+        robot=make_links(world.models[0], world.layout.robot_bodies.tolist()) if robot else None,
         hinge_pos_w=jnp.asarray(hinge_pos, f32),
         hinge_axes_w=jnp.asarray(hinge_axes, f32),
         hinge_axis_b=jnp.asarray(hinge_axis, f32),
@@ -164,7 +266,8 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
         qpos: [..., nq].
 
     Returns:
-        Positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body.
+        Positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body. If the
+        robot is seen, its bodies follow.
     """
     lead = qpos.shape[:-1]
     free, hinged = np.flatnonzero(~tables.hinged), np.flatnonzero(tables.hinged)
@@ -179,6 +282,10 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     order = np.argsort(np.concatenate([free, hinged, [len(tables.slot_qpos)]]))
     if (order != np.arange(len(order))).any():
         pos, axes = pos[..., order, :], axes[..., order, :, :]
+    if tables.robot is not None:
+        own_pos, own_axes = zip(*tables.robot.frames(qpos), strict=True)
+        pos = jnp.concatenate([pos, jnp.stack(own_pos, -2)], -2)
+        axes = jnp.concatenate([axes, jnp.stack(own_axes, -3)], -3)
     return pos, axes
 
 

@@ -18,15 +18,17 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import warp as wp
+from scipy.spatial import ConvexHull
 
 from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import FAR_M, NEAR_M, Lens, Renderer
-from interactive_nav.sensing.boxes import BoxTables, body_poses, boxes_of_slots, rotate
+from interactive_nav.sensing.boxes import BoxTables, body_poses, boxes_of_slots, geom_box, robot_geoms, rotate
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour
 from interactive_nav.sensing.surfaces import lit_images
 from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.categories import class_id
 
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))
@@ -63,6 +65,28 @@ def _box_part(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Part:
     return _Part(slot, points.reshape(-1, 3), faces, np.zeros((len(faces), 3, 2)), None, colour)
 
 
+def _geom_part(model: mujoco.MjModel, geom: int, slot: int) -> _Part:
+    """A geom of the robot's: a mesh, a box, or what is round as its hull."""
+    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        return _mesh_part(model, geom, slot, False)
+    part = _box_part(slot, geom_box(model, geom)[None], geom_colour(model, geom))
+    turn, rise = np.meshgrid(np.arange(24) * np.pi / 12, np.linspace(-np.pi / 2, np.pi / 2, 13))
+    ball = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], -1).reshape(-1, 3)
+    ends = np.array([[[0.0, 0.0, -1.0]], [[0.0, 0.0, 1.0]]])
+    hulls = {
+        mujoco.mjtGeom.mjGEOM_SPHERE: size[0] * ball,
+        mujoco.mjtGeom.mjGEOM_ELLIPSOID: size * ball,
+        mujoco.mjtGeom.mjGEOM_CAPSULE: size[0] * ball + size[1] * ends,
+        mujoco.mjtGeom.mjGEOM_CYLINDER: size[0] * ball * [1, 1, 0] + size[1] * ends,
+    }
+    if kind not in hulls:
+        return part
+    hull = ConvexHull(hulls[kind].reshape(-1, 3))
+    points = hull.points @ matrix_from_quat(model.geom_quat[geom]).T + model.geom_pos[geom]
+    return dataclasses.replace(part, points=points, faces=hull.simplices, uv=np.zeros((len(hull.simplices), 3, 2)))
+
+
 def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Part:
     mesh, texture = model.geom_dataid[geom], -1
     vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
@@ -94,7 +118,9 @@ def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[i
             parts += [_mesh_part(model, geom, slot, name == "structure") for geom in visual[name]]
         elif len(boxes):
             parts.append(_box_part(slot, boxes, PALETTES[tables.classes][number]))
-    return parts, [number for _, number in column]
+    own = robot_geoms(world) if tables.robot else []
+    parts += [_geom_part(world.models[0], g, len(column) + i) for i, geoms in enumerate(own) for g in geoms]
+    return parts, [number for _, number in column] + [class_id("robot", tables.classes)] * len(own)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,9 +89,10 @@ class Sensors:
         self._drawn = (*self._images, *(["normals"] if config.camera_noise.depth_grazing_deg else []))
         coloured = not meshes and bool({"rgb", "normals"} & set(self._drawn))
         self.boxes = build_boxes(world, config.segmentation_classes, coloured)
+        seen = build_boxes(world, config.segmentation_classes, coloured, True) if config.robot_visible else self.boxes
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
-        drawn = self.boxes, self.lens, config.renderer, backend, world if meshes else None
+        drawn = seen, self.lens, config.renderer, backend, world if meshes else None
         self.renderer = make_renderer(*drawn) if self._images else None
         self.cameras: tuple[SensorCamera, ...] = _cameras(world, config, self.renderer) if self.renderer else ()
         angles = -0.5 * config.lidar_fov_deg + np.arange(config.lidar_rays) * config.lidar_fov_deg / config.lidar_rays

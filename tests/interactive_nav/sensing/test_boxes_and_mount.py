@@ -6,10 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from interactive_nav.config import NavConfig
+from interactive_nav.robots import get_robot
 from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.objects import pick
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import look_along
-from interactive_nav.sensing.boxes import box_poses
+from interactive_nav.sensing.boxes import body_poses, box_poses, build_boxes
 from interactive_nav.sensing.mount import make_mount
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import OBJECT_CATEGORIES, SEGMENTATIONS, class_id
@@ -117,3 +121,27 @@ def test_numpys_cameras_are_jaxs():
 def test_looking_straight_down_has_axes():
     axes = np.asarray(look_along(jnp.zeros(3), jnp.asarray([0.0, 0.0, -2.0])).axes_w)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
+
+
+def test_the_robots_bodies_are_where_c_mujoco_has_them(room):
+    world = build_world(get_robot("fetch"), (load_scene(room),), NavConfig.of(num_objects=1))
+    tables, model = build_boxes(world, "all", robot=True), world.models[0]
+    qpos = np.array(world.rest_qpos[0], np.float32)
+    own = slice(world.layout.robot_qpos, world.layout.robot_qpos + world.layout.robot_nq)
+    qpos[own] = np.random.default_rng(1).uniform(-0.7, 0.7, world.layout.robot_nq)
+    qpos[own][3:7] /= np.linalg.norm(qpos[own][3:7])
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    pos, axes = jax.jit(lambda q: body_poses(tables, jnp.asarray(0), q))(qpos)
+    first, bodies = world.layout.num_slots + 1, world.layout.robot_bodies
+    np.testing.assert_allclose(pos[first:], data.xpos[bodies], atol=1e-5)
+    np.testing.assert_allclose(axes[first:], data.xmat[bodies].reshape(-1, 3, 3), atol=1e-5)
+    centre, _ = box_poses(tables, jnp.asarray(0), jnp.asarray(qpos))
+    mine = tables.body >= first
+    assert set(np.asarray(tables.class_id)[0, mine]) == {1} and 1 not in np.asarray(tables.class_id)[0, ~mine]
+    # Those for show, but for the one around the camera.
+    shown = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies and model.geom_group[g] == 2]
+    shown = [g for g in shown if model.geom_bodyid[g] != model.body("fetch_head_tilt").id]
+    want = sorted(map(tuple, np.round(data.geom_xpos[shown], 3)))
+    np.testing.assert_allclose(sorted(map(tuple, np.round(np.asarray(centre)[mine], 3))), want, atol=2e-3)

@@ -278,3 +278,29 @@ def test_several_cameras_look_each_its_own_way_with_its_own_lens(world, moment):
     noisy = sense(world, moment, **images, cameras=cameras, depth_dropout=0.5)[1]
     lost = [np.asarray(noisy[f"pixels/{name}/depth"] == 0)[16, :33] for name in sides]
     assert (lost[0] != lost[2]).any()
+
+
+@pytest.mark.parametrize("geometry", ["boxes", "meshes"])
+def test_a_robot_sees_its_own_body_where_that_is_asked_for(world, moment, geometry):
+    if geometry == "meshes":
+        pytest.importorskip("warp")
+    images = {"observations": ("depth", "segmentation"), "image_size": 64, "image_geometry": geometry}
+    _, blind = sense(world, moment, **images)
+    sensors, obs = sense(world, moment, **images, robot_visible=True)
+    assert not (np.round(np.asarray(blind["pixels/segmentation"]) * 11) == 1).any()
+    mine = np.round(np.asarray(obs["pixels/segmentation"])[..., 0] * 11) == 1
+    depth = np.asarray(obs["pixels/depth"])[..., 0] * 5
+    # Below the camera, at (-0.087, -0.0125, 0.272), is a round plate of 0.16 m, its top at 0.201 m;
+    # a rod stands on it at x = 0.13, under another plate.
+    lens = sensors.lens
+    right, up = np.meshgrid(lens.columns, lens.rows)
+    plate = (0.272 - 0.201) / np.maximum(-up, 1e-6)
+    x, y = plate - 0.087, -0.0125 - plate * right
+    inside = np.maximum(abs(x), abs(y)) if geometry == "boxes" else np.hypot(x, y)
+    low = up < -0.1
+    on = low & (inside < 0.157) & (x < 0.12)
+    assert mine[on].all() and on.sum() > 500
+    np.testing.assert_allclose(depth[on], plate[on], atol=2e-4)
+    assert (np.abs(depth - plate)[low & (inside > 0.161)] > 1e-3).all() and (low & (inside > 0.161)).sum() > 100
+    assert mine[0, 32] and 0.4 < mine.mean() < 0.8
+    np.testing.assert_array_equal(depth[~mine], np.asarray(blind["pixels/depth"])[..., 0][~mine] * 5)
