@@ -203,7 +203,10 @@ class PhysicsConfig(Settings):
 
 _NOISE = {
     part: " ".join([*own, *(f.name for f in dataclasses.fields(CameraNoise) if f.name.startswith(part))])
-    for part, own in {"depth": ("depth_range_m", "depth_dropout", "depth_noise"), "rgb": ()}.items()
+    for part, own in {
+        "depth": ("depth_range_m", "depth_dropout", "depth_noise"),
+        "rgb": ("random_colours", "random_light"),
+    }.items()
 }
 """Image -> the settings that act on it alone."""
 
@@ -224,6 +227,11 @@ class SensorConfig(Settings):
     """Cameras in place of the robot's one, each a mapping of settings of `CameraView`."""
     robot_visible: bool = False
     """Images show the robot's own body but for the housing of its camera."""
+    random_colours: NotNegative = 0.0
+    """Each episode, each class of things has its colours multiplied by a factor for red, green and blue: the standard
+    deviation of their logarithm."""
+    random_light: NotNegative = 0.0
+    """Each episode has its sun and brightness: standard deviation, of the latter in stops."""
     image_size: ImageSide = 68
     """Side of the square images, pixels."""
     image_fov_deg: FovDeg = None

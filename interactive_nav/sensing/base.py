@@ -16,6 +16,7 @@ import numpy as np
 
 from interactive_nav.batching import one_of_batch
 from interactive_nav.sensing.boxes import BoxTables
+from interactive_nav.sensing.shading import Look
 
 NEAR_M = 0.01
 FAR_M = 100.0
@@ -115,7 +116,12 @@ class Renderer(abc.ABC):
 
     @abc.abstractmethod
     def images_batch(
-        self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose
+        self,
+        names: tuple[str, ...],
+        scene: jax.Array,
+        qpos: jax.Array,
+        camera: CameraPose,
+        look: Look | None = None,
     ) -> dict[str, jax.Array]:
         """Draws a batch in several ways.
 
@@ -124,6 +130,7 @@ class Renderer(abc.ABC):
             scene: [N] i32.
             qpos: [N, nq] f32.
             camera: leaves [N, ...].
+            look: leaves [N, ...]; None: things have their own colours.
 
         Returns:
             depth and segmentation as `render_batch` gives them; rgb [N, H, W, 3] f32 in [0, 1]; normals
@@ -131,10 +138,16 @@ class Renderer(abc.ABC):
         """
 
     def images(
-        self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose
+        self,
+        names: tuple[str, ...],
+        scene: jax.Array,
+        qpos: jax.Array,
+        camera: CameraPose,
+        look: Look | None = None,
     ) -> dict[str, jax.Array]:
         """One environment's `images_batch`; under any number of `vmap`s all environments are drawn in one call."""
-        return one_of_batch(functools.partial(self.images_batch, names), (scene, qpos, camera))
+        drawn = (scene, qpos, camera) if look is None else (scene, qpos, camera, look)
+        return one_of_batch(functools.partial(self.images_batch, names), drawn)
 
     def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
         """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""

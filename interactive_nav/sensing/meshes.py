@@ -351,7 +351,7 @@ class MeshRenderer(Renderer):
         seen = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
         return seen["depth"], seen["segmentation"]
 
-    def images_batch(self, names, scene, qpos, camera):
+    def images_batch(self, names, scene, qpos, camera, look=None):
         pos, axes = body_poses(self.tables, scene, qpos)
         slot = jnp.asarray(self._slot)[scene]
         pos = jnp.take_along_axis(pos, slot[..., None], -2)
@@ -364,4 +364,4 @@ class MeshRenderer(Renderer):
             self._handle, scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants,
             launch_dims=(size[0], -(-size[1] // 8), -(-size[2] // 4), 32), output_dims=size,
         )  # fmt: skip
-        return {"depth": depth, "segmentation": ids, **lit_images(base, normal, camera, kind == 1)}
+        return {"depth": depth, "segmentation": ids, **lit_images(base, normal, camera, kind == 1, ids, look)}

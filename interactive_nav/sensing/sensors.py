@@ -39,6 +39,7 @@ from interactive_nav.sensing.mount import Mount, make_mount
 from interactive_nav.sensing.noise import disturbed
 from interactive_nav.sensing.observation import task_parts
 from interactive_nav.sensing.rays import cast_fan
+from interactive_nav.sensing.shading import draw_look
 from interactive_nav.types import NavInfo
 from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 from scenes_mjcf.categories import SEGMENTATIONS
@@ -147,7 +148,7 @@ class Sensors:
         def key_of(name: str) -> jax.Array:
             return stream(rng, f"{camera.prefix}{name}", nav.step_count)
 
-        seen = disturbed(config.camera_noise, camera.lens, self.render(physics, nav, camera), key_of)
+        seen = disturbed(config.camera_noise, camera.lens, self.render(physics, nav, camera, rng), key_of)
         depth = jnp.clip(seen["depth"] / config.depth_range_m, 0.0, 1.0)
         depth = _noisy(depth, config.depth_noise, config.depth_dropout, 0.0, key_of("depth"))
         ids = seen["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
@@ -162,12 +163,16 @@ class Sensors:
                 out[key] = (jnp.round(255.0 * images[name]) if whole else images[name]).astype(dtype)
         return out
 
-    def render(self, physics: PhysicsState, nav: NavInfo, camera: SensorCamera) -> dict[str, jax.Array]:
+    def render(self, physics: PhysicsState, nav: NavInfo, camera: SensorCamera, rng: jax.Array) -> dict[str, jax.Array]:
         """What a camera sees, without noise: the images that are observed or needed for it, as
         `Renderer.images_batch` has them, without its leading axis; depth and segmentation always."""
         # A broken world's numbers must not reach the renderer's search tree.
         qpos = jnp.where(jnp.isfinite(physics.qpos), physics.qpos, 0.0)
-        return camera.renderer.images(self._drawn, nav.scene_index, qpos, camera.mount.pose(qpos))
+        config, look = self._config, None
+        if config.random_colours or config.random_light:
+            key = stream(rng, "look", jnp.zeros((), jnp.int32))
+            look = draw_look(key, config.random_colours, config.random_light, self.boxes.classes)
+        return camera.renderer.images(self._drawn, nav.scene_index, qpos, camera.mount.pose(qpos), look)
 
     def odometry_error(self, rng: jax.Array, step_count: jax.Array) -> jax.Array:
         """(2,) relative errors of a step's distance and angle."""

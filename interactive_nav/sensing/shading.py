@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import flax.struct
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.scene import Scene
-from scenes_mjcf.categories import SEGMENTATIONS
+from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
 
 SKY_COLOUR = (0.93, 0.95, 0.97)
 """RGB in [0, 1] of pictures where nothing is met."""
@@ -22,9 +25,41 @@ PALETTES = {
 _LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
 
 
-def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
+@flax.struct.dataclass
+class Look:
+    """How an episode looks; leading axes as the caller has them."""
+
+    tint: jax.Array
+    """[..., classes, 3] factors of the colours of each class of the masks; structure and sky are 0."""
+    sun_w: jax.Array
+    """[..., 3] unit vector towards the sun."""
+    brightness: jax.Array
+    """[...] factor of everything."""
+
+
+def draw_look(key: jax.Array, colours: float, light: float, classes: MaskClasses) -> Look:
+    """An episode's look.
+
+    Args:
+        key: consumed.
+        colours: standard deviation of the logarithm of each factor of a tint.
+        light: that of brightness in stops, and of each component of the vector to the sun before it has length 1.
+        classes: the setting `segmentation_classes`.
+    """
+    tint, sun, bright = jax.random.split(key, 3)
+    sun_w = _LIGHT_W + light * jax.random.normal(sun, (3,))
+    # It stays above the floor.
+    sun_w = sun_w.at[2].set(jnp.maximum(jnp.abs(sun_w[2]), 0.1))
+    return Look(
+        jnp.exp(colours * jax.random.normal(tint, (len(SEGMENTATIONS[classes].names), 3))),
+        sun_w / jnp.linalg.norm(sun_w),
+        2.0 ** (light * jax.random.normal(bright)),
+    )
+
+
+def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any, sun_w: Any = _LIGHT_W) -> Any:
     """Colours [..., 3] in [0, 1] under a sun and a lamp at the camera; what is not `met` keeps its colour."""
-    light_w = xp.broadcast_to(xp.asarray(_LIGHT_W), normal_w.shape)
+    light_w = xp.broadcast_to(xp.asarray(sun_w), normal_w.shape)
     sun = xp.maximum((normal_w * light_w).sum(-1), 0.0)
     lamp = xp.maximum(-(normal_w * forward_w).sum(-1), 0.0)
     return base * xp.where(met, xp.minimum(0.45 + 0.4 * sun + 0.25 * lamp, 1.0), 1.0)[..., None]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from interactive_nav.sensing.base import CameraPose, Lens, Renderer
 from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate, slab
-from interactive_nav.sensing.shading import SKY_COLOUR, lit
+from interactive_nav.sensing.shading import SKY_COLOUR, Look, lit
 
 _FLOOR_HALF_M = (1e4, 1e4, 1.0)
 """The floor as one more box, whose top is z = 0."""
@@ -27,15 +27,21 @@ class BoxRenderer(Renderer):
             -1 nothing.
         """
 
-    def images_batch(self, names, scene, qpos, camera):
+    def images_batch(self, names, scene, qpos, camera, look=None):
         if not set(names) & {"rgb", "normals"}:
             return dict(zip(("depth", "segmentation"), self.render_batch(scene, qpos, camera), strict=True))
         _, index = self.trace_batch(scene, qpos, camera)
-        return paint(self.tables, self.lens, scene, qpos, camera, index)
+        return paint(self.tables, self.lens, scene, qpos, camera, index, look)
 
 
 def paint(
-    tables: BoxTables, lens: Lens, scene: jax.Array, qpos: jax.Array, camera: CameraPose, index: jax.Array
+    tables: BoxTables,
+    lens: Lens,
+    scene: jax.Array,
+    qpos: jax.Array,
+    camera: CameraPose,
+    index: jax.Array,
+    look: Look | None = None,
 ) -> dict[str, jax.Array]:
     """Images from the boxes that a renderer has met.
 
@@ -48,6 +54,7 @@ def paint(
         qpos: [N, nq] f32.
         camera: leaves [N, ...].
         index: [N, H, W] i32 as `BoxRenderer.trace_batch` gives it.
+        look: leaves [N, ...]; None: as it is.
 
     Returns:
         See `Renderer.images_batch`.
@@ -77,14 +84,22 @@ def paint(
     normal = rotate(axes, outward) * met[..., None]
     sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
     base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
+    seen = jnp.where(met, of_pixel(ids[..., None])[..., 0], 0)
     return {
         "depth": jnp.where(met, low.max(-1), 0.0),
-        "segmentation": jnp.where(met, of_pixel(ids[..., None])[..., 0], 0),
-        **lit_images(base, normal, camera, met),
+        "segmentation": seen,
+        **lit_images(base, normal, camera, met, seen, look),
     }
 
 
-def lit_images(base: jax.Array, normal_w: jax.Array, camera: CameraPose, shaded: jax.Array) -> dict[str, jax.Array]:
+def lit_images(
+    base: jax.Array,
+    normal_w: jax.Array,
+    camera: CameraPose,
+    shaded: jax.Array,
+    ids: jax.Array,
+    look: Look | None = None,
+) -> dict[str, jax.Array]:
     """The images `rgb` and `normals`.
 
     Args:
@@ -92,10 +107,15 @@ def lit_images(base: jax.Array, normal_w: jax.Array, camera: CameraPose, shaded:
         normal_w: [N, H, W, 3], 0 where nothing is met.
         camera: leaves [N, ...].
         shaded: [N, H, W] bool: where light falls; else the colours stay as they are.
+        ids: [N, H, W] classes.
+        look: leaves [N, ...]; None: as it is.
     """
     forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
     sideways, upward, away = ((normal_w * axis).sum(-1) for axis in (right, up, forward))
-    return {
-        "normals": jnp.stack([sideways, upward, -away], -1),
-        "rgb": lit(base, normal_w, forward, shaded, jnp),
-    }
+    normals = jnp.stack([sideways, upward, -away], -1)
+    if look is None:
+        return {"normals": normals, "rgb": lit(base, normal_w, forward, shaded, jnp)}
+    flat = ids.reshape(len(ids), -1, 1).astype(jnp.int32)
+    base = jnp.clip(base * jnp.take_along_axis(look.tint, flat, 1).reshape(base.shape), 0.0, 1.0)
+    rgb = lit(base, normal_w, forward, shaded, jnp, look.sun_w[:, None, None])
+    return {"normals": normals, "rgb": jnp.clip(rgb * look.brightness[:, None, None, None], 0.0, 1.0)}

@@ -19,7 +19,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.observation import advance_odometry
 from interactive_nav.sensing.sensors import Sensors, stream
-from interactive_nav.sensing.shading import FLOOR_COLOUR
+from interactive_nav.sensing.shading import FLOOR_COLOUR, draw_look
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import NavInfo
 from interactive_nav_common.errors import UserError
@@ -304,3 +304,30 @@ def test_a_robot_sees_its_own_body_where_that_is_asked_for(world, moment, geomet
     assert (np.abs(depth - plate)[low & (inside > 0.161)] > 1e-3).all() and (low & (inside > 0.161)).sum() > 100
     assert mine[0, 32] and 0.4 < mine.mean() < 0.8
     np.testing.assert_array_equal(depth[~mine], np.asarray(blind["pixels/depth"])[..., 0][~mine] * 5)
+
+
+@pytest.mark.parametrize("geometry", ["boxes", "meshes"])
+def test_colours_and_light_are_drawn_once_an_episode(world, moment, geometry):
+    if geometry == "meshes":
+        pytest.importorskip("warp")
+    images = {"observations": ("rgb", "segmentation"), "image_size": 32, "image_geometry": geometry}
+    plain = sense(world, moment, **images)[1]["pixels/rgb"]
+    sensors, obs = sense(world, moment, **images, random_colours=0.2)
+    observe, (physics, nav, rng) = jax.jit(sensors.observe), moment
+    first, mask = np.asarray(obs["pixels/rgb"]), np.round(np.asarray(obs["pixels/segmentation"])[..., 0] * 11)
+    tint = draw_look(stream(rng, "look", jnp.asarray(0)), 0.2, 0.0, 4).tint
+    assert np.log(tint).std() == pytest.approx(0.2, abs=0.06)
+    floor = np.array(FLOOR_COLOUR)
+    np.testing.assert_allclose(first[-1, 16] / plain[-1, 16], np.minimum(floor * tint[0], 1) / floor, rtol=1e-4)
+    chair = np.argwhere(mask == 2)[0]
+    at = tuple(chair)
+    dull = np.asarray(plain)[at] * tint[2] < 0.5
+    np.testing.assert_allclose((first[at] / np.asarray(plain)[at])[dull], np.asarray(tint[2])[dull], rtol=1e-4)
+    later = observe(physics, nav.replace(step_count=nav.step_count + 1), rng)["pixels/rgb"]
+    np.testing.assert_array_equal(later, first)
+    assert np.abs(observe(physics, nav, jax.random.PRNGKey(6))["pixels/rgb"] - first).max() > 0.02
+    _, lit = sense(world, moment, **images, random_light=0.3)
+    look = draw_look(stream(rng, "look", jnp.asarray(0)), 0.0, 0.3, 4)
+    assert np.linalg.norm(look.sun_w) == pytest.approx(1.0, abs=1e-5) and look.sun_w[2] > 0
+    light = min(0.45 + 0.4 * float(look.sun_w[2]), 1.0) * float(look.brightness)
+    np.testing.assert_allclose(lit["pixels/rgb"][-1, 16], np.minimum(light * floor, 1.0), rtol=1e-3)
