@@ -265,7 +265,7 @@ def make_floor_plan(
             "scan: no traversable floor is left (no floor label below 1.2 m of free height); "
             "check the floor's labels and height"
         )
-    height, leaf = _heights(shown, occupied), swept & (~traversable if exact else occupied)
+    height, leaf = _heights(shown, occupied, 1 if exact else 5), swept & (~traversable if exact else occupied)
     return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height)
 
 
@@ -323,17 +323,17 @@ def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.nd
     return _Shown(counts[0], counts[1], counts[2], counts[3], top, facing, round(tall, 3))
 
 
-def _heights(shown: _Shown, occupied: np.ndarray) -> np.ndarray:
+def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
     """(rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
 
     A cell is low where no wall, window or the like is labelled in the robot's band and the highest point lies
-    within it; the highest of its neighbours counts, so that a ragged edge does not lower a cabinet.
+    within it; the highest of so many cells around counts, so that a scan's ragged edge does not lower a cabinet.
     """
     tall_m = shown.wall_height_m
     low = occupied & (shown.structure < 3) & (shown.top_m < BAND_M[1])
-    around = ndimage.maximum_filter(np.where(low, shown.top_m, 0.0), 5)
-    low &= around > 0
-    rounded = np.ceil(around / HEIGHT_STEP_M - 1e-9) * HEIGHT_STEP_M
+    top_m = ndimage.maximum_filter(np.where(low, shown.top_m, 0.0), around)
+    low &= top_m > 0
+    rounded = np.ceil(top_m / HEIGHT_STEP_M - 1e-9) * HEIGHT_STEP_M
     return np.where(low, np.minimum(rounded, tall_m), tall_m).round(3)
 
 

@@ -176,7 +176,8 @@ class _Export:
             beyond = [wall.ends[0] - 1e-3 * run, wall.ends[1] + 1e-3 * run]
             out = np.where(shapely.contains(every, shapely.points(beyond)), IN_M, -IN_M)
             (x0, y0), (x1, y1) = 100 * (wall.ends + np.outer(out * [-1, 1], run)) * [1.0, -1.0] + 0.0
-            words = {"height": 100 * wall.height, "thickness": 100 * (wall.thickness - 2 * IN_M), "pattern": "hatchUp"}
+            top = wall.height - (IN_M / 2 if wall.height <= self.low_m else 0.0)  # heights on the grid are rounded up
+            words = {"height": 100 * top, "thickness": 100 * (wall.thickness - 2 * IN_M), "pattern": "hatchUp"}
             words |= {"leftSideColor": WALL, "rightSideColor": WALL}
             self._add("wall", id=f"wall{k}", xStart=x0, yStart=y0, xEnd=x1, yEnd=y1, **words)
         low, high = (

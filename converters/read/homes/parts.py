@@ -36,8 +36,8 @@ ALIASES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Names that others give to our categories."""
 KNOWN = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
 KNOWN |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
-OTHER_STRUCTURE = 38
-"""NYU40's word for what is built in and nothing else."""
+OTHER_STRUCTURE, OTHER_FURNITURE = 38, 39
+"""NYU40's words for what is built in and nothing else, and for what need not reach the ceiling."""
 TEXTURE_PX = 512
 STANDS_M = 0.15
 """Of its base above the floor: what is higher stands on something else, or hangs."""
@@ -68,6 +68,8 @@ class Part:
     static: bool
     mass_kg: float | None = None
     friction: float | None = None
+    low: bool = False
+    """Built in, and no higher than it shows."""
     held: bool = False
     """It stays where it is whatever its name says."""
     known_as: str = ""
@@ -128,6 +130,8 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
     mesh = with_own_corners(mesh)
     labels = label_storeys(mesh.vertices, mesh.faces, floors_m)
     labels[labels == UNLABELLED] = OTHER_STRUCTURE
+    low = np.repeat([part.low for part in structure], [len(shell.faces) for shell in shells])
+    labels[mesh.faces[low]] = OTHER_FURNITURE
     points, _ = sample_faces(mesh.vertices, mesh.faces, SHOWN_M)
     pairs = [
         _furniture(source, part, [parts[k] for k, by in enumerate(carried) if by == i], points)

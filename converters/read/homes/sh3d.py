@@ -26,7 +26,16 @@ from converters.read.files import SourceFolder
 from converters.read.homes.parts import Part, category_of, home
 from converters.read.homes.sh3d_archive import called, metres, number, point, read_xml, unpack
 from converters.read.homes.sh3d_models import LEAF, Models, yaw_pose
-from converters.read.homes.sh3d_walls import HEIGHT_M, Room, level_parts, opening_of, read_room, read_walls, wall_part
+from converters.read.homes.sh3d_walls import (
+    HEIGHT_M,
+    LOW_M,
+    Room,
+    level_parts,
+    opening_of,
+    read_room,
+    read_walls,
+    wall_part,
+)
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
@@ -158,7 +167,8 @@ class _Drawing:
                     own = self.models.look(board, "color", "texture", looks[side][0][:1, :1])
                     boards[side] = (float(size[0]), float(size[1]), own)
             part = wall_part(wall, openings, looks, boards)
-            parts += [] if part is None else [part]
+            low = wall.height_m.max() < LOW_M
+            parts += [] if part is None else [dataclasses.replace(part, low=low)]
         rooms, floors_m = [], set()
         for e in self._seen("room"):
             room = read_room(e, self.models.look)

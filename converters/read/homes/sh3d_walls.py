@@ -21,7 +21,8 @@ from converters.read.homes.sh3d_sheet import WHITE, Look, Sheet, fitted
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M
 
-HEIGHT_M = 2.5
+HEIGHT_M, LOW_M = 2.5, 1.2
+"""Of a wall that says nothing; lower ones are built-in furniture to the map."""
 ARC_STEP_RAD = math.radians(10)
 SHORT_M, NEAR_M = 1e-3, 1e-6
 PARALLEL = 0.8

@@ -133,6 +133,30 @@ def test_a_scene_comes_back(tiny_scene, tmp_path, hull_cache):
     assert footprint(tiny_scene[0]).symmetric_difference(footprint(tmp_path / "back")).area < 1e-6
 
 
+@pytest.mark.heavy
+@pytest.mark.parametrize(("name", "rooms"), [("elm", 7)])
+def test_a_generated_home_comes_back_piece_by_piece(tmp_path, hull_cache, name, rooms):
+    home = HOME.parent / name
+    told = export_sh3d(home, tmp_path / "home.sh3d")
+    assert f", {rooms} rooms," in told[0]
+    config = ConvertConfig(structure_texture=64)
+    back = convert(tmp_path / "home.sh3d", tmp_path / "back", config, cache=hull_cache)
+    assert {g.name for g in back.gates if not g.passed} == set()
+    own, again = load_manifest(home).objects, list(back.manifest.objects)
+    assert len(own) == len(again)
+    heights = [{round(2 * g.size[2], 2) for g in of_scene(f).geoms if "wall_" in g.name} for f in (home, back.folder)]
+    assert len(heights[0]) > 1 and heights[0] >= heights[1] and max(heights[0]) == max(heights[1])
+    for thing in own:
+        world = seen(home, thing.name)
+        alike = [o for o in again if o.category == thing.category and o.n_hulls == thing.n_hulls]
+        off = [apart(seen(back.folder, o.name), world) for o in alike]
+        # A centimetre at the end of a metre is less than a degree.
+        assert min(off) < 0.01, thing.name
+        found = alike[int(np.argmin(off))]
+        again.remove(found)
+        assert found.mass_kg == pytest.approx(thing.mass_kg, rel=0.02)
+
+
 def test_the_example_was_made_of_its_drawing():
     raw, own = read_sh3d(DRAWN.with_suffix(".sh3d")), load_manifest(DRAWN)
     assert raw.sources == own.source["sha256"] and raw.licence == own.licence
