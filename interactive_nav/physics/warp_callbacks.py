@@ -18,6 +18,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
+
+_held = Primitive("held")
+_held.def_impl(lambda x, *, owner: x)
+_held.def_abstract_eval(lambda x, *, owner: x)
+
+
+def _lower_held(ctx: Any, x: Any, *, owner: Any) -> list[Any]:
+    ctx.module_context.add_keepalive(owner)
+    return [x]
+
+
+mlir.register_lowering(_held, _lower_held)
+
+
+def held(x: jax.Array, owner: object) -> jax.Array:
+    """The array; the program that it is part of keeps `owner` alive, whose memory Warp reads, as long as it lives."""
+    return _held.bind(x, owner=owner)
+
 
 class _Suspended:
     """Keeps the collector off while anybody is inside, and leaves it as the first found it: devices have threads."""

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from interactive_nav.physics.warp_callbacks import keep_collector_out
+from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import FAR_M, NEAR_M, Lens, Renderer
@@ -360,8 +360,9 @@ class MeshRenderer(Renderer):
         sphere = jnp.concatenate([pos + rotate(axes, sphere[..., :3]), sphere[..., 3:]], -1)
         columns, rows = jnp.asarray(self.lens.columns), jnp.asarray(self.lens.rows)
         size = (len(scene), self.lens.height, self.lens.width)
+        handle = held(self._handle, self._mesh)
         depth, ids, kind, normal, base = self._draw(
-            self._handle, scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants,
+            handle, scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants,
             launch_dims=(size[0], -(-size[1] // 8), -(-size[2] // 4), 32), output_dims=size,
         )  # fmt: skip
         return {"depth": depth, "segmentation": ids, **lit_images(base, normal, camera, kind == 1, ids, look)}

@@ -16,7 +16,7 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.physics.base import uncommitted
-from interactive_nav.physics.warp_callbacks import keep_collector_out
+from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses
 from interactive_nav.sensing.shading import SKY_COLOUR
@@ -68,7 +68,7 @@ class WarpRenderer(BoxRenderer):
     def trace_batch(self, scene, qpos, camera):
         n = scene.shape[0]
         context = self._context(n)
-        centre, axes = box_poses(self.tables, scene, qpos)
+        centre, axes = box_poses(self.tables, scene, held(qpos, self._contexts[n]))
         half = self.tables.half_m[scene]
         hidden = half[..., :1] < 0
         centre = jnp.where(hidden, jnp.asarray(_HIDDEN_W), centre)

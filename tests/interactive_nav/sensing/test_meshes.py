@@ -1,6 +1,8 @@
 """Textured meshes by our own Warp kernel, on the CPU: against C MuJoCo's rays, and texels by hand."""
 
 import functools
+import gc
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -115,3 +117,20 @@ def test_texels_are_where_the_faces_coordinates_put_them(tmp_path, baked):
 def test_rays_of_plain_jax_draw_no_meshes():
     with pytest.raises(ConfigError, match="renderer is 'rays', expected auto or warp with image_geometry=meshes"):
         NavConfig.of(observations=("rgb",), image_geometry="meshes", renderer="rays")
+
+
+def test_a_program_outlives_the_renderer_that_it_draws_with(room):
+    world = build_world(get_robot("turtlebot"), (load_scene(room),), NavConfig.of(num_objects=0))
+    renderer = make_renderer(build_boxes(world), LENS, "auto", "native", world)
+    camera = look_along(jnp.asarray([[-1.0, 0.0, 0.2]]), jnp.asarray([[1.0, 0.0, 0.0]]))
+    at = jnp.zeros(1, jnp.int32), jnp.asarray(world.rest_qpos[:1], jnp.float32), camera
+    draw = jax.jit(functools.partial(renderer.images_batch, ("rgb",))).lower(*at).compile()
+    want, mesh = jax.device_get(draw(*at)["depth"]), weakref.ref(renderer._mesh)
+    del renderer
+    jax.clear_caches()
+    gc.collect()
+    assert mesh() is not None
+    np.testing.assert_array_equal(draw(*at)["depth"], want)
+    del draw
+    gc.collect()
+    assert mesh() is None
