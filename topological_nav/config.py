@@ -246,6 +246,8 @@ class EvaluationConfig(Settings):
     """Episodes played at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
+    objects: Annotated[int, (0, 100)] = 0
+    """Small objects strewn over the floor; images of goals and maps are of the scene without them."""
     supersample: Annotated[int | None, (1, 16)] = None
     """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
     most 2."""

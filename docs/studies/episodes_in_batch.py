@@ -111,10 +111,10 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
         setattr(simulator, name, clock.timed("physics", getattr(simulator, name)))
     draw = clock.timed("drawing", venue.camera)
 
-    def camera(xy_w, yaw_rad):
+    def camera(xy_w, yaw_rad, qpos):
         nonlocal images
         images += len(xy_w)
-        return draw(xy_w, yaw_rad)
+        return draw(xy_w, yaw_rad, qpos)
 
     journeys = clock.timed("episodes drawn", lambda: venue.episodes)()
     player = NavigatorPlayer(Navigator(made, sight, policy, contest.config.navigator), simulator, camera)

@@ -85,7 +85,7 @@ def _draw_pair(
     return jnp.where(miss > 0, known[0], start), jnp.where(miss > 0, known[1], goal)
 
 
-def _place_small(
+def place_small(
     key: jax.Array,
     tables: SceneTables,
     scene: jax.Array,
@@ -93,7 +93,7 @@ def _place_small(
     kept_free_w: list[jax.Array],
     robot_radius_m: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Places [k, 2] of the small objects, clear of each other and of a robot at points (2,); and which found one."""
+    """Places [k, 2] of objects of radii [k], clear of each other and of a robot at points (2,), and which have one."""
     count = radius_m.shape[0]
     if not count:
         return jnp.zeros((0, 2)), jnp.zeros(0, bool)
@@ -154,7 +154,7 @@ def draw_episode(
     start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, min_goal_distance_m, max_goal_distance_m)
 
     kept_free = [start_xy, goal_xy] if goal_clear else [start_xy]
-    small_xy, small_placed = _place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)
+    small_xy, small_placed = place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)
     turn = jax.random.uniform(key_turn, small_radius_m.shape, minval=-jnp.pi, maxval=jnp.pi)
     return EpisodeStart(
         scene_index=scene,

@@ -127,7 +127,6 @@ class SceneModel:
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         self._inertial_axes_b = matrix_from_quat(self.model.body_iquat)
-        self._geom_axes_b = matrix_from_quat(self.model.geom_quat)
         mine, rest = ((class_id(kind, classes), kind) for kind in ("robot", "structure"))
         robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
         names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
@@ -171,9 +170,28 @@ class SceneModel:
             axes = rotation.reshape(3, 3)
             data.xipos[body] = pos + axes @ model.body_ipos[body]
             data.ximat[body] = (axes @ self._inertial_axes_b[body]).ravel()
-            own = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
-            data.geom_xpos[own] = pos + model.geom_pos[own] @ axes.T
-            data.geom_xmat[own] = (axes @ self._geom_axes_b[own]).reshape(-1, 9)
+            own, geom_pos, geom_axes = carried_geoms(model, body, np.asarray(pos)[None], axes[None])
+            data.geom_xpos[own], data.geom_xmat[own] = geom_pos[0], geom_axes[0].reshape(-1, 9)
+
+
+def carried_geoms(
+    model: mujoco.MjModel, body: int, pos_w: np.ndarray, axes_w: np.ndarray
+) -> tuple[slice, np.ndarray, np.ndarray]:
+    """Where a body's geoms are.
+
+    Args:
+        model: any.
+        body: its id.
+        pos_w: [N, 3] m, of the body in N moments.
+        axes_w: [N, 3, 3], its axes in columns.
+
+    Returns:
+        Ids of its geoms (g), positions [N, g, 3] and axes [N, g, 3, 3].
+    """
+    own = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+    axes_w = axes_w[:, None]
+    pos = pos_w[:, None] + (axes_w @ model.geom_pos[own, :, None])[..., 0]
+    return own, pos, axes_w @ matrix_from_quat(model.geom_quat[own])
 
 
 def cast(

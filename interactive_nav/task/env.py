@@ -14,7 +14,7 @@ from brax.envs.base import Env, State
 
 from interactive_nav.config import NavConfig
 from interactive_nav.navigation.lookup import cell_centre, geodesic_at, goal_field, grid_waypoints_at, waypoints_at
-from interactive_nav.navigation.placement import draw_episode
+from interactive_nav.navigation.placement import draw_episode, place_small
 from interactive_nav.navigation.tables import build_tables, furniture_map, rest_poses
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
 from interactive_nav.physics.base import TOUCH_FORCE_N
@@ -139,6 +139,19 @@ class InteractiveNav(Env):
             self.config.rules.goal_clear,
             self.config.rules.random_object_yaw,
         )
+
+    def strew(self, key: jax.Array, start: EpisodeStart) -> EpisodeStart:
+        """A given episode with its small objects drawn: clear of start, goal and each other.
+
+        Args:
+            key: consumed.
+            start: leaves of one environment.
+        """
+        key_place, key_turn = jax.random.split(key)
+        free, scene = [start.start_xy_w, start.goal_xy_w], start.scene_index
+        xy, ok = place_small(key_place, self.tables, scene, self._small_radius_m, free, self.robot.footprint_radius_m)
+        turn = jax.random.uniform(key_turn, ok.shape, minval=-jnp.pi, maxval=jnp.pi)
+        return start.replace(small_xy_w=xy, small_yaw_rad=turn, small_placed=ok)
 
     def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
         """The first state of a given episode (fixed evaluation episodes, tests).

@@ -59,11 +59,11 @@ class NavigatorPlayer:
         self.state: State | None = None
 
     def begin(self, episodes: DrivenEpisodes) -> None:
-        """Takes the goals' images, along as many headings as a localisation's."""
+        """Takes the goals' images, of the scene at rest, along as many headings as a localisation's."""
         count = self._navigator.config.images
         around = 2 * np.pi * np.arange(count) / count
         n = len(episodes)
-        images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n))
+        images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n), None)
         images = images.reshape(n, count, *images.shape[1:])
         self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
         self._images = images[:, 0].copy()
@@ -80,7 +80,7 @@ class NavigatorPlayer:
         mind = self._navigator.stop(self.state, over)
         looks = np.flatnonzero(self._navigator.looks(mind, seen.yaw_rad, time_s))
         if len(looks):  # the others keep an old image, which nobody looks at
-            self._images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks])
+            self._images[looks] = self._camera(seen.xy_w[looks], seen.yaw_rad[looks], seen.qpos[looks])
         self.state, linear, angular, events = self._navigator.step(mind, self._images, seen.yaw_rad, time_s)
         self._watch(time_s, seen, self.state, events)
         return self._simulator.drive(state, linear, angular), events

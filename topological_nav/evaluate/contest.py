@@ -107,13 +107,16 @@ class ContestScene:
     @functools.cached_property
     def simulator(self) -> Simulator:
         """Of the navigator."""
-        return Simulator(make_env(self.scene, self.contest.robot, self.contest.config.backend))
+        return self._simulator(None)
 
     @functools.cached_property
     def expert_simulator(self) -> Simulator:
         """Of the expert, which plans for half of the robot's width: doorways are narrower than its diagonal."""
-        radius_m = self.robot.body_width_m / 2
-        return Simulator(make_env(self.scene, self.contest.robot, self.contest.config.backend, radius_m))
+        return self._simulator(self.robot.body_width_m / 2)
+
+    def _simulator(self, radius_m: float | None) -> Simulator:
+        config = self.contest.config
+        return Simulator(make_env(self.scene, self.contest.robot, config.backend, radius_m, config.objects))
 
     @functools.cached_property
     def map(self) -> TopologicalMap:
@@ -128,9 +131,10 @@ class ContestScene:
         """What the navigator's sight understands."""
         if self.networks is None:
             return pose_camera
-        plain = scene_camera(renderer_of(self.scene, self.drawn), self.robot)
+        world = self.simulator.env.world
+        plain = scene_camera(renderer_of(self.scene, self.drawn, world.small_objects), self.robot, world)
         domain = preset(self.contest.domain)
-        return lambda xy, yaw: as_seen_from(plain(xy, yaw), domain, xy, yaw)
+        return lambda xy, yaw, qpos=None: as_seen_from(plain(xy, yaw, qpos), domain, xy, yaw)
 
     @property
     def drawn(self) -> DataConfig:
@@ -229,6 +233,7 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulat
     from train.scoring.evaluation import load_policy
 
     folder, words = RunFolder(run), [f"env.backend={config.backend}"] if config.backend != "auto" else []
+    words += [f"env.num_objects={config.objects}"] if config.objects else []
     made = config_to_play(folder, words, [str(scene.path)], Console(stderr=True))
     env = make_trained_env(made.env)
     policy, _ = load_policy(folder, made, env, "best", deterministic=False)

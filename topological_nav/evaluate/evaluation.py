@@ -73,7 +73,8 @@ def play(
     """Plays episodes to their ends, in one batch."""
     tally = _Tally(episodes, config, simulator.dt_s)
     contender.begin(episodes)
-    state = simulator.start(episodes.start_xy_w, episodes.yaw_rad, episodes.goal_xy_w, episodes.number, config.seed)
+    begin = episodes.start_xy_w, episodes.yaw_rad, episodes.goal_xy_w, episodes.number
+    state = simulator.start(*begin, config.seed, strewn=config.objects > 0)
     step, seen = 0, simulator.seen(state)
     while not tally.over.all():
         before, time = seen, step * simulator.dt_s

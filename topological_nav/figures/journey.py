@@ -145,7 +145,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
 
     def watch(time_s: float, seen: Seen, state: State, events: Events) -> None:
         if filmed and not contest.truth and len(seen_at) % every == 0:
-            views[len(seen_at)] = venue.camera(seen.xy_w[:1], seen.yaw_rad[:1])[0]
+            views[len(seen_at)] = venue.camera(seen.xy_w[:1], seen.yaw_rad[:1], seen.qpos[:1])[0]
         seen_at.append((time_s, seen.xy_w[0], seen.yaw_rad[0], int(state.phase[0])))
         told.extend(f"{time_s:7.1f} s  {said}" for said in _said(made, state, events))
 

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.files import whole_file
@@ -174,9 +175,9 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
     return dataclasses.replace(data, supersample=supersample)
 
 
-def renderer_of(scene: Scene, data: DataConfig) -> SceneRenderer:
-    """What draws a scene as a dataset's images were drawn."""
-    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine)
+def renderer_of(scene: Scene, data: DataConfig, small: Sequence[SmallObject] = ()) -> SceneRenderer:
+    """What draws a scene, and small objects in it, as a dataset's images were drawn."""
+    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, small)
 
 
 class Pictures:

@@ -1,4 +1,4 @@
-"""Where a robot stands and looks in, what its camera sees out: a scene at rest, drawn in batches of any size.
+"""Where a robot stands and looks in, what its camera sees out: a scene as it is, drawn in batches of any size.
 
 `warp` (MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's own renderer, which needs EGL or OSMesa)
 both draw the visual meshes with their textures. Their light differs, so the images of one do not fit networks that
@@ -8,7 +8,7 @@ learned from the other.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,18 +17,23 @@ import mujoco
 import numpy as np
 
 from interactive_nav.pictures.gl import GlPainter
-from interactive_nav.pictures.scene_model import SCENE, picture_spec
+from interactive_nav.pictures.scene_model import SCENE, carried_geoms, picture_spec
 from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import matrix_from_quat
 
 CPU_IMAGES = (1, 2, 6, 18)
 """Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""
 DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
 """Least and most images a call on an accelerator, and the most pixels drawn for them."""
-Painter = Callable[[np.ndarray, np.ndarray], Any]
-"""Positions [n, 3] and axes [n, 3, 3] of cameras to images [n, H, W, 3] u8, in an array of any kind."""
+Painter = Callable[..., Any]
+"""Positions [n, 3] and axes [n, 3, 3] of cameras, the same of all geoms [n, g, ...], to images [n, H, W, 3] u8, in an
+array of any kind."""
+Bodies = tuple[Sequence[str], np.ndarray, np.ndarray]
+"""Names (B), positions [N, B, 3] (m, world) and quaternions [N, B, 4] of bodies, in N images."""
 
 
 def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pitch_rad: np.ndarray) -> CameraPose:
@@ -76,9 +81,11 @@ def need_engine(engine: str) -> None:
 
 
 class SceneRenderer:
-    """Draws one scene, its furniture at rest and no robot in it."""
+    """Draws one scene without a robot in it."""
 
-    def __init__(self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp"):
+    def __init__(
+        self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", small: Sequence[SmallObject] = ()
+    ):
         """Loads the scene's meshes; the first picture may compile.
 
         Args:
@@ -86,6 +93,7 @@ class SceneRenderer:
             lens: of the images returned.
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
+            small: small objects, out of sight where they are not placed.
 
         Raises:
             UserError: the engine does not start here.
@@ -93,8 +101,10 @@ class SceneRenderer:
         need_engine(engine)
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
-        self._model = _visual_model(scene, self._large)
+        self._model = _visual_model(scene, self._large, small)
         self._data = mujoco.MjData(self._model)
+        for name in body_names(small):
+            self._data.qpos[self._model.joint(f"{name}_joint").qposadr[0] + 2] = -50.0
         mujoco.mj_forward(self._model, self._data)
         self._painters: dict[int, Painter] = {}
         """By images a call."""
@@ -105,10 +115,16 @@ class SceneRenderer:
             self._sizes = (1,)
             self._painters[1] = self._gl_painter()
 
-    def draw(self, pose: CameraPose) -> np.ndarray:
-        """[N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
+    def draw(self, pose: CameraPose, bodies: Bodies | None = None) -> np.ndarray:
+        """[N, H, W, 3] u8 images of cameras with leaves [N, ...].
+
+        Args:
+            pose: of the cameras.
+            bodies: where they are; those without a name here are at rest, names that nothing here has are left out.
+        """
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
         count, first = len(pos), 0
+        geoms = self._geoms(count, bodies)
         out = np.empty((count, self._lens.height, self._lens.width, 3), np.uint8)
         drawn: list[tuple[int, Any]] = []
 
@@ -120,11 +136,24 @@ class SceneRenderer:
         for size in calls(count, self._sizes):
             # Padded by the last camera: Warp draws batches of fixed sizes only.
             rows = np.minimum(np.arange(first, first + size), count - 1)
-            drawn.append((first, self._painter(size)(pos[rows], axes[rows])))
+            drawn.append((first, self._painter(size)(pos[rows], axes[rows], *(of[rows] for of in geoms))))
             first += size
             fetch(1)  # the accelerator draws the next batch while this one is copied
         fetch(0)
         return out
+
+    def _geoms(self, count: int, bodies: Bodies | None) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [count, ngeom, 3] and axes [count, ngeom, 3, 3]."""
+        xpos = np.tile(self._data.geom_xpos.astype(np.float32), (count, 1, 1))
+        xmat = np.tile(self._data.geom_xmat.reshape(-1, 3, 3).astype(np.float32), (count, 1, 1, 1))
+        names, pos_w, quat_w = bodies or ((), xpos, xpos)
+        for i, name in enumerate(names):
+            body = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, name)
+            if body > 0:
+                axes_w = matrix_from_quat(quat_w[:, i])
+                own, xpos_own, xmat_own = carried_geoms(self._model, body, pos_w[:, i], axes_w)
+                xpos[:, own], xmat[:, own] = xpos_own, xmat_own
+        return xpos, xmat
 
     def _painter(self, size: int) -> Painter:
         if size not in self._painters:
@@ -135,20 +164,23 @@ class SceneRenderer:
         from interactive_nav.sensing.warp import WarpColour
 
         painter = WarpColour(self._model, self._large, size, list(SCENE))
-        xpos = jnp.asarray(np.tile(self._data.geom_xpos, (size, 1, 1)), jnp.float32)
-        xmat = jnp.asarray(np.tile(self._data.geom_xmat.reshape(-1, 3, 3), (size, 1, 1, 1)), jnp.float32)
 
         @jax.jit
-        def paint(xpos: jax.Array, xmat: jax.Array, pos: jax.Array, axes: jax.Array) -> jax.Array:
+        def paint(pos: jax.Array, axes: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
             return shrink(painter.draw(xpos, xmat, CameraPose(pos, axes)), self._by)
 
-        return lambda pos, axes: paint(xpos, xmat, pos, axes)
+        return paint
 
     def _gl_painter(self) -> Painter:
         data, lens, by = self._data, self._large, self._by
         painter = GlPainter(self._model, lens.width, lens.height)
+
         # Without `self`: a context holds some 100 MiB, and goes with its renderer, not when cycles are collected.
-        return lambda pos, axes: shrink(painter.draw(data, CameraPose(pos, axes), lens.fov_deg, SCENE), by)
+        def paint(pos: np.ndarray, axes: np.ndarray, xpos: np.ndarray, xmat: np.ndarray) -> np.ndarray:
+            data.geom_xpos[:], data.geom_xmat[:] = xpos[0], xmat[0].reshape(-1, 9)
+            return shrink(painter.draw(data, CameraPose(pos, axes), lens.fov_deg, SCENE), by)
+
+        return paint
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
@@ -196,9 +228,9 @@ def shrink(images: Any, by: int) -> Any:
     return (whole + up).astype(xp.uint8)
 
 
-def _visual_model(scene: Scene, lens: Lens) -> mujoco.MjModel:
+def _visual_model(scene: Scene, lens: Lens, small: Sequence[SmallObject]) -> mujoco.MjModel:
     """The scene's visual meshes and floor; boxes stand for bodies without a mesh."""
-    spec = picture_spec(scene)
+    spec = picture_spec(scene, small=small)
     if not any(body.joints for body in spec.bodies):
         # MJX-Warp wants at least one degree of freedom.
         body = spec.worldbody.add_body(name="unseen", pos=[0, 0, -60.0])

@@ -1,7 +1,7 @@
 """Velocity commands in, poses, images and contacts out: TTbot in a scene, many at a time, at 10 Hz.
 
-Physics is `interactive_nav`'s environment with furniture where it stands at rest and nothing strewn about. Images show
-the scene at rest as well: what a robot has pushed away is still seen where it stood.
+Physics is `interactive_nav`'s environment; furniture begins where it stands at rest. Images show what is pushed where
+it is, open doors open, and small objects where they lie.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.config import NavConfig
+from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene
+from interactive_nav.scenes.world import World
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.versions import usable_cores
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 
-Camera = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Places [n, 2] (m) and headings [n] (rad) to what is seen there [n, ...]."""
+Camera = Callable[..., np.ndarray]
+"""Places [n, 2] (m), headings [n] (rad) and the world's `qpos` [n, nq] to what is seen there [n, ...]; None: a world at
+rest, without small objects."""
 CONTROL = "twist"
 """Control mode whose action is a base velocity."""
 
@@ -43,11 +46,13 @@ class Seen:
     """[B] bool: touched something movable in the last control step."""
     wall: np.ndarray
     """[B] bool: touched a wall in it."""
+    qpos: np.ndarray
+    """[B, nq] of the environment: where everything is."""
     broken: np.ndarray
     """[B] bool: the physics gave up on it, lost contacts, or left out something near (MJX's window was full)."""
 
 
-def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = None) -> InteractiveNav:
+def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = None, objects: int = 0) -> InteractiveNav:
     """The environment that evaluation steps, on past what it itself would call the end of an episode.
 
     Args:
@@ -55,6 +60,7 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
         robot: its name; it must know control mode `twist`.
         backend: of physics.
         radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
+        objects: small objects that are strewn about.
 
     Raises:
         UserError: the backend is not installed.
@@ -63,7 +69,7 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
     config = NavConfig.of(
         backend=backend,
         control_mode=CONTROL,
-        num_objects=0,
+        num_objects=objects,
         observations=("localisation",),
         episode_steps=10**8,
         num_waypoints=1,
@@ -100,6 +106,7 @@ class Simulator:
         """
         self.env = env
         self._reset = jax.jit(jax.vmap(env.reset_to))
+        self._strewn = jax.jit(jax.vmap(env.strew))
         # A step writes where the state lay: for buffers that have moved MJX-Warp captures its graphs anew.
         self._advance = jax.jit(jax.vmap(env.advance), donate_argnums=0)
         self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
@@ -112,12 +119,22 @@ class Simulator:
         return self.env.dt
 
     def start(
-        self, start_xy_w: np.ndarray, yaw_rad: np.ndarray, goal_xy_w: np.ndarray, number: np.ndarray, seed: int
+        self,
+        start_xy_w: np.ndarray,
+        yaw_rad: np.ndarray,
+        goal_xy_w: np.ndarray,
+        number: np.ndarray,
+        seed: int,
+        strewn: bool = False,
     ) -> Any:
-        """States of B episodes, with observations; noise of an episode depends on its number [B] and the seed."""
+        """States of B episodes, with observations; noise of an episode depends on its number [B] and the seed.
+
+        So does where its small objects lie, if they are `strewn`; else they are left out.
+        """
         objects = len(self.env.world.small_objects)
         keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.asarray(number))
-        return self._reset(episode_starts(start_xy_w, yaw_rad, goal_xy_w, objects), keys)
+        starts = episode_starts(start_xy_w, yaw_rad, goal_xy_w, objects)
+        return self._reset(self._strewn(keys, starts) if strewn else starts, keys)
 
     def drive(self, state: Any, linear: np.ndarray, angular: np.ndarray) -> Any:
         """One control step under base velocities [B] m/s and [B] rad/s; the state given is used up."""
@@ -133,24 +150,33 @@ class Simulator:
         if self._last is None or self._last[0] is not state:
             nav = state.info["nav"]
             of = (nav.robot_pos_w, nav.yaw_rad, nav.robot_path_m, nav.touching, nav.overflow_steps + nav.left_out_steps)
-            told = np.asarray(self._packed(of, state.metrics["nonfinite"])).astype(float)
-            xy, (yaw, path), flags = told[:, :2], told[:, 2:4].T, told[:, 4:].T > 0
-            self._last = state, Seen(xy, yaw, path, *flags)
+            told = np.asarray(self._packed(of, state.metrics["nonfinite"], state.pipeline_state.qpos)).astype(float)
+            xy, (yaw, path), (movable, wall, broken) = told[:, :2], told[:, 2:4].T, told[:, 4:7].T > 0
+            self._last = state, Seen(xy, yaw, path, movable, wall, told[:, 7:], broken)
         return self._last[1]
 
 
-def _packed(nav: tuple[jax.Array, ...], nonfinite: jax.Array) -> jax.Array:
-    """[B, 7] f32: what `Seen` tells, in one array, because every transfer from an accelerator makes it wait."""
+def _packed(nav: tuple[jax.Array, ...], nonfinite: jax.Array, qpos: jax.Array) -> jax.Array:
+    """[B, 7 + nq] f32: what `Seen` tells, in one array, because every transfer from an accelerator makes it wait."""
     pos, yaw, path, touching, lost = nav
     broken = (nonfinite > 0) | (lost > 0)
-    return jnp.concatenate([pos[:, :2], jnp.stack([yaw, path, *touching.T[:2], broken], 1)], 1).astype(jnp.float32)
+    flags = jnp.stack([yaw, path, *touching.T[:2], broken], 1)
+    return jnp.concatenate([pos[:, :2], flags, qpos], 1).astype(jnp.float32)
 
 
-def scene_camera(renderer: SceneRenderer, robot: RobotSpec) -> Camera:
-    """Level images of a robot's camera."""
-    return lambda xy, yaw: renderer.draw(camera_pose(robot, xy, yaw, np.zeros(len(xy))))
+def scene_camera(renderer: SceneRenderer, robot: RobotSpec, world: World) -> Camera:
+    """Level images of a robot's camera, of the world's first scene."""
+
+    def images(xy: np.ndarray, yaw: np.ndarray, qpos: np.ndarray | None = None) -> np.ndarray:
+        bodies = None
+        if qpos is not None:
+            names, own, pos_w, quat_w = world_poses(world, 0, qpos)
+            bodies = names[own:], pos_w[:, own:], quat_w[:, own:]
+        return renderer.draw(camera_pose(robot, xy, yaw, np.zeros(len(xy))), bodies)
+
+    return images
 
 
-def pose_camera(xy_w: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
+def pose_camera(xy_w: np.ndarray, yaw_rad: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
     """The camera of `sight.TrueSight`: [n, 3] poses."""
     return np.concatenate([np.asarray(xy_w, float), np.asarray(yaw_rad, float)[:, None]], -1)

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.robots import get_robot
 from interactive_nav.sensing.base import Lens
 from interactive_nav_common.config import replace
@@ -101,13 +102,16 @@ def test_a_trained_policy_starts_every_run_with_a_fresh_memory_and_keeps_it_with
 def test_it_is_shown_level_images_of_where_the_robot_is_and_its_words_are_commands(watched):
     venue, policy, steps, _ = watched
     renderer = SceneRenderer(venue.scene, Lens(32, 32, venue.networks.camera.fov_deg))
+    world = venue.simulator.env.world
     robot, about = get_robot("ttbot"), policy.policy.about
     acted = [i for i in range(1, len(steps)) if steps[i][4] > steps[i - 1][4]]
     for i in acted[:: max(1, len(acted) // 5)]:
         _, seen, state, _, count = steps[i]
         _, images, _, linear, angular = policy.calls[count - 1]
         assert images.shape == (1, 32, 32, 3) and images.dtype == np.uint8
-        expected = renderer.draw(camera_pose(robot, seen.xy_w, seen.yaw_rad, np.zeros(1)))
+        names, own, pos_w, quat_w = world_poses(world, 0, seen.qpos)
+        bodies = names[own:], pos_w[:, own:], quat_w[:, own:]
+        expected = renderer.draw(camera_pose(robot, seen.xy_w, seen.yaw_rad, np.zeros(1)), bodies)
         assert (images == expected).all()
         assert (images != renderer.draw(camera_pose(robot, seen.xy_w, seen.yaw_rad, np.array([0.35])))).any()
         assert (state.linear[0], state.angular[0]) == (linear[0], angular[0])

@@ -50,14 +50,14 @@ class Rails:
     def __init__(self, touches):
         self._touches = touches
 
-    def start(self, start_xy_w, yaw_rad, goal_xy_w, number, seed):
+    def start(self, start_xy_w, yaw_rad, goal_xy_w, number, seed, strewn=False):
         return np.array(start_xy_w)[:, 0], 0, number
 
     def seen(self, state):
         x, step, number = state
         movable = np.array([step in self._touches.get(int(n), ()) for n in number])
         none = np.zeros(len(x), bool)
-        return Seen(np.stack([x, 0 * x], -1), 0 * x, 0.2 * step + 0 * x, movable, none, none)
+        return Seen(np.stack([x, 0 * x], -1), 0 * x, 0.2 * step + 0 * x, movable, none, np.zeros((len(x), 7)), none)
 
 
 class Line:
@@ -366,8 +366,10 @@ def test_one_array_tells_what_the_state_holds():
     nav = {
         name: jnp.asarray(value, value.dtype if value.dtype != float else jnp.float32) for name, value in nav.items()
     }
-    state = SimpleNamespace(info={"nav": SimpleNamespace(**nav)}, metrics={"nonfinite": jnp.zeros(3)})
-    simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step"), abs)))
+    physics = SimpleNamespace(qpos=jnp.asarray(rng.normal(size=(3, 9)), jnp.float32))
+    info, metrics = {"nav": SimpleNamespace(**nav)}, {"nonfinite": jnp.zeros(3)}
+    state = SimpleNamespace(info=info, metrics=metrics, pipeline_state=physics)
+    simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step", "strew"), abs)))
     seen = simulator.seen(state)
     assert (seen.xy_w == np.asarray(nav["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float
     assert (seen.yaw_rad == np.asarray(nav["yaw_rad"])).all()
@@ -375,6 +377,7 @@ def test_one_array_tells_what_the_state_holds():
     assert seen.movable.tolist() == [True, False, False]
     assert seen.wall.tolist() == [False, True, False]
     assert seen.broken.tolist() == [False, True, True]
+    assert (seen.qpos == np.asarray(physics.qpos)).all()
     assert simulator.seen(state) is seen  # the same state is not asked twice
 
 

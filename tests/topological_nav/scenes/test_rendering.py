@@ -113,7 +113,7 @@ def test_each_call_takes_the_least_batch_that_serves(painted, monkeypatch):
 
     def noted(self, size):
         paint = make(self, size)
-        return lambda pos, axes: asked.append(len(pos)) or paint(pos, axes)
+        return lambda pos, *rest: asked.append(len(pos)) or paint(pos, *rest)
 
     monkeypatch.setattr(SceneRenderer, "_warp_painter", noted)
     scene, lens, robot = load_scene(painted), Lens(16, 12, 60.0), get_robot("ttbot")
