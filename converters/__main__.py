@@ -21,6 +21,7 @@ from rich.console import Console
 from converters.furniture_library import add_library
 from converters.generating import Commands, add_generate, add_generate_scenes, add_launcher, add_models, positive
 from converters.records.errors import StageFailed
+from converters.segmenting import add_segmenting
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import UserError
@@ -323,8 +324,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     generating = (add_generate, add_generate_scenes, add_models, add_library)
-    for add in (_add_convert, _add_propose, _add_object, _add_check, *generating, _add_preview, _add_export):
+    for add in (_add_convert, add_segmenting, _add_propose, _add_object, _add_check, *generating, _add_preview):
         add(commands)
+    _add_export(commands)
     return parser
 
 

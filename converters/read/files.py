@@ -118,6 +118,18 @@ def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
         raise SceneRejected(f"{path}: not readable ({type(error).__name__}: {reason}); {remedy}") from error
 
 
+def read_labels(path: Path) -> np.ndarray:
+    """(n,) int64 NYU40 ids: the array `label` of an NPZ.
+
+    Raises:
+        SceneRejected: there is none, or it holds no whole numbers.
+    """
+    labels = read_npz(path, "label", "expected an NPZ with the array 'label' of NYU40 ids")
+    if labels.dtype.kind not in "iu":
+        raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
+    return labels.reshape(-1).astype(np.int64)
+
+
 def read_image(path: Path, mode: str) -> np.ndarray:
     """Reads an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w).
 

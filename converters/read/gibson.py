@@ -13,10 +13,10 @@ import numpy as np
 
 from converters.read.annotations import inside_scan, parse_annotations
 from converters.read.cad import read_cad
-from converters.read.files import SourceFolder, read_image, read_json, read_npz
+from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_npz
 from converters.read.obj import GREY, TexturedMesh, read_scan_obj
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_upright, with_own_corners
+from converters.read.surfaces import check_upright, labelled, with_own_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION, FLOOR, GivenMap, RawScene, ScanMesh, Storey
 
@@ -53,12 +53,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
     heights = read_floors(source)
     labels = None
     if source.has(LABELS):
-        labels = _labels(source.use(LABELS, ""))
-        if len(labels) != len(mesh.vertices):
-            raise SceneRejected(
-                f"{root / LABELS}: {len(labels)} labels for the {len(mesh.vertices)} vertices of {MESH}, "
-                "expected one for each 'v' line; label the same mesh again"
-            )
+        mesh, labels = labelled(mesh, read_labels(source.use(LABELS, "")), root / LABELS)
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, labels, heights[0])
     if labels is None:
         source.note(f"{LABELS} is absent: floor, walls and ceiling are told by shape")
@@ -104,13 +99,6 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
         warnings=tuple(source.warnings),
         attribution=read_attribution(source),
     )
-
-
-def _labels(path: Path) -> np.ndarray:
-    labels = read_npz(path, "label", "expected an NPZ with the array 'label' of NYU40 ids")
-    if labels.dtype.kind not in "iu":
-        raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
-    return labels.reshape(-1).astype(np.int64)
 
 
 def _furnished(path: Path) -> bool:

@@ -20,10 +20,10 @@ from trimesh.visual import ColorVisuals
 
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
-from converters.read.files import SourceFolder, check_mesh
+from converters.read.files import SourceFolder, check_mesh, read_labels
 from converters.read.obj import GREY, TexturedMesh, join_meshes, read_scan_obj, read_texture, texels, use_found
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_extent, floor_level, with_own_corners
+from converters.read.surfaces import check_extent, floor_level, labelled, with_own_corners
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, check_count
 from converters.records.raw import RawScene, ScanMesh
@@ -37,6 +37,11 @@ UP_AXES = {
     "Z_UP": np.eye(3),
 }
 """COLLADA's word -> turn to z up."""
+
+
+def labels_beside(path: Path) -> Path:
+    """Where the labels of a mesh file lie, if it has any."""
+    return path.with_name(f"{path.stem}.labels.npz")
 
 
 class SourceResolver(Resolver):
@@ -134,7 +139,7 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
 def read_single_mesh(
     path: Path, strict: bool = False, up: str = "auto", unit: str = "auto", mirror: bool = False
 ) -> RawScene:
-    """Reads a scan that is one mesh file: floor, walls and ceiling are told by shape, all furniture stays part of it.
+    """Reads a scan that is one mesh file. Without `labels_beside` structure is told by shape.
 
     Args:
         path: of the file; what it names must lie in its folder.
@@ -165,20 +170,19 @@ def read_single_mesh(
             "turn the order of each face's corners if only that is wrong"
         )
     floor_m = floor_level(mesh.vertices, mesh.faces, str(path))
-    mesh = with_own_corners(mesh)
-    source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, furniture is part of them")
+    if labels_beside(path).is_file():
+        given = source.use(source.inside(labels_beside(path)), "")
+        mesh, labels = labelled(mesh, read_labels(given), given)
+    else:
+        mesh = with_own_corners(mesh)
+        labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
+        source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
     grey = np.full((len(mesh.vertices), 3), GREY[0], np.uint8) if mesh.texture is None else None
+    scan = ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture)
     return RawScene(
         name=path.stem,
         source_format="mesh",
-        scan=ScanMesh(
-            mesh.vertices,
-            mesh.faces,
-            label_storeys(mesh.vertices, mesh.faces, (floor_m,)),
-            grey,
-            mesh.corner_uv,
-            mesh.texture,
-        ),
+        scan=scan,
         cads={},
         annotations=(),
         floor_height_m=floor_m,

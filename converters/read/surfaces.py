@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
@@ -44,6 +45,21 @@ def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
     return dataclasses.replace(
         mesh, vertices=np.vstack([mesh.vertices, mesh.vertices[mesh.faces[long]].reshape(-1, 3)]), faces=faces
     )
+
+
+def labelled(mesh: TexturedMesh, labels: np.ndarray, where: Path) -> tuple[TexturedMesh, np.ndarray]:
+    """A mesh and its labels: one a vertex, or as many as `with_own_corners` makes.
+
+    Raises:
+        SceneRejected: another number.
+    """
+    own = mesh if len(labels) == len(mesh.vertices) else with_own_corners(mesh)
+    if len(labels) != len(own.vertices):
+        raise SceneRejected(
+            f"{where}: {len(labels)} labels for the {len(mesh.vertices)} vertices of the mesh, "
+            "expected one for each; label the same mesh again"
+        )
+    return own, labels
 
 
 def check_extent(where: str, vertices: np.ndarray) -> None:

@@ -1,0 +1,104 @@
+"""An unlabelled scan in, NYU40 labels of its vertices out, and how well they fit a labelled one's."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.propose.proposals import bounds, box_iou, propose_instances
+from converters.propose.report import annotated_vertices
+from converters.read.storeys import storey_of
+from converters.read.surfaces import floor_level
+from converters.records.raw import UNLABELLED, RawScene, ScanMesh
+from converters.segment.network import WEIGHTS, Scores, make_scores, read_weights, score_voxels
+from converters.segment.samples import TIERS, building_surface
+from converters.segment.voxels import (
+    NAMES,
+    NYU40,
+    Surface,
+    at_vertices,
+    classes_of,
+    intersection_over_union,
+    sample_surface,
+    voxelise,
+)
+
+FOUND_IOU = 0.5
+"""Of boxes, from which on a proposal is an annotated object."""
+Report = Callable[[str, float], None]
+
+
+def load_scores(weights: Path = WEIGHTS) -> Scores:
+    """The network with weights, for `label_scan`.
+
+    Raises:
+        SceneRejected: there are none, or damaged ones.
+    """
+    return make_scores(*read_weights(weights))
+
+
+def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:
+    """(n, classes) scores of a surface's points, storey by storey; zeros too high above a floor."""
+    out, of = np.zeros((len(surface.points), len(NAMES)), np.float32), storey_of(surface.points[:, 2], floors_m)
+    for k, floor_m in enumerate(floors_m):
+        mine = np.flatnonzero(of == k)
+        colours = None if surface.colours is None else surface.colours[mine]
+        part = Surface(surface.points[mine], surface.normals[mine], colours, surface.face[mine])
+        voxels = voxelise(part, floor_m)
+        found = score_voxels(voxels, scores, lambda share, k=k: report("segment", (k + share) / len(floors_m)))
+        inside = voxels.of_point >= 0
+        out[mine[inside]] = found[voxels.of_point[inside]]
+    return out
+
+
+def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, share: None) -> np.ndarray:
+    """(n,) int64 NYU40 ids of the scan's vertices; its own labels are not looked at.
+
+    Args:
+        raw: the read source.
+        scores: of `load_scores`.
+        report: progress, (stage, share).
+    """
+    scan = raw.scan
+    floors = tuple(s.height_m for s in raw.storeys)
+    if not floors:
+        given = raw.floor_height_m
+        floors = (floor_level(scan.vertices, scan.faces, raw.name) if given is None else given,)
+    surface = sample_surface(scan)
+    found = at_vertices(score_points(surface, floors, scores, report), surface, scan.faces, len(scan.vertices))
+    return np.where(found.any(axis=1), NYU40[found.argmax(axis=1)], UNLABELLED)
+
+
+def objects_found(raw: RawScene, scan: ScanMesh) -> int:
+    """How many of a source's annotated objects `propose` finds by the labels of a scan: same category, `FOUND_IOU`."""
+    proposals = propose_instances(scan)
+    boxes = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations]
+    return sum(
+        any(p.category == category and box_iou(box, bounds(p.points)) >= FOUND_IOU for p in proposals)
+        for category, box in boxes
+    )
+
+
+def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any]:
+    """IoU by class at the vertices of a labelled source, and the annotated objects found beside true labels."""
+    labels = label_scan(raw, scores, report)
+    iou = intersection_over_union(classes_of(raw.scan.labels), classes_of(labels))
+    found = objects_found(raw, dataclasses.replace(raw.scan, labels=labels))
+    return {"iou": iou, "objects": len(raw.annotations), "found": found, "found_true": objects_found(raw, raw.scan)}
+
+
+def score_homes(seeds: range, scores: Scores, report: Report) -> dict[str, float]:
+    """IoU by class over the surfaces of whole generated buildings of each tier, their furniture held out."""
+    truth, found = [], []
+    for k, seed in enumerate(seeds):
+        surface, classes = building_surface(seed, TIERS[k % len(TIERS)], "test")
+        guess = score_points(surface, (0.0,), scores, lambda stage, share: None)
+        inside = guess.any(axis=1)
+        truth.append(classes[inside])
+        found.append(guess[inside].argmax(axis=1))
+        report("score", (k + 1) / len(seeds))
+    return intersection_over_union(np.concatenate(truth), np.concatenate(found))

@@ -1,0 +1,164 @@
+"""Dense tiles of voxels in, class scores of every voxel out: a 3-D U-Net whose finest maps have half the resolution.
+
+Each cell of 2 x 2 x 2 voxels is one place with eight times the channels, on the way in and out: an eighth of the work,
+and nothing is lost. Normalisation is over channels alone, so that a tile's size changes nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from converters.records.errors import SceneRejected
+from converters.segment.voxels import BELOW_M, FEATURES, LAYERS, NAMES, VOXEL_M, Voxels
+from interactive_nav_common.files import write_arrays
+
+WEIGHTS = Path(__file__).with_name("weights.npz")
+"""The package's own."""
+TILE, MARGIN = 160, 16
+"""Voxels of a tile's side, and of its border, which is left to the next tile."""
+MULTIPLE = 8
+"""Sides of a tile are multiples of this many voxels."""
+
+
+class VoxelNet(nn.Module):
+    """Scores [N, X, Y, Z, classes] of tiles [N, X, Y, Z, FEATURES + 2]."""
+
+    widths: Sequence[int] = (40, 64, 96)
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Scores of every voxel; sides are multiples of `MULTIPLE`."""
+        x, skips = _fold(x.astype(self.dtype)), []
+        for level, width in enumerate(self.widths):
+            if level:
+                skips.append(x)
+                x = nn.Dense(width, dtype=self.dtype)(_fold(x))
+            x = self._block(x, width)
+        for skip in reversed(skips):
+            width = skip.shape[-1]
+            x = jnp.concatenate([_unfold(nn.Dense(8 * width, dtype=self.dtype)(x)), skip], axis=-1)
+            x = self._block(x, width)
+        return _unfold(nn.Dense(8 * len(NAMES), dtype=self.dtype)(x)).astype(jnp.float32)
+
+    def _block(self, x: jax.Array, width: int) -> jax.Array:
+        x = nn.relu(nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
+        return nn.relu(x + nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
+
+
+def _fold(x: jax.Array) -> jax.Array:
+    """[N, X, Y, Z, C] -> [N, X/2, Y/2, Z/2, 8C]."""
+    n, a, b, c, f = x.shape
+    x = x.reshape(n, a // 2, 2, b // 2, 2, c // 2, 2, f).transpose(0, 1, 3, 5, 2, 4, 6, 7)
+    return x.reshape(n, a // 2, b // 2, c // 2, 8 * f)
+
+
+def _unfold(x: jax.Array) -> jax.Array:
+    """[N, X, Y, Z, 8C] -> [N, 2X, 2Y, 2Z, C]."""
+    n, a, b, c, f = x.shape
+    x = x.reshape(n, a, b, c, 2, 2, 2, f // 8).transpose(0, 1, 4, 2, 5, 3, 6, 7)
+    return x.reshape(n, 2 * a, 2 * b, 2 * c, f // 8)
+
+
+def dense(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """[N, X, Y, LAYERS, FEATURES + 2] tiles: occupied, height over the floor (in 3 m), then the features.
+
+    Args:
+        index: [N, K, 3] int; rows with a negative x are none.
+        features: [N, K, FEATURES] int8.
+        shape: X, Y.
+    """
+    height = (index[..., 2:] + 0.5) * (VOXEL_M / 3) - BELOW_M / 3
+    given = jnp.concatenate([jnp.ones_like(height), height, features.astype(jnp.float32) / 127], axis=-1)
+    x, y, z = (jnp.where(index[..., :1] < 0, 1 << 20, index)[..., k] for k in range(3))
+    tile = jnp.arange(len(index))[:, None]
+    return jnp.zeros((len(index), *shape, LAYERS, FEATURES + 2)).at[tile, x, y, z].set(given, mode="drop")
+
+
+Scores = Callable[[jax.Array, jax.Array, tuple[int, int]], jax.Array]
+"""Index, features and shape of `dense` -> [N, X, Y, LAYERS, classes]."""
+
+
+def make_scores(net: VoxelNet, variables: Any) -> Scores:
+    """A network with weights, compiled once a shape."""
+
+    @functools.partial(jax.jit, static_argnums=2)
+    def scores(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
+        out = net.apply(variables, dense(index, features, shape))
+        assert isinstance(out, jax.Array)
+        return jax.nn.log_softmax(out)
+
+    return scores
+
+
+def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None) -> np.ndarray:
+    """(k, classes) scores of occupied voxels, tile by tile.
+
+    Args:
+        voxels: of one storey.
+        scores: of `make_scores`.
+        report: progress.
+    """
+    out = np.zeros((len(voxels.index), len(NAMES)), np.float32)
+    extent = voxels.index[:, :2].max(axis=0, initial=0) + 1
+    side = [min(TILE, int(-(-n // 16) * 16)) for n in extent]
+    step = [s - 2 * MARGIN if n > s else s for n, s in zip(extent, side, strict=True)]
+    starts = [(i, j) for i in range(0, int(extent[0]), step[0]) for j in range(0, int(extent[1]), step[1])]
+    tiles = []
+    for start in starts:
+        low = np.array(start) - [MARGIN if n > s else 0 for n, s in zip(extent, side, strict=True)]
+        at = voxels.index[:, :2] - low
+        near = np.flatnonzero(((at >= 0) & (at < side)).all(axis=1))
+        own = ((voxels.index[near, :2] >= start) & (voxels.index[near, :2] < np.add(start, step))).all(axis=1)
+        if own.any():
+            tiles.append((low, near, near[own]))
+    most = max((len(near) for _, near, _ in tiles), default=0)
+    for k, (low, near, own) in enumerate(tiles):
+        index, features = np.full((1, most, 3), -1), np.zeros((1, most, FEATURES), np.int8)
+        index[0, : len(near)], features[0, : len(near)] = voxels.index[near] - [*low, 0], voxels.features[near]
+        found = scores(jnp.asarray(index), jnp.asarray(features), (side[0], side[1]))[0]
+        x, y, z = (voxels.index[own] - [*low, 0]).T
+        out[own] = np.asarray(found[x, y, z])
+        report((k + 1) / len(tiles))
+    return out
+
+
+def write_weights(path: Path, net: VoxelNet, variables: Any) -> None:
+    """Writes weights of a byte each, with a factor for each output of a layer; vectors as float16."""
+    arrays: dict[str, np.ndarray] = {"widths": np.array(net.widths)}
+    for name, value in flatten_dict(variables["params"], sep="/").items():
+        value = np.asarray(value, np.float32)
+        if value.ndim > 1:
+            factor = np.abs(value).max(axis=tuple(range(value.ndim - 1))) / 127
+            arrays[f"{name}@"] = factor
+            arrays[name] = np.round(value / np.maximum(factor, 1e-12)).astype(np.int8)
+        else:
+            arrays[name] = value.astype(np.float16)
+    write_arrays(path, **arrays)
+
+
+def read_weights(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
+    """What `write_weights` wrote.
+
+    Raises:
+        SceneRejected: it is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+        net = VoxelNet(tuple(int(w) for w in arrays.pop("widths")))
+        params = {n: jnp.asarray(v * arrays.get(f"{n}@", 1), jnp.float32) for n, v in arrays.items() if n[-1] != "@"}
+        return net, {"params": unflatten_dict(params, sep="/")}
+    except (OSError, KeyError, ValueError) as error:
+        raise SceneRejected(
+            f"{path}: no readable weights ({error}); give weights.npz of 'python -m converters segment-train'"
+        ) from error

@@ -1,0 +1,199 @@
+"""Seeds in, labelled crops of furnished buildings out, as a hand-held sensor would have scanned them, and worse.
+
+Frame: scan x, y, height above the floor; metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from converters.generate import GenerationError, HomeConfig, design_building, render_building
+from converters.generate.design.instance import Instance
+from converters.generate.models.parts import MATERIALS
+from converters.generate.surface.scan import NYU40 as LABELS
+from converters.generate.surface.scan import smooth_noise
+from converters.recipes import building_of
+from converters.records.raw import ScanMesh
+from converters.segment.voxels import LAYERS, NAMES, VOXEL_M, Surface, classes_of, joined, sample_surface, voxelise
+from interactive_nav_common.files import write_arrays
+
+TIERS = ("furnished", "cluttered", "sparse")
+OTHER = (39,)
+"""Id of generated appliances as of waste baskets: here they are `other`, unless their category is one of these."""
+BASKETS = ("basket", "bin", "laundry_basket")
+
+
+@dataclasses.dataclass(frozen=True)
+class Crop:
+    """Occupied voxels of a square column."""
+
+    index: np.ndarray
+    """(k, 3) uint8."""
+    features: np.ndarray
+    """(k, `FEATURES`) int8."""
+    classes: np.ndarray
+    """(k,) uint8."""
+
+
+def _of_item(item: Instance) -> list[Surface]:
+    visual = item.model.surface
+    if visual is not None:
+        v, none = item.to_floor(np.asarray(visual.vertices, float)), np.zeros(len(visual.vertices), np.int64)
+        uv = np.asarray(visual.uv, float)[visual.uv_faces]
+        return [sample_surface(ScanMesh(v, visual.faces, none, None, uv, np.asarray(visual.image)[..., :3]))]
+    surfaces = []
+    for part in item.model.parts:
+        v = item.to_floor(part.vertices)
+        bare = sample_surface(ScanMesh(v, part.faces, np.zeros(len(v), np.int64), None))
+        colour = 255 * np.array(MATERIALS[part.material])
+        surfaces.append(dataclasses.replace(bare, colours=np.tile(colour, (len(bare.points), 1))))
+    return surfaces
+
+
+def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndarray]:
+    """Structure and furniture of a generated building, with the class of each point.
+
+    Args:
+        seed: of the building.
+        tier: one of `TIERS`.
+        split: train or test: whose models.
+    """
+    config = building_of(tier, {}, split, "segment")
+    building = design_building(seed, config)
+    scan, atlas = render_building(building, seed, config, lambda stage, share: None)
+    labels = scan.labels.astype(int)
+    home = isinstance(config, HomeConfig)
+    labels[np.isin(labels, OTHER) & home] = 40
+    shell = ScanMesh(scan.vertices, scan.faces, labels, None, atlas.uv[atlas.face_uv], atlas.image)
+    surfaces = [sample_surface(shell)]
+    classes = [classes_of(labels)[scan.faces[surfaces[0].face, 0]]]
+    for item in building.items if home else ():
+        category = item.model.category
+        label = 39 if category in BASKETS else 40 if LABELS[category] in OTHER else LABELS[category]
+        surfaces += (found := _of_item(item))
+        classes += [np.full(len(s.points), classes_of(np.array([label]))[0]) for s in found]
+    return joined(surfaces), np.concatenate(classes)
+
+
+def _seen(surface: Surface, rng: np.random.Generator, side_m: float) -> np.ndarray:
+    """(n,) bool: points that a sensor carried around the middle sees."""
+    occupied = voxelise(surface, 0.0)
+    grid = np.zeros((*(occupied.index[:, :2].max(axis=0, initial=0) + 3), LAYERS + 2), bool)
+    grid[tuple(occupied.index.T)] = True
+    top = np.array(grid.shape) - 1
+    at = occupied.index + 0.5
+    normal = occupied.features[:, :3] / 127
+    seen = np.zeros(len(at), bool)
+    for _ in range(int(rng.integers(3, 9))):
+        spread = rng.normal(0, side_m / 7, 2)
+        camera = (np.array([*spread, rng.uniform(0.8, 1.8)]) - occupied.origin) / VOXEL_M
+        start = at + 1.7 * normal
+        ray = camera - start
+        facing = np.flatnonzero(~seen & ((ray * normal).sum(axis=1) > 0.1 * np.linalg.norm(ray, axis=1)))
+        free = np.ones(len(facing), bool)
+        for t in np.linspace(0, 1, 64, endpoint=False):
+            cell = np.clip((start[facing] + t * ray[facing]).astype(int), 0, top)
+            free &= ~grid[tuple(cell.T)]
+        seen[facing[free]] = True
+    return seen[occupied.of_point] & (occupied.of_point >= 0)
+
+
+def _recoloured(colours: np.ndarray | None, rng: np.random.Generator) -> np.ndarray | None:
+    """Another exposure, white balance and camera; a quarter of all without any colour."""
+    if colours is None or rng.random() < 0.25:
+        return None
+    c = np.clip(colours / 255, 0.0, 1.0)[:, rng.permutation(3) if rng.random() < 0.15 else [0, 1, 2]]
+    grey = c.mean(axis=1, keepdims=True)
+    c = grey + (c - grey) * rng.uniform(0.2, 1.4)
+    c = np.clip(c, 0, 1) ** rng.uniform(0.6, 1.9) * rng.uniform(0.5, 1.15) * rng.uniform(0.85, 1.15, 3)
+    return 255 * np.clip(c + rng.normal(0, rng.uniform(0, 0.06), c.shape) + rng.normal(0, 0.04), 0, 1)
+
+
+def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m: float) -> tuple[Surface, np.ndarray]:
+    """A square column of a building turned, mirrored and scanned badly around its middle, which is at x = y = 0."""
+    floor = np.flatnonzero((classes == NAMES.index("floor")) & (surface.normals[:, 2] > 0.9))
+    middle = surface.points[rng.choice(floor)] if len(floor) else surface.points.mean(axis=0)
+    angle, mirror = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]) @ np.diag(
+        [mirror, 1, 1]
+    )
+    points = (surface.points - [*middle[:2], 0]) @ turn.T * rng.uniform(0.9, 1.1)
+    keep = (np.abs(points[:, :2]) < side_m / 2).all(axis=1) & (rng.random(len(points)) < rng.uniform(0.4, 1.0))
+    if rng.random() < 0.5:
+        keep &= classes != NAMES.index("ceiling")
+    if rng.random() < 0.5:
+        keep &= points[:, 2] < rng.uniform(1.1, 2.6)
+    keep = np.flatnonzero(keep)
+    points, normals = points[keep], surface.normals[keep] @ turn.T
+    taken = np.zeros(len(keep), bool)
+    for spot in points[rng.integers(len(points), size=rng.integers(0, 12))] if len(points) else ():
+        taken |= ((points - spot) ** 2).sum(axis=1) < rng.uniform(0.05, 0.4) ** 2
+    if len(points) and rng.random() < 0.5:
+        taken |= smooth_noise(points, rng.uniform(0.15, 0.5), rng) > rng.uniform(1.2, 2.5)
+    if len(points):
+        wave = smooth_noise(points, rng.uniform(0.08, 0.3), rng) * rng.uniform(0, 0.015)
+        moved = points + normals * (wave + rng.normal(0, rng.uniform(0, 0.008), len(points)))[:, None]
+        normals = normals + rng.normal(0, rng.uniform(0, 0.3), normals.shape)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        points = moved + [0, 0, rng.normal(0, 0.02)]
+    colours = _recoloured(None if surface.colours is None else surface.colours[keep], rng)
+    out = Surface(points, normals, colours, surface.face[keep])
+    left = ~taken
+    if len(points) and rng.random() < 0.7:
+        left &= _seen(out, rng, side_m)
+    return (
+        Surface(points[left], normals[left], None if colours is None else colours[left], out.face[left]),
+        classes[keep][left],
+    )
+
+
+def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side: int) -> Crop:
+    """Voxels of `worn`, each of the class that most of its points have.
+
+    Args:
+        surface: of a building.
+        classes: (n,) of its points.
+        rng: random stream.
+        side: voxels.
+    """
+    column, of = worn(surface, classes, rng, side * VOXEL_M)
+    voxels = voxelise(column, 0.0)
+    votes = np.zeros((len(NAMES), len(voxels.index)), np.int32)
+    for k in range(len(NAMES)):
+        votes[k] = np.bincount(voxels.of_point[(of == k) & (voxels.of_point >= 0)], minlength=len(voxels.index))
+    inside = (voxels.index < side).all(axis=1) if len(voxels.index) else np.zeros(0, bool)
+    return Crop(
+        voxels.index[inside].astype(np.uint8), voxels.features[inside], votes.argmax(axis=0)[inside].astype(np.uint8)
+    )
+
+
+def write_crops(path: Path, seed: int, split: str, count: int, side: int) -> Path:
+    """Writes crops of one building; one that cannot be built gives its place to the next of 1,000,000 seeds on."""
+    rng = np.random.default_rng((seed, 7))
+    tier = str(rng.choice(TIERS, p=(0.5, 0.25, 0.25)))
+    try:
+        surface, classes = building_surface(seed, tier, split)
+    except GenerationError:
+        return write_crops(path, seed + 1_000_000, split, count, side)
+    crops = [make_crop(surface, classes, rng, side) for _ in range(count)]
+    crops = [c for c in crops if len(c.index) > 500] or crops
+    columns = {f.name: np.concatenate([getattr(c, f.name) for c in crops]) for f in dataclasses.fields(Crop)}
+    write_arrays(path, lengths=np.array([len(c.index) for c in crops]), **columns)
+    return path
+
+
+def generate_crops(task: tuple[Path, int, str, int, int]) -> Path:
+    """`write_crops` of these words, unless they are there."""
+    return task[0] if task[0].exists() else write_crops(*task)
+
+
+def read_crops(path: Path) -> list[Crop]:
+    """What `write_crops` wrote."""
+    with np.load(path) as file:
+        ends = np.cumsum(file["lengths"])[:-1]
+        return [
+            Crop(*row) for row in zip(*(np.split(file[f.name], ends) for f in dataclasses.fields(Crop)), strict=True)
+        ]

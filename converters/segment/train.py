@@ -1,0 +1,245 @@
+"""Settings in, a folder with weights out: buildings are generated beside the training, which goes on where it stopped.
+
+OUT/crops/SEED.npz   labelled voxels of a generated building, held_out/SEED.npz of those with other furniture
+    checkpoint.msgpack, weights.npz, metrics.jsonl   as of the last save
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import flax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from converters.segment.network import VoxelNet, dense, write_weights
+from converters.segment.samples import Crop, generate_crops, read_crops
+from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_over_union
+from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings
+from interactive_nav_common.files import whole_file, write_text
+
+HELD_OUT_SEED = 900_000
+State = tuple[Any, Any]
+"""Parameters, optimiser's state."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SegmentConfig(Settings):
+    """What the network learns from, and for how long."""
+
+    buildings: Count = 400
+    """Generated, each another home or sparse building."""
+    held_out: Count = 24
+    """Buildings with other furniture that it is scored by."""
+    crops: AtLeastOne = 48
+    """Of a building, each worn in another way."""
+    side: AtLeastOne = 96
+    """Voxels of a crop's side, a multiple of 8."""
+    widths: tuple[int, ...] = (40, 64, 96)
+    """Channels of the levels."""
+    batch: Count = 16
+    """Crops of a step."""
+    most_voxels: Count = 40000
+    """Of a crop; the rest is left out at random."""
+    steps: Count = 20000
+    """At most."""
+    minutes: Positive = 480.0
+    """At most, of training; the learning rate falls to nothing at whichever comes first."""
+    learning_rate: Positive = 2e-3
+    """At the beginning."""
+    workers: Count = os.cpu_count() or 1
+    """Processes that generate."""
+    save_s: Positive = 60.0
+    """Seconds between saves."""
+    half: bool = False
+    """Computes in bfloat16, for GPUs."""
+    seed: Seed = 0
+    """Of the first building, and of the weights."""
+
+
+def turned(crop: Crop, side: int, quarter: int, mirror: bool) -> Crop:
+    """The crop turned by quarters, counter-clockwise, and then mirrored in x, within its square."""
+    index, features = crop.index.astype(np.int64), crop.features.copy()
+    for _ in range(quarter % 4):
+        index = np.stack([side - 1 - index[:, 1], index[:, 0], index[:, 2]], axis=1)
+        features[:, 0], features[:, 1] = -features[:, 1], features[:, 0].copy()
+    if mirror:
+        index[:, 0], features[:, 0] = side - 1 - index[:, 0], -features[:, 0]
+    return Crop(index, features, crop.classes)
+
+
+def batch_of(crops: Sequence[Crop], config: SegmentConfig, rng: np.random.Generator | None) -> tuple[np.ndarray, ...]:
+    """Index [N, K, 3] i32, features [N, K, FEATURES] i8 and classes [N, K] u8; turned at random with `rng`."""
+    n, k = len(crops), config.most_voxels
+    index, classes = np.full((n, k, 3), -1, np.int32), np.full((n, k), UNKNOWN, np.uint8)
+    features = np.zeros((n, k, FEATURES), np.int8)
+    for row, crop in enumerate(crops):
+        if rng is not None:
+            crop = turned(crop, config.side, int(rng.integers(4)), bool(rng.integers(2)))
+            pick = rng.permutation(len(crop.index))[:k]
+        else:
+            pick = np.arange(min(k, len(crop.index)))
+        count = len(pick)
+        index[row, :count], features[row, :count] = crop.index[pick], crop.features[pick]
+        classes[row, :count] = crop.classes[pick]
+    return index, features, classes
+
+
+def _scores_at(net: VoxelNet, params: Any, index: jax.Array, features: jax.Array, side: int) -> jax.Array:
+    out = net.apply({"params": params}, dense(index, features, (side, side)))
+    assert isinstance(out, jax.Array)
+    at = jnp.maximum(index, 0)
+    return out[jnp.arange(len(index))[:, None], at[..., 0], at[..., 1], at[..., 2]]
+
+
+def make_step(net: VoxelNet, config: SegmentConfig) -> tuple[Callable[[Any], State], Callable[..., tuple[Any, ...]]]:
+    """Functions: parameters -> state, and (state, learning rate, batch) -> state, loss; rare classes weigh more."""
+    rule = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), optax.add_decayed_weights(1e-3))
+
+    def loss_of(params: Any, index: jax.Array, features: jax.Array, classes: jax.Array) -> jax.Array:
+        scores = _scores_at(net, params, index, features, config.side)
+        known = classes != UNKNOWN
+        classes = jnp.where(known, classes, 0)
+        count = jnp.zeros(len(NAMES)).at[classes].add(known)
+        weight = jnp.where(known, ((count.sum() / (count + 1.0)) ** 0.5)[classes], 0.0)
+        loss = optax.softmax_cross_entropy_with_integer_labels(scores, classes)
+        return (weight * loss).sum() / jnp.maximum(weight.sum(), 1.0)
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def step(state: State, rate: jax.Array, *batch: jax.Array) -> tuple[State, jax.Array]:
+        loss, gradient = jax.value_and_grad(loss_of)(state[0], *batch)
+        change, inner = rule.update(gradient, state[1], state[0])
+        return (optax.apply_updates(state[0], jax.tree.map(lambda c: -rate * c, change)), inner), loss
+
+    return lambda params: (params, rule.init(params)), step
+
+
+def score_crops(net: VoxelNet, params: Any, crops: Sequence[Crop], config: SegmentConfig) -> dict[str, float]:
+    """Class -> IoU over all voxels of the crops."""
+    scores = jax.jit(functools.partial(_scores_at, net), static_argnums=3)
+    truth, found = [], []
+    for first in range(0, len(crops), config.batch):
+        index, features, classes = batch_of(crops[first : first + config.batch], config, None)
+        found.append(np.asarray(scores(params, index, features, config.side).argmax(axis=-1)).ravel())
+        truth.append(classes.ravel())
+    return intersection_over_union(np.concatenate(truth), np.concatenate(found)) if crops else {}
+
+
+def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None], tell: Callable[[str], None]) -> dict:
+    """Trains, or goes on; what was learned is saved whatever ends it.
+
+    Args:
+        out: folder of the run.
+        config: settings; `widths`, `side` and `seed` must be those that it was begun with.
+        report: progress, (stage, share).
+        tell: told one line a save.
+
+    Returns:
+        IoU by class on what was held out, and `mean`.
+    """
+    tasks = [
+        (out / folder / f"{seed}.npz", seed, split, config.crops if split == "train" else 8, config.side)
+        for folder, split, start, count in (
+            ("held_out", "test", HELD_OUT_SEED, config.held_out),
+            ("crops", "train", config.seed, config.buildings),
+        )
+        for seed in range(start, start + count)
+    ]
+    for folder in ("held_out", "crops"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    with multiprocessing.get_context("spawn").Pool(
+        config.workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    ) as pool:
+        made = pool.imap_unordered(generate_crops, tasks)
+        learner, held_out = _Learner(out, config, report, tell), []
+        try:
+            ready, least = [], min(len(tasks), config.held_out + min(config.buildings, 2 * config.workers))
+            while len(ready) < least:
+                ready.append(next(made))
+                report("generating", len(ready) / least)
+            for path in ready:
+                (learner.crops if path.parent.name == "crops" else held_out).extend(read_crops(path))
+            learner.run(functools.partial(_newly, made), held_out)
+        finally:
+            learner.save()
+            pool.terminate()
+    return learner.score(held_out)
+
+
+def _newly(made: Any) -> list[Path]:
+    """Buildings that were finished since the last call."""
+    found = []
+    while True:
+        try:
+            found.append(made.next(timeout=0))
+        except (multiprocessing.TimeoutError, StopIteration):
+            return found
+
+
+class _Learner:
+    """Network, optimiser and how far they are."""
+
+    def __init__(self, out: Path, config: SegmentConfig, report: Callable, tell: Callable[[str], None]) -> None:
+        self.out, self.config, self.report, self.tell = out, config, report, tell
+        self.crops: list[Crop] = []
+        self.net = VoxelNet(config.widths, jnp.bfloat16 if config.half else jnp.float32)
+        start, self.step = make_step(self.net, config)
+        nothing = jnp.zeros((1, 8, 8, 8, FEATURES + 2))
+        self.state: State = start(self.net.init(jax.random.key(config.seed), nothing)["params"])
+        self.steps, self.seconds, self.loss = 0, 0.0, float("nan")
+        if (out / "checkpoint.msgpack").is_file():
+            kept = {"state": self.state, "steps": 0, "seconds": 0.0}
+            kept = flax.serialization.from_bytes(kept, (out / "checkpoint.msgpack").read_bytes())
+            self.state, self.steps, self.seconds = kept["state"], kept["steps"], kept["seconds"]
+
+    def run(self, newly: Callable[[], list[Path]], held_out: list[Crop]) -> None:
+        """Steps until there were enough."""
+        rng = np.random.default_rng((self.config.seed, self.steps))
+        saved = last = time.monotonic()
+        while (share := max(self.steps / self.config.steps, self.seconds / 60 / self.config.minutes)) < 1:
+            rate = self.config.learning_rate * (0.5 + 0.5 * np.cos(np.pi * share)) * min(1.0, (self.steps + 1) / 100)
+            chosen = [self.crops[k] for k in rng.integers(len(self.crops), size=self.config.batch)]
+            self.state, loss = self.step(self.state, rate, *batch_of(chosen, self.config, rng))
+            self.steps += 1
+            if self.steps % 10 == 0:
+                self.loss = float(loss)
+                self.report("training", share)
+                self.crops += [c for p in newly() if p.parent.name == "crops" for c in read_crops(p)]
+            now = time.monotonic()
+            self.seconds, last = self.seconds + now - last, now
+            if now - saved > self.config.save_s:
+                self.save()
+                self.note(self.score(held_out[: 4 * self.config.batch]))
+                saved = last = time.monotonic()
+
+    def save(self) -> None:
+        """Writes checkpoint and weights."""
+        if self.steps:
+            kept = jax.device_get({"state": self.state, "steps": self.steps, "seconds": self.seconds})
+            with whole_file(self.out / "checkpoint.msgpack") as partial:
+                partial.write_bytes(flax.serialization.to_bytes(kept))
+            write_weights(self.out / "weights.npz", self.net, {"params": self.state[0]})
+
+    def score(self, held_out: list[Crop]) -> dict[str, float]:
+        """IoU by class, and `mean`."""
+        found = score_crops(self.net, self.state[0], held_out, self.config)
+        return found | {"mean": float(np.mean(list(found.values()))) if found else 0.0}
+
+    def note(self, scores: dict[str, float]) -> None:
+        """One line of metrics.jsonl, and of the console."""
+        row = {"step": self.steps, "seconds": round(self.seconds, 1), "loss": self.loss, "iou": scores}
+        path = self.out / "metrics.jsonl"
+        write_text(path, (path.read_text() if path.is_file() else "") + json.dumps(row) + "\n")
+        self.tell(f"step {self.steps}, {self.seconds:.0f} s, {len(self.crops)} crops: loss {self.loss:.3f}, "
+                  f"held-out mIoU {scores['mean']:.3f}")  # fmt: skip

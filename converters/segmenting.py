@@ -1,0 +1,108 @@
+"""Commands of `python -m converters` that label scans: their words, and what they print."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+
+from converters.generating import Commands, positive
+from converters.records.errors import SceneRejected
+from interactive_nav_common.files import write_arrays
+from interactive_nav_common.progress import stage_progress
+
+
+def _labels_of(source: Path) -> Path:
+    """Where the readers look for a source's labels."""
+    from converters.read.gibson import LABELS
+    from converters.read.meshes import labels_beside
+
+    if source.is_file():
+        return labels_beside(source)
+    from converters.read.source import detect_format
+
+    layout = detect_format(source)
+    if layout != "gibson":
+        raise SceneRejected(f"{source}: is of layout {layout}, expected a mesh file or a folder of layout gibson")
+    return source / LABELS
+
+
+def _segment(arguments: argparse.Namespace, console: Console) -> int:
+    target = _labels_of(arguments.source)
+    if target.exists() and not arguments.overwrite:
+        raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
+    import numpy as np
+
+    from converters.read.source import read_source
+    from converters.segment.labelling import label_scan, load_scores
+    from converters.segment.network import WEIGHTS
+
+    arguments.output = target
+    scores = load_scores(arguments.weights or WEIGHTS)
+    with stage_progress(console) as report:
+        labels = label_scan(read_source(arguments.source, up=arguments.up, unit=arguments.unit), scores, report)
+    write_arrays(target, label=labels.astype(np.uint8))
+    console.print(f"{target}: labels of {len(labels)} vertices", soft_wrap=True)
+    return 0
+
+
+def _train(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.segment.train import SegmentConfig, train
+    from interactive_nav_common.config import overridden
+
+    config = overridden(SegmentConfig(), arguments.settings)
+    with stage_progress(console) as report:
+        scores = train(arguments.out, config, report, lambda line: console.print(line, soft_wrap=True))
+    _table(console, "held-out crops", scores)
+    return 0
+
+
+def _score(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.read.source import read_source
+    from converters.segment.labelling import load_scores, score_homes, score_source
+    from converters.segment.network import WEIGHTS
+    from converters.segment.train import HELD_OUT_SEED
+
+    scores = load_scores(arguments.weights or WEIGHTS)
+    with stage_progress(console) as report:
+        for source in arguments.sources:
+            found = score_source(read_source(source), scores, report)
+            _table(console, str(source), found["iou"])
+            console.print(
+                f"{source}: of {found['objects']} annotated objects {found['found']} found, "
+                f"{found['found_true']} with its own labels",
+                soft_wrap=True,
+            )
+        if arguments.homes:
+            # Whole buildings of other seeds than those whose crops the training was watched by.
+            homes = range(HELD_OUT_SEED + 50_000, HELD_OUT_SEED + 50_000 + arguments.homes)
+            _table(console, f"{arguments.homes} held-out buildings", score_homes(homes, scores, report))
+    return 0
+
+
+def _table(console: Console, what: str, iou: dict[str, float]) -> None:
+    mean = iou.get("mean", sum(iou.values()) / max(len(iou), 1))
+    row = ", ".join(f"{name} {value:.3f}" for name, value in iou.items() if name != "mean")
+    console.print(f"{what}: mIoU {mean:.3f}; {row}", soft_wrap=True, highlight=False)
+
+
+def add_segmenting(commands: Commands) -> None:
+    """Words of `segment`, `segment-train` and `segment-score`."""
+    about = "weights.npz of a training (default: the packaged)"
+    command = commands.add_parser("segment", help="label an unlabelled scan by a network, for propose and convert")
+    command.add_argument("source", type=Path, metavar="SRC", help="a mesh file, or a folder of layout gibson")
+    command.add_argument("--weights", type=Path, metavar="NPZ", help=about)
+    command.add_argument("--up", choices=("auto", *"xyz", "-x", "-y", "-z"), default="auto", help="axis of a mesh file")
+    command.add_argument("--unit", choices=("auto", "m", "cm", "mm", "ft", "in"), default="auto", help="of a mesh file")
+    command.add_argument("--overwrite", action="store_true", help="replace labels that are there")
+    command.set_defaults(run=_segment, writes=("{}",))
+    command = commands.add_parser("segment-train", help="train the network of segment on generated buildings")
+    command.add_argument("out", type=Path, metavar="OUT", help="folder of the run; one that is there is gone on with")
+    command.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="such as steps=1000; see SegmentConfig")
+    command.set_defaults(run=_train, writes=("{}",))
+    command = commands.add_parser("segment-score", help="score the network on labelled scans and generated buildings")
+    command.add_argument("sources", nargs="*", type=Path, metavar="SRC", help="labelled scans")
+    command.add_argument("--homes", type=positive, metavar="N", help="also whole generated buildings, so many")
+    command.add_argument("--weights", type=Path, metavar="NPZ", help=about)
+    command.set_defaults(run=_score, writes=())

@@ -1,0 +1,194 @@
+"""The volumetric network: voxels by hand, labels at vertices, files that the readers take, a few steps of training."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from converters.__main__ import main
+from converters.read.meshes import labels_beside
+from converters.read.source import read_source
+from converters.records.errors import SceneRejected
+from converters.records.raw import ScanMesh
+from converters.segment.labelling import label_scan
+from converters.segment.network import VoxelNet, read_weights, score_voxels, write_weights
+from converters.segment.samples import Crop, building_surface, make_crop, read_crops
+from converters.segment.train import SegmentConfig, batch_of, make_step, score_crops, turned
+from converters.segment.voxels import (
+    FEATURES,
+    NAMES,
+    UNKNOWN,
+    Surface,
+    at_vertices,
+    classes_of,
+    intersection_over_union,
+    sample_surface,
+    voxelise,
+)
+
+TINY = SegmentConfig(widths=(16, 24), side=16, most_voxels=1200, batch=1)
+FLOOR, WALL, OTHER = (NAMES.index(name) for name in ("floor", "wall", "other"))
+
+
+def square(size_m: float = 1.0) -> ScanMesh:
+    """A level square of two triangles, coloured from black to white along x."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * size_m
+    colours = np.repeat([[0], [255], [255], [0]], 3, axis=1).astype(np.uint8)
+    return ScanMesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(4, int), colours)
+
+
+def test_ids_become_classes_and_what_is_not_known_stays_so():
+    assert classes_of(np.array([0, 1, 2, 11, 39, 38, 5])).tolist() == [
+        *(UNKNOWN, WALL, FLOOR, WALL, NAMES.index("basket"), OTHER, NAMES.index("chair"))
+    ]
+
+
+def test_a_surface_is_sampled_evenly_with_its_own_colours():
+    found = sample_surface(square(), spacing_m=0.05)
+    assert len(found.points) == 400 and np.bincount(found.face).tolist() == [200, 200]
+    assert found.normals.tolist() == [[0, 0, 1]] * 400
+    assert found.colours is not None and np.allclose(found.colours[:, 0], 255 * found.points[:, 0])
+    quadrant = (found.points[:, :2] > 0.5) @ [1, 2]
+    assert np.abs(np.bincount(quadrant) - 100).max() <= 6
+    grey = dataclasses.replace(square(), vertex_colours=np.full((4, 3), 160, np.uint8))
+    assert sample_surface(grey).colours is None
+
+
+def test_voxels_by_hand():
+    points = np.array([[0.0, 0.0, 1.0], [0.02, 0.03, 1.0], [0.05, 0.0, 1.0], [0.0, 0.0, 9.0]])
+    normals = np.array([[0.0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 0, 1]])
+    colours = np.array([[127.5, 0, 255], [127.5, 0, 255], [255, 255, 255], [0, 0, 0.0]])
+    found = voxelise(Surface(points, normals, colours, np.zeros(4, int)), floor_m=1.0)
+    assert found.origin.tolist() == pytest.approx([0.0, 0.0, 0.82])
+    assert found.index.tolist() == [[0, 0, 4], [1, 0, 4]]
+    assert found.of_point.tolist() == [0, 0, 1, -1]
+    assert found.features.tolist() == [[64, 0, 64, 0, -127, 127, 127], [0, 0, -127, 127, 127, 127, 127]]
+
+
+def test_scores_of_points_come_together_at_vertices():
+    surface = sample_surface(square(), spacing_m=0.5)
+    assert surface.face.tolist() == [0, 0, 1, 1]
+    scores = np.array([[0, 1], [0, 1], [3, 0], [3, 0]])
+    assert at_vertices(scores, surface, square().faces, 4).tolist() == [[6, 2], [0, 2], [6, 2], [6, 0]]
+
+
+def test_iou_by_hand():
+    truth = np.array([WALL, WALL, FLOOR, FLOOR, UNKNOWN])
+    found = np.array([WALL, FLOOR, FLOOR, FLOOR, OTHER])
+    assert intersection_over_union(truth, found) == {"wall": 0.5, "floor": 2 / 3}
+
+
+def test_a_crop_turned_by_a_quarter_turns_its_normals_too():
+    features = np.zeros((1, FEATURES), np.int8)
+    features[0, :2] = 127, 3
+    crop = Crop(np.array([[5, 2, 9]], np.uint8), features, np.array([1], np.uint8))
+    once = turned(crop, 16, 1, mirror=False)
+    assert once.index.tolist() == [[13, 5, 9]] and once.features[0, :2].tolist() == [-3, 127]
+    back = turned(turned(once, 16, 3, mirror=True), 16, 0, mirror=True)
+    assert back.index.tolist() == [[5, 2, 9]] and back.features[0, :2].tolist() == [127, 3]
+
+
+def stair() -> Crop:
+    """A level plate with normals up and an upright one with normals along x."""
+    grid = np.stack(np.meshgrid(np.arange(16), np.arange(16), indexing="ij"), axis=-1).reshape(-1, 2)
+    plate = np.column_stack([grid, np.full(256, 5)])
+    upright = np.column_stack([np.zeros(256, int), grid[:, 0], 6 + grid[:, 1]])
+    features = np.zeros((512, FEATURES), np.int8)
+    features[:256, 2], features[256:, 0] = 127, 127
+    classes = np.repeat([FLOOR, WALL], 256).astype(np.uint8)
+    return Crop(np.concatenate([plate, upright]).astype(np.uint8), features, classes)
+
+
+def test_a_few_steps_learn_one_sample_by_heart_and_weights_keep_it(tmp_path):
+    net = VoxelNet(TINY.widths)
+    start, step = make_step(net, TINY)
+    state = start(net.init(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2)))["params"])
+    batch, losses = batch_of([stair()], TINY, None), []
+    for _ in range(25):
+        state, loss = step(state, 3e-3, *batch)
+        losses.append(float(loss))
+    assert losses[-1] < 0.2 * losses[0]
+    assert score_crops(net, state[0], [stair()], TINY) == {"wall": 1.0, "floor": 1.0}
+    write_weights(tmp_path / "weights.npz", net, {"params": state[0]})
+    kept, variables = read_weights(tmp_path / "weights.npz")
+    assert kept.widths == (16, 24)
+    assert score_crops(kept, variables["params"], [stair()], TINY) == {"wall": 1.0, "floor": 1.0}
+
+
+def test_crops_of_a_sparse_building_are_seen_in_part():
+    surface, classes = building_surface(3, "sparse", "train")
+    assert {NAMES[k] for k in np.unique(classes)} >= {"wall", "floor", "chair", "door"}
+    crops = [make_crop(surface, classes, np.random.default_rng(k), 64) for k in range(4)]
+    assert all(c.index.max() < 80 and (c.index[:, :2] < 64).all() for c in crops)
+    assert len({len(c.index) for c in crops}) == 4
+    again = make_crop(surface, classes, np.random.default_rng(2), 64)
+    assert np.array_equal(again.index, crops[2].index) and np.array_equal(again.features, crops[2].features)
+
+
+def by_normal(index, features, shape):
+    """Scores of a stand-in for a network: level is floor, steep is wall."""
+    out = np.zeros((1, *shape, 80, len(NAMES)), np.float32)
+    x, y, z = np.asarray(index)[0].T
+    level = np.abs(np.asarray(features)[0, :, 2]) > 90
+    out[0, x, y, z, FLOOR], out[0, x, y, z, WALL] = level, ~level
+    return jnp.asarray(out)
+
+
+def test_every_voxel_of_a_long_building_is_scored_once():
+    surface = sample_surface(square(8.0), spacing_m=0.02)
+    found = score_voxels(voxelise(surface, 0.0), by_normal)
+    assert 40000 <= len(found) <= 40401 and (found[:, FLOOR] == 1).all()
+
+
+@pytest.fixture
+def room(tmp_path):
+    box = trimesh.creation.box((4, 3, 2.5)).subdivide_to_size(0.2)
+    box.invert()
+    box.update_faces(box.triangles_center[:, 2] < 1.2)  # without a ceiling
+    box.remove_unreferenced_vertices()
+    path = tmp_path / "room.ply"
+    box.export(path)
+    return path
+
+
+def test_labels_of_a_room_are_read_back(room):
+    raw = read_source(room)
+    labels = label_scan(raw, by_normal)
+    assert len(labels) == len(raw.scan.vertices) and set(labels.tolist()) == {1, 2}
+    np.savez(labels_beside(room), label=labels)
+    assert np.array_equal(read_source(room).scan.labels, labels)
+    np.savez(labels_beside(room), label=labels[:-1])
+    with pytest.raises(SceneRejected, match="labels for the"):
+        read_source(room)
+
+
+def test_the_command_writes_what_the_reader_takes_and_replaces_nothing(room, tmp_path, capsys):
+    net = VoxelNet((8,))
+    write_weights(tmp_path / "w.npz", net, net.init(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2))))
+    words = ["segment", str(room), "--weights", str(tmp_path / "w.npz")]
+    assert main(words) == 0
+    with np.load(labels_beside(room)) as file:
+        assert np.array_equal(read_source(room).scan.labels, file["label"])
+    assert main(words) == 2
+    assert "give --overwrite" in capsys.readouterr().err
+    assert main([*words, "--overwrite"]) == 0
+    assert main([*words[:3], str(tmp_path / "none.npz"), "--overwrite"]) == 2
+    assert "segment-train" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_training_goes_on_where_it_stopped(tmp_path):
+    words = ["buildings=1", "held_out=1", "crops=2", "side=32", "widths=[8,8]", "batch=1", "workers=1", "save_s=0.5"]
+    assert main(["segment-train", str(tmp_path / "run"), *words, "steps=2", "most_voxels=4000"]) == 0
+    crops = read_crops(next((tmp_path / "run/crops").glob("*.npz")))
+    assert len(crops) == 2 and all(len(c.index) == len(c.classes) for c in crops)
+    assert main(["segment-train", str(tmp_path / "run"), *words, "steps=4", "most_voxels=4000"]) == 0
+    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == sorted(row["step"] for row in rows) and rows[-1]["step"] == 4
+    assert read_weights(tmp_path / "run/weights.npz")[0].widths == (8, 8)
