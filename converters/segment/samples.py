@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.generate import GenerationError, HomeConfig, design_building, render_building
+from converters.generate import BuildingConfig, GenerationError, HomeConfig, design_building, render_building
 from converters.generate.design.instance import Instance
+from converters.generate.homes.config import home_config
+from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import NYU40 as LABELS
 from converters.generate.surface.scan import smooth_noise
-from converters.recipes import building_of
 from converters.records.raw import ScanMesh
 from converters.segment.voxels import LAYERS, NAMES, VOXEL_M, Surface, classes_of, joined, sample_surface, voxelise
 from interactive_nav_common.files import write_arrays
@@ -61,7 +62,9 @@ def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndar
         tier: one of `TIERS`.
         split: train or test: whose models.
     """
-    config = building_of(tier, {}, split, "segment")
+    # Not `recipes.building_of`, whose imports a machine for training alone lacks.
+    sparse, homes = (TRAIN_MODELS, HOME_TRAIN_MODELS) if split == "train" else (TEST_MODELS, HOME_TEST_MODELS)
+    config = BuildingConfig(models=sparse) if tier == "sparse" else home_config(tier, {}, homes)
     building = design_building(seed, config)
     scan, atlas = render_building(building, seed, config, lambda stage, share: None)
     labels = scan.labels.astype(int)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import flax
+import flax.serialization
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -174,7 +174,9 @@ def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None]
         finally:
             learner.save()
             pool.terminate()
-    return learner.score(held_out)
+    scores = learner.score(held_out)
+    learner.note(scores)
+    return scores
 
 
 def _newly(made: Any) -> list[Path]:
@@ -197,7 +199,8 @@ class _Learner:
         start, self.step = make_step(self.net, config)
         nothing = jnp.zeros((1, 8, 8, 8, FEATURES + 2))
         self.state: State = start(self.net.init(jax.random.key(config.seed), nothing)["params"])
-        self.steps, self.seconds, self.loss = 0, 0.0, float("nan")
+        self.steps, self.seconds = 0, 0.0
+        self.loss: Any = float("nan")
         if (out / "checkpoint.msgpack").is_file():
             kept = {"state": self.state, "steps": 0, "seconds": 0.0}
             kept = flax.serialization.from_bytes(kept, (out / "checkpoint.msgpack").read_bytes())
@@ -210,10 +213,9 @@ class _Learner:
         while (share := max(self.steps / self.config.steps, self.seconds / 60 / self.config.minutes)) < 1:
             rate = self.config.learning_rate * (0.5 + 0.5 * np.cos(np.pi * share)) * min(1.0, (self.steps + 1) / 100)
             chosen = [self.crops[k] for k in rng.integers(len(self.crops), size=self.config.batch)]
-            self.state, loss = self.step(self.state, rate, *batch_of(chosen, self.config, rng))
+            self.state, self.loss = self.step(self.state, rate, *batch_of(chosen, self.config, rng))
             self.steps += 1
             if self.steps % 10 == 0:
-                self.loss = float(loss)
                 self.report("training", share)
                 self.crops += [c for p in newly() if p.parent.name == "crops" for c in read_crops(p)]
             now = time.monotonic()
@@ -238,8 +240,10 @@ class _Learner:
 
     def note(self, scores: dict[str, float]) -> None:
         """One line of metrics.jsonl, and of the console."""
-        row = {"step": self.steps, "seconds": round(self.seconds, 1), "loss": self.loss, "iou": scores}
+        loss = float(self.loss)
+        row = {"step": self.steps, "seconds": round(self.seconds, 1), "loss": loss, "iou": scores}
+        row |= {"loss": None} if np.isnan(loss) else {}
         path = self.out / "metrics.jsonl"
         write_text(path, (path.read_text() if path.is_file() else "") + json.dumps(row) + "\n")
-        self.tell(f"step {self.steps}, {self.seconds:.0f} s, {len(self.crops)} crops: loss {self.loss:.3f}, "
+        self.tell(f"step {self.steps}, {self.seconds:.0f} s, {len(self.crops)} crops: loss {loss:.3f}, "
                   f"held-out mIoU {scores['mean']:.3f}")  # fmt: skip
