@@ -1,12 +1,14 @@
 """Frames per second of RGB, normals, depth and segmentation: sizes in, one JSON row a measurement out.
 
     python -m docs.studies.rendering --renderer warp rays --size 68 256 512 1024 --num-envs 1 64 1024
+    python -m docs.studies.rendering --image-geometry meshes --stream rgb --size 68 --num-envs 8192 --scenes S...
 
 Cameras stand at drawn starts of a scene and turn a little at every call, so that no frame repeats. Each stream is
 measured with the frames left on the device and copied to the host. `rgb` is Lambert shading of the collision boxes
-in their bodies' mean colours; `rgb_textured` draws the scene's visual meshes with textures (renderer warp only);
-`observation` is depth and segmentation in one pass, without the environment around them. A row that fails (memory, for
-the most part) carries `error` instead of a rate. Rows are appended to `benchmarks/results/rendering.jsonl`.
+in their bodies' mean colours, or with `--image-geometry meshes` of the scenes' textured meshes; `rgb_textured` draws a
+scene's visual meshes with MJX-Warp's own renderer (renderer warp only); `observation` is depth and segmentation in one
+pass, without the environment around them. A row that fails (memory, for the most part) carries `error` instead of a
+rate. Rows are appended to `benchmarks/results/rendering.jsonl`.
 """
 
 from __future__ import annotations
@@ -39,7 +41,9 @@ def _turned(camera: CameraPose, angle_rad: jax.Array) -> CameraPose:
     return camera.replace(axes_w=turn @ camera.axes_w)
 
 
-def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -> Callable[[jax.Array], jax.Array]:
+def program(
+    env: Any, state: Any, stream: str, renderer_name: str, lens: Lens, meshes: bool = False
+) -> Callable[[jax.Array], jax.Array]:
     """What draws one stream of every environment, as a function of the angle by which the cameras are turned.
 
     Raises:
@@ -48,8 +52,8 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
     sensors, scene, qpos = env.sensors, state.info["nav"].scene_index, state.pipeline_state.qpos
     camera = jax.jit(sensors.mount.pose)(qpos)
     if stream == "rgb_textured":
-        if renderer_name != "warp":
-            raise Skip("textures are drawn by warp only")
+        if renderer_name != "warp" or meshes:
+            raise Skip("MJX-Warp's textures are drawn by warp only")
         from interactive_nav.pictures.scene_model import SCENE, SceneModel
         from interactive_nav.sensing.warp import WarpColour
 
@@ -63,7 +67,7 @@ def program(env: Any, state: Any, stream: str, renderer_name: str, lens: Lens) -
         painter = WarpColour(visual.model, lens, n, list(SCENE))
         return lambda angle: painter.draw(position, matrix, _turned(camera, angle))
     boxes = build_boxes(env.world, sensors.boxes.classes, colours=stream in ("rgb", "normals"))
-    renderer = make_renderer(boxes, lens, renderer_name, env.backend)
+    renderer = make_renderer(boxes, lens, renderer_name, env.backend, env.world if meshes else None)
 
     @jax.jit
     def draw(scene, qpos, camera, angle):
@@ -100,6 +104,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = command_line(__doc__, "rendering")
     parser.add_argument("--scenes", nargs="+", default=[SCENE])
     parser.add_argument("--renderer", nargs="+", choices=("auto", "warp", "rays"), default=["auto"])
+    parser.add_argument("--image-geometry", choices=("boxes", "meshes"), default="boxes")
     parser.add_argument("--size", type=int, nargs="+", default=[68, 256, 512, 1024], help="side of the frames, pixels")
     parser.add_argument("--num-envs", type=int, nargs="+", default=[1])
     parser.add_argument("--stream", nargs="+", choices=STREAMS, default=list(STREAMS))
@@ -108,7 +113,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--max-megapixels", type=float, default=512.0, help="a call; larger ones are left out")
     args = parser.parse_args(argv)
     env = interactive_nav.make("turtlebot", args.scenes, backend="native")
-    common = {"scenes": args.scenes, "boxes": env.sensors.boxes.num_boxes, **origin(args.commit)}
+    common = {
+        "scenes": args.scenes,
+        "geometry": args.image_geometry,
+        "boxes": env.sensors.boxes.num_boxes,
+        **origin(args.commit),
+    }
     append = functools.partial(append_row, args.out, hidden=("versions", "scenes"))
     for num_envs in args.num_envs:
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), num_envs))
@@ -120,7 +130,7 @@ def main(argv: list[str] | None = None) -> int:
                     lens = Lens(size, size, env.sensors.lens.fov_deg)
                     row = {"renderer": renderer, "stream": stream, "size": size, "num_envs": num_envs}
                     try:
-                        draw = program(env, state, stream, renderer, lens)
+                        draw = program(env, state, stream, renderer, lens, args.image_geometry == "meshes")
                         for where in args.where:
                             measured = measure(draw, num_envs, where == "host", args.seconds)
                             append(row | {"frames_on": where} | measured | common)

@@ -67,6 +67,26 @@ def test_depth_classes_and_normals_equal_c_mujocos_rays(flats):
     assert len(classes) >= 4 and {6, 10} & classes
 
 
+@pytest.mark.parametrize(("classes", "own"), [(4, {4, 6, 8}), (5, {11, 6, 8})])
+def test_pictures_and_meshes_share_one_table_of_classes(tmp_path, classes, own):
+    """The second basket is 8 and a desk 4, or apart from tables 11, pixel for pixel in both."""
+    room = write_room(tmp_path / "room", blocks=(("desk", 0.7, 0.5, 9.0, 0.5),))
+    config = NavConfig.of(num_objects=6, segmentation_classes=classes)
+    world = build_world(get_robot("turtlebot"), (load_scene(room),), config)
+    qpos = world.rest_qpos[:1].astype(np.float32)
+    for k, at in enumerate(world.layout.slot_qpos[:6]):
+        qpos[0, at : at + 2] = [-1.5 + 0.6 * k, -0.5]
+    camera = look_along(np.array([[0.0, -1.2, 1.8]], np.float32), np.array([[0.0, 0.6, -1.0]], np.float32))
+    renderer = make_renderer(build_boxes(world, classes), LENS, "auto", "native", world)
+    _, ids = jax.jit(renderer.render_batch)(jnp.zeros(1, jnp.int32), jnp.asarray(qpos), camera)
+    model = SceneModel(world.robot, world.scenes[0], world.small_objects, classes)
+    model.pose(world, 0, qpos[0])
+    _, geom, _, _ = trace(model.model, model.data, CameraPose(camera.pos_w[0], camera.axes_w[0]), LENS, SCENE)
+    want = np.where(geom >= 0, model.class_id[geom], 0)
+    assert np.mean(ids[0] == want) > 0.99
+    assert own <= set(np.unique(ids)) == set(np.unique(want))
+
+
 def test_what_moves_is_elsewhere_in_the_next_picture(flats):
     world, scene, qpos, camera, draw = flats
     before = jax.device_get(draw(scene, qpos, camera))
