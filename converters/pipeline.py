@@ -304,7 +304,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     _report_objects(rows, settled, drawn, annotated)
     with clock.stage("write"):
         visuals = tuple(own.mesh for own in drawn)
-        parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=visuals)
+        lamps = tuple(dataclasses.replace(p, at=p.at - [0.0, 0.0, floor_height]) for p in raw.lamps)
+        parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=visuals, lamps=lamps)
         write_scene(parts, folder)
         save_maps(maps, folder)
     with clock.stage("gates"):

@@ -71,6 +71,7 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
                 floor_height_m=storey.height_m,
                 given_map=storey.given_map,
                 storeys=(),
+                lamps=tuple(p for p in raw.lamps if storey_of(p.at[2], heights, 0.0) == k),
                 picture=tuple(p for v, f in raw.picture for p in _cut(v, f, heights, k)),
                 warnings=(
                     *raw.warnings,

@@ -124,6 +124,16 @@ class Storey:
 
 
 @dataclasses.dataclass(frozen=True)
+class Lamp:
+    """A lamp that shines to all sides."""
+
+    at: np.ndarray
+    """(3,) scan frame, m."""
+    colour: np.ndarray
+    """(3,) in [0, 1], times its power."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RawScene:
     """Everything that a reader hands to the pipeline."""
 
@@ -143,6 +153,7 @@ class RawScene:
     """From the lowest up, where there are several; `converters.read.storeys.split_storeys` takes them apart."""
     picture: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     """Vertices (n, 3) and faces (m, 3) of the parts that a modelled structure is drawn with, in place of the scan."""
+    lamps: tuple[Lamp, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """What the reader repaired or found missing, for scene.json."""
     attribution: str = dataclasses.field(default="", metadata=NOT_HASHED)

@@ -15,6 +15,7 @@ import numpy as np
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
 from converters.geometry.boxes import OrientedBox, least_turned
+from converters.records.raw import Lamp
 from converters.records.visual import VisualMesh
 from converters.write.texture import as_png, quantise, share_plain
 
@@ -26,6 +27,8 @@ DOOR_FRICTION = 0.4
 
 
 ONE = (1.0, 1.0, 1.0)
+LAMP, LAMP_FALL = 0.8, (1.0, 0.0, 0.15)
+"""Of a white lamp at full power: how bright it is, and by which powers of the distance (m) that falls."""
 SAME_M = 5e-5
 """Meshes no farther apart are one; half of what a file's last digit is."""
 HULL_DECIMALS = 5
@@ -61,6 +64,8 @@ class SceneParts:
     physical: tuple[Physical, ...]
     walls: tuple[OrientedBox, ...]
     structure_visual: VisualMesh | None = None
+    lamps: tuple[Lamp, ...] = ()
+    """World frame."""
     object_visuals: tuple[VisualMesh, ...] = ()
     """Body frame, one an object; empty: no visuals (the settling model)."""
 
@@ -207,7 +212,8 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
         assets: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
     """
     spec = _empty_spec(parts.name)
-    _add_surroundings(spec, parts.walls, parts.structure_visual is not None and parts.structure_visual.exact)
+    lit = parts.structure_visual is not None and parts.structure_visual.exact
+    _add_surroundings(spec, parts.walls, lit, parts.lamps)
     assets = assets or Assets({}, {})
     _add_structure(spec, parts, assets.looks.get("structure"))
     # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
@@ -232,8 +238,8 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool) -> None:
-    """Floor, and a light above the middle of the walls: an even one where the structure is `lit` in its own image."""
+def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool, lamps: tuple[Lamp, ...]) -> None:
+    """Floor, lamps, and a light above the walls' middle: an even one where the structure is `lit` in its own image."""
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -248,11 +254,18 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
         dir=[0.25, 0.35, -0.9] if lit else [0, 0, -1],
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         castshadow=False,
-        diffuse=[0.25] * 3 if lit else [0.6] * 3,
-        ambient=[0.5] * 3 if lit else [0.4] * 3,
+        diffuse=[0.25 if lit else 0.15 if lamps else 0.6] * 3,
+        ambient=[0.5 if lit else 0.35 if lamps else 0.4] * 3,
     )
+    for k, lamp in enumerate(lamps):  # MuJoCo's renderer leaves out lights of type point
+        spec.worldbody.add_light(
+            name=f"lamp_{k}", pos=_tidy(lamp.at), castshadow=False, cutoff=180.0, exponent=0.0,
+            attenuation=LAMP_FALL, diffuse=np.round(LAMP * lamp.colour, 4), specular=[0.0] * 3,
+        )  # fmt: skip
+    if lit or lamps:
+        spec.visual.headlight.diffuse = [0.15] * 3
     if lit:
-        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.25] * 3, [0.15] * 3
+        spec.visual.headlight.ambient = [0.25] * 3
 
 
 def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) -> None:

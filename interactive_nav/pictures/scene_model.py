@@ -60,7 +60,7 @@ def picture_spec(
     class_of: dict[str, int] | None = None,
     classes: MaskClasses = 4,
 ) -> mujoco.MjSpec:
-    """`furnished_spec` in the groups of pictures, with a lamp, and with one camera named `view` instead of its own.
+    """`furnished_spec` in the groups of pictures, lit by its own lamps or by one, with one camera `view` instead of its own.
 
     Args:
         scene: its visual meshes are drawn; bodies that have none, as their boxes.
@@ -95,7 +95,8 @@ def picture_spec(
     for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
         spec.delete(camera)
     spec.worldbody.add_camera(name="view", fovy=60.0)
-    spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
+    if len(spec.lights) < 2:  # a home with lamps is lit by them
+        spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
     # The clipping planes are given as shares of the extent.
     spec.stat.extent = 1.0
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 100.0

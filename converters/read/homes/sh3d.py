@@ -24,8 +24,9 @@ import shapely
 from converters.geometry.boxes import convex_hull
 from converters.read.files import SourceFolder
 from converters.read.homes.parts import Part, category_of, home
-from converters.read.homes.sh3d_archive import called, metres, number, point, read_xml, unpack
+from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
 from converters.read.homes.sh3d_models import LEAF, Models, yaw_pose
+from converters.read.homes.sh3d_sheet import WHITE
 from converters.read.homes.sh3d_walls import (
     HEIGHT_M,
     LOW_M,
@@ -38,9 +39,10 @@ from converters.read.homes.sh3d_walls import (
 )
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
+from converters.read.storeys import storey_of
 from converters.records.errors import SceneRejected
 from converters.records.limits import DRAWN, UNPACKED, check_count
-from converters.records.raw import RawScene
+from converters.records.raw import Lamp, RawScene
 from interactive_nav_common.records import read_packaged
 
 ENDING = ".sh3d"
@@ -62,6 +64,8 @@ TURN_MOST_RAD = math.radians(120)
 AJAR_RAD = math.radians(10)
 """A leaf that is drawn farther from both ends of its swing stands ajar."""
 LOW_TABLE_M = 0.5
+LAMPS = 6
+"""Of a storey: MuJoCo's renderer draws eight lights, the headlight and the scene's own among them."""
 OURS = "interactive_nav#"
 """Ids of drawings that `converters.write.sh3d` makes: their categories are known."""
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
@@ -138,6 +142,7 @@ class _Drawing:
         self.models = Models(source, budget)
         self.dropped: collections.Counter[str] = collections.Counter()
         self.named: collections.Counter[str] = collections.Counter()
+        self.lamps: list[Lamp] = []
         levels = root.findall("level")
         self.hidden = {e.get("id") for e in levels if "false" in (e.get("visible"), e.get("viewable"))}
         self.base_m: dict[str | None, float] = {e.get("id"): number(e, "elevation") / 100 for e in levels}
@@ -191,7 +196,20 @@ class _Drawing:
                 self.source.note(f"{count} {what}: dropped")
         if not floors_m:
             raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
-        return home(self.source, "sh3d", parts, _storeys(sorted(floors_m)))
+        storeys = _storeys(sorted(floors_m))
+        lamps = self._brightest(storeys)
+        return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps)
+
+    def _brightest(self, floors_m: tuple[float, ...]) -> tuple[Lamp, ...]:
+        """Of each storey the brightest lamps, as many as pictures have room for."""
+        ranked = sorted((lamp for lamp in self.lamps if lamp.colour.any()), key=lambda lamp: -float(lamp.colour.sum()))
+        of = [int(storey_of(lamp.at[2], floors_m, 0.0)) for lamp in ranked]
+        kept = [lamp for k, lamp in enumerate(ranked) if of[:k].count(of[k]) < LAMPS]
+        if len(kept) < len(ranked):
+            self.source.note(
+                f"{len(ranked) - len(kept)} lamps that are not among a floor's {LAMPS} brightest: no light"
+            )
+        return tuple(kept)
 
     def _seen(self, tag: str) -> Iterator[ElementTree.Element]:
         for e in self.root.findall(tag):
@@ -246,8 +264,8 @@ class _Drawing:
             return self._door(e, name, pose, surface, group, solid)
         kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
         if e.tag == "light":
-            self.dropped["lights' shine (their lamps stay)"] += 1
             kind = kind if kind == "floor_lamp" else "other"
+            self.lamps += [_lamp(e, source, pose) for source in e.findall("lightSource")]
         held = e.get("movable") == "false" or kind == "structure"
         return [Part(name, pose, surface, solid, False, held=held, known_as=kind)]
 
@@ -284,6 +302,15 @@ class _Drawing:
             else []
         )
         return rest + made
+
+
+def _lamp(e: ElementTree.Element, source: ElementTree.Element, pose: np.ndarray) -> Lamp:
+    """One source of light of a piece whose own frame (z up, front along -y) has a pose: (4, 4)."""
+    x, y, z = (number(source, key) - shift for key, shift in (("x", 0.5), ("y", 0.5), ("z", 0.0)))
+    side = -1.0 if e.get("modelMirrored") == "true" else 1.0
+    own = metres(e, "width", "depth", "height") * [side * x, y, z]
+    shade = colour(source.get("color"), WHITE).ravel() / 255
+    return Lamp(pose[:3, :3] @ own + pose[:3, 3], shade * float(np.clip(number(e, "power", 0.5), 0.0, 1.0)))
 
 
 def _storeys(floors_m: list[float]) -> tuple[float, ...]:
