@@ -60,7 +60,7 @@ def picture_spec(
     class_of: dict[str, int] | None = None,
     classes: MaskClasses = 4,
 ) -> mujoco.MjSpec:
-    """`furnished_spec` in the groups of pictures, lit by its own lamps or by one, with one camera `view` instead of its own.
+    """`furnished_spec` in the groups of pictures, lit by its own lamps or by one, with a camera named `view`.
 
     Args:
         scene: its visual meshes are drawn; bodies that have none, as their boxes.
