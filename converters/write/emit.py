@@ -64,10 +64,10 @@ class SceneParts:
     physical: tuple[Physical, ...]
     walls: tuple[OrientedBox, ...]
     structure_visual: VisualMesh | None = None
-    lamps: tuple[Lamp, ...] = ()
-    """World frame."""
     object_visuals: tuple[VisualMesh, ...] = ()
     """Body frame, one an object; empty: no visuals (the settling model)."""
+    lamps: tuple[Lamp, ...] = ()
+    """World frame."""
 
 
 def _add_defaults(spec: mujoco.MjSpec) -> None:
