@@ -21,12 +21,15 @@ from PIL import Image
 
 from converters.geometry.boxes import convex_hull
 from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.read.files import read_image, read_obj
 from converters.read.homes.sh3d import OURS
 from converters.read.homes.sh3d_models import HULLS
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION
+from converters.records.visual import ColourCloud, TexturedMesh
 from converters.structure.walls import cover_rectangles
 from converters.write.sh3d_rooms import rooms_of
+from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
@@ -42,10 +45,12 @@ BESIDE_M = 0.08
 """A leaf may hang so far beside the middle of its wall."""
 BEYOND_M, THICK_M = (0.01, 0.06, 0.11), (0.04, 0.4)
 """So far beyond a gap's ends it is seen how thick the wall is, within these bounds; else it is `INNER_M`."""
-INNER_M, ROOM_M2, SLACK_RAD, TILT_RAD = 0.1, 0.5, 0.15, 0.01
+INNER_M, ROOM_M2, SLACK_RAD, TILT_RAD, FACING = 0.1, 0.5, 0.15, 0.01, 0.9
 IN_M = 0.002
 """Free faces are drawn so far back: those on the border of two cells of a map would fill both."""
 WALL, FLOOR = "FFEDEAE4", "FFC8B9A0"
+SIDE_M, APART_M = 0.08, 0.04
+"""What shows a wall's face or a floor lies so near to it; its colours are looked at so far apart."""
 LEAF = "sweethome3d_opening_on_hinge_1"
 
 
@@ -63,6 +68,10 @@ class Wall(NamedTuple):
     def polygon(self) -> Any:
         """Its footprint."""
         return shapely.LineString(self.ends).buffer(self.thickness / 2, cap_style="flat")
+
+    def side(self, out: np.ndarray) -> Any:
+        """In plan what is nearest to the face that looks along (2,) unit `out`."""
+        return shapely.LineString(self.ends + self.thickness / 2 * out).buffer(SIDE_M, cap_style="flat")
 
 
 class Mesh(NamedTuple):
@@ -155,7 +164,8 @@ class _Export:
         self.low_m = min(WALL_M, 0.8 * max((w.height for w in self.walls), default=0.0))
         self.high = [w for w in self.walls if w.height > self.low_m]
         self.stands = shapely.union_all([w.polygon() for w in self.high])
-        told, doors, pieces = ["left out: windows, colours of walls and floors, and masses"], 0, 0
+        self.cloud = self._cloud()
+        told, doors, pieces = ["left out: windows, textures of walls and floors, lamps' light, and masses"], 0, 0
         if len(self.high) < len(self.walls):
             told.append("built-in furniture is drawn as low walls")
         bodies = [b for b in self.spec.bodies if b.name in category]
@@ -178,7 +188,9 @@ class _Export:
             (x0, y0), (x1, y1) = 100 * (wall.ends + np.outer(out * [-1, 1], run)) * [1.0, -1.0] + 0.0
             top = wall.height - (IN_M / 2 if wall.height <= self.low_m else 0.0)  # heights on the grid are rounded up
             words = {"height": 100 * top, "thickness": 100 * (wall.thickness - 2 * IN_M), "pattern": "hatchUp"}
-            words |= {"leftSideColor": WALL, "rightSideColor": WALL}
+            left = run[::-1] * [-1.0, 1.0]
+            for side, out in (("left", left), ("right", -left)):
+                words[f"{side}SideColor"] = self._seen(WALL, wall.side(out), out, 0.1, wall.height)
             self._add("wall", id=f"wall{k}", xStart=x0, yStart=y0, xEnd=x1, yEnd=y1, **words)
         low, high = (
             shapely.union_all([w.polygon() for w in self.walls if (w.height > self.low_m) == tall])
@@ -188,7 +200,8 @@ class _Export:
         stands = high.buffer(1e-4, join_style="mitre")
         rooms = rooms_of(maps, low, stands, ROOM_M2, maps.resolution_m if across else 0.0)
         for k, plan in enumerate(rooms):
-            words = {"areaVisible": "true", "floorColor": FLOOR, "ceilingVisible": "false"}
+            colour = self._seen(FLOOR, plan, np.zeros(2), -SIDE_M, SIDE_M)
+            words = {"areaVisible": "true", "floorColor": colour, "ceilingVisible": "false"}
             room = self._add("room", id=f"room{k}", name=f"Room {k + 1}", **words)
             for x, y in 100 * shapely.get_coordinates(plan.exterior)[:-1] * [1.0, -1.0] + 0.0:
                 self._add("point", room, x=x, y=y)
@@ -196,6 +209,32 @@ class _Export:
         self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
         count = f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {pieces} other things"
         return [count, *told]
+
+    def _cloud(self) -> ColourCloud:
+        """Points of what shows the structure."""
+        geom = next((g for g in self.spec.geoms if g.name == "structure_visual"), None)
+        if geom is None:
+            return textured_cloud(TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), int), None, None), APART_M)
+        mesh = read_obj(self.folder / self.spec.meshdir / self.spec.mesh(geom.meshname).file)
+        image = read_image(self._image(geom), "RGB")
+        return textured_cloud(TexturedMesh(mesh.vertices, mesh.faces, mesh.corner_uv, image), APART_M)
+
+    def _image(self, geom: Any) -> Path:
+        look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]
+        return self.folder / self.spec.texturedir / self.spec.texture(look).file
+
+    def _seen(self, default: str, plan: Any, out: np.ndarray, low_m: float, high_m: float) -> str:
+        """Median colour of the structure over a plan, between two heights, that looks along (2,) `out` or, if 0, up."""
+        cloud, towards = self.cloud, np.array([*out, 0.0 if out.any() else 1.0])
+        near = (cloud.normals @ towards > FACING) & (
+            np.abs(cloud.points[:, 2] - (low_m + high_m) / 2) < (high_m - low_m) / 2
+        )
+        near[near] = shapely.contains_xy(plan, *cloud.points[near, :2].T)
+        return (
+            f"FF{bytes(np.median(cloud.colours[near], axis=0).astype(np.uint8)).hex().upper()}"
+            if near.any()
+            else default
+        )
 
     def _mesh(self, body: Any) -> Mesh | None:
         """What shows a body; None where nothing does."""
@@ -212,8 +251,7 @@ class _Export:
                 clouds.append(np.array([row.split()[1:4] for row in rows if row[:2] == "v "], float) * mesh.scale)
                 if clouds[-1].ndim != 2 or not np.isfinite(clouds[-1]).all():
                     raise ValueError("has no vertices")
-            look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]
-            path = self.folder / self.spec.texturedir / self.spec.texture(look).file
+            path = self._image(geom)
             data = path.read_bytes()
             Image.open(io.BytesIO(data)).verify()
         except (OSError, ValueError, AttributeError, SyntaxError) as error:
@@ -221,7 +259,7 @@ class _Export:
             why = f"not readable ({reason}), {body.name} needs it"
             raise SceneRejected(f"{path}: {why}; convert the scene again") from None
         rest = "\n".join(row for row in rows if row[:2] in ("vt", "f "))
-        return Mesh(clouds.pop(), rest, data, (f"{mesh.file} {mesh.scale}", look), clouds)
+        return Mesh(clouds.pop(), rest, data, (f"{mesh.file} {mesh.scale}", path.name), clouds)
 
     def _model(self, key: Any, place: Place, mesh: Mesh, group: str = "piece", frame: np.ndarray | None = None) -> str:
         """Entry of a model, written once, of a mesh placed in a frame that is z up and a door frame's bars' corners."""

@@ -1,6 +1,7 @@
 """A scene drawn for Sweet Home 3D, read and converted again."""
 
 import shutil
+import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
 
@@ -14,9 +15,12 @@ from scipy.spatial import KDTree
 from converters.__main__ import main
 from converters.pipeline import ConvertConfig, convert
 from converters.read.homes.sh3d import kind_of, read_sh3d
+from converters.read.homes.sh3d_archive import point
 from converters.write.sh3d import Wall, export_sh3d, merged_walls
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import CATEGORIES, load_manifest, load_maps
+from tests.converters.read.homes.test_drawn_lamps import PLAIN
+from tests.converters.read.homes.test_sh3d import write_home
 
 HOME = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
 DRAWN = HOME.parent / "drawn" / "flat"
@@ -213,6 +217,8 @@ def test_one_mesh_is_written_once(tmp_path):
             "home.sh3d",
             "chair_0 needs it; convert the scene",
         ),
+        (lambda f: (f / "assets" / "structure_visual.obj").write_text("v 0 0 0"), "home.sh3d", "structure_visual.obj"),
+        (lambda f: (f / "assets" / "structure.png").unlink(), "home.sh3d", "structure.png"),
         (lambda f: (f / "scene.xml").write_text("<mujoco"), "home.sh3d", "MuJoCo refuses it"),
         (lambda f: None, "home.xml", "expected a new file that ends in .sh3d"),
         (lambda f: (f.parent / "home.sh3d").write_text("kept"), "home.sh3d", "exists, expected a new file"),
@@ -226,3 +232,44 @@ def test_bad_input(tmp_path, capsys, spoil, out, words):
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def rgb(word: str | None) -> np.ndarray:
+    return np.array(list(bytes.fromhex((word or "")[2:])), int)
+
+
+def test_colours_of_floors_and_walls_come_back(tmp_path):
+    drawn, again = DRAWN.with_suffix(".sh3d"), tmp_path / "flat.sh3d"
+    export_sh3d(DRAWN, again)
+    with zipfile.ZipFile(drawn) as first, zipfile.ZipFile(again) as second:
+        homes = [ElementTree.fromstring(archive.read("Home.xml")) for archive in (first, second)]
+    plans = [{room: shapely.Polygon([point(p) for p in room]) for room in home.iter("room")} for home in homes]
+    assert len(plans[1]) == 3
+    for room, plan in plans[1].items():
+        own = max(plans[0], key=lambda r: plans[0][r].intersection(plan).area)
+        assert np.abs(rgb(room.get("floorColor")) - rgb(own.get("floorColor"))).max() <= 12
+    lines = [
+        {w: shapely.LineString([point(w, f"x{e}", f"y{e}") for e in ("Start", "End")]) for w in h.iter("wall")}
+        for h in homes
+    ]
+    stands = shapely.union_all([line.buffer(float(w.get("thickness", "0")) / 200) for w, line in lines[0].items()])
+    own = [wall for wall, line in lines[1].items() if stands.contains(line)]
+    sides = np.array([rgb(wall.get(f"{side}SideColor")) for wall in own for side in ("left", "right")])
+    assert len(sides) == 18 and np.abs(sides - rgb("FFEDEAE4")).max() <= 12  # all of the drawing's are
+
+
+def test_each_side_of_a_wall_has_its_own_colour(tmp_path, hull_cache):
+    root = tmp_path / "two"
+    made = convert(write_home(root, PLAIN), root / "out", ConvertConfig(structure_texture=256), cache=hull_cache)
+    export_sh3d(made.folder, tmp_path / "two.sh3d")
+    with zipfile.ZipFile(tmp_path / "two.sh3d") as archive:
+        home = ElementTree.fromstring(archive.read("Home.xml"))
+    (room,) = home.iter("room")
+    assert np.abs(rgb(room.get("floorColor")) - 0x60).max() <= 12
+    seen = {wall.get(f"{side}SideColor") for wall in home.iter("wall") for side in ("left", "right")}
+    assert {"FFFF0000", "FF00FF00"} <= seen
+    for wall in (w for w in home.iter("wall") if w.get("id") != "wall5"):  # red is what looks at the room, but the leaf
+        start, end = point(wall, "xStart", "yStart"), point(wall, "xEnd", "yEnd")
+        left = (end - start)[::-1] * [-1.0, 1.0]
+        inside = "left" if left @ ([2.0, -1.5] - start) > 0 else "right"
+        assert wall.get(f"{inside}SideColor") == "FFFF0000", wall.attrib
