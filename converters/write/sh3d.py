@@ -32,7 +32,7 @@ from converters.write.sh3d_rooms import rooms_of
 from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
+from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat, yaw_matrix
 from scenes_mjcf.schema import SceneMaps, load_manifest, load_maps
 
 WALL_M = 1.8
@@ -160,7 +160,7 @@ class _Export:
     def fill(self, category: dict[str, str], maps: SceneMaps) -> list[str]:
         """All of it; what there is and what is left out, a line each."""
         geoms = [g for g in self.spec.geoms if g.name.startswith("wall_")]
-        self.walls = merged_walls([(np.array(g.pos), np.array(g.size), _yaw(g.quat)) for g in geoms])
+        self.walls = merged_walls([(np.array(g.pos), np.array(g.size), float(yaw_from_quat(g.quat))) for g in geoms])
         self.low_m = min(WALL_M, 0.8 * max((w.height for w in self.walls), default=0.0))
         self.high = [w for w in self.walls if w.height > self.low_m]
         self.stands = shapely.union_all([w.polygon() for w in self.high])
@@ -196,7 +196,7 @@ class _Export:
             shapely.union_all([w.polygon() for w in self.walls if (w.height > self.low_m) == tall])
             for tall in (False, True)
         )
-        across = any(abs(math.remainder(_yaw(g.quat), math.pi / 2)) > 1e-3 for g in geoms)
+        across = any(abs(math.remainder(float(yaw_from_quat(g.quat)), math.pi / 2)) > 1e-3 for g in geoms)
         stands = high.buffer(1e-4, join_style="mitre")
         rooms = rooms_of(maps, low, stands, ROOM_M2, maps.resolution_m if across else 0.0)
         for k, plan in enumerate(rooms):
@@ -212,12 +212,11 @@ class _Export:
 
     def _cloud(self) -> ColourCloud:
         """Points of what shows the structure."""
-        geom = next((g for g in self.spec.geoms if g.name == "structure_visual"), None)
-        if geom is None:
-            return textured_cloud(TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), int), None, None), APART_M)
-        mesh = read_obj(self.folder / self.spec.meshdir / self.spec.mesh(geom.meshname).file)
-        image = read_image(self._image(geom), "RGB")
-        return textured_cloud(TexturedMesh(mesh.vertices, mesh.faces, mesh.corner_uv, image), APART_M)
+        for geom in (g for g in self.spec.geoms if g.name == "structure_visual"):
+            mesh = read_obj(self.folder / self.spec.meshdir / self.spec.mesh(geom.meshname).file)
+            seen = TexturedMesh(mesh.vertices, mesh.faces, mesh.corner_uv, read_image(self._image(geom), "RGB"))
+            return textured_cloud(seen, APART_M)
+        return ColourCloud(*(np.zeros((0, 3)),) * 3)
 
     def _image(self, geom: Any) -> Path:
         look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]
@@ -296,7 +295,7 @@ class _Export:
         return {"catalogId": OURS + kind, "name": name, "model": model, **place}
 
     def _piece(self, body: Any, mesh: Mesh, kind: str) -> None:
-        yaw = _yaw(body.quat)
+        yaw = float(yaw_from_quat(body.quat))
         rest = yaw_matrix(yaw).T @ matrix_from_quat(np.array(body.quat))
         rest = rest if math.acos(np.clip(rest[2, 2], -1, 1)) > TILT_RAD else np.eye(3)
         vertices = mesh.vertices @ rest.T
@@ -351,11 +350,6 @@ class _Export:
 def _lines(vertices: np.ndarray) -> str:
     """An OBJ's, in cm and y up, of (n, 3) vertices in m and z up."""
     return "".join(f"v {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in 100 * vertices @ Y_UP_TO_Z_UP + 0.0)
-
-
-def _yaw(quat: Any) -> float:
-    turn = matrix_from_quat(np.array(quat))
-    return math.atan2(turn[1, 0], turn[0, 0])
 
 
 def _bar(x0: float, x1: float, z0: float, z1: float, half: float) -> np.ndarray:
