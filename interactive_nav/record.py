@@ -1,7 +1,8 @@
 """`python -m interactive_nav.record REPLAY -o out.mp4`: a replay in, a video out.
 
 The picture: the robot from behind, its goal and path painted on the floor; beside it what the robot's camera
-sees, as colour, depth and class mask; below, the step and its reward, force and touches.
+sees, as colour, depth and class mask; below, the step and its reward, force and touches. Or, with `--views`, the home
+with its textures from where somebody would film it.
 
 Playing a policy is for `train` to do: `python -m train.record RUN` plays an episode of a run, and has it drawn here.
 """
@@ -19,9 +20,11 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
+from interactive_nav.pictures.camera import clear_way, straight_down
 from interactive_nav.pictures.replay import Replay, ReplayError, load, replay_path
+from interactive_nav.pictures.scene_model import ROBOT, SCENE
 from interactive_nav.pictures.views import (
     INSIDE,
     OUTSIDE,
@@ -34,12 +37,16 @@ from interactive_nav.pictures.views import (
 )
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.progress import progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
 
-FORMATS = (".mp4", ".gif")
+FORMATS = (".mp4", ".gif", ".webp")
+BEHIND_M = {"follow": (1.8, 1.8), "eye": (2.6, 1.5)}
+"""Textured views from behind the robot: how far away, how high."""
+VIEWS = (*BEHIND_M, "above")
 CAMERA_PIXELS = 68
 """Depth and mask are rendered at the resolution of the paper's policies (section V)."""
 _CAMERA_LAG_S = 1.0
@@ -51,13 +58,14 @@ _HOLD_S = 1.5
 class Compositor:
     """Frames of one replay."""
 
-    def __init__(self, replay: Replay, scene: Scene, height: int = 360):
+    def __init__(self, replay: Replay, scene: Scene, height: int = 360, views: Sequence[str] = ()):
         """Compiles the scene.
 
         Args:
             replay: the episode.
             scene: the folder that it was played in.
             height: rows of the view from behind; a multiple of 12, so that every part has whole, even pixels.
+            views: of `VIEWS`, side by side in place of the view from behind and the robot's camera.
 
         Raises:
             ReplayError: the scene is not the one that the replay was recorded in.
@@ -65,19 +73,26 @@ class Compositor:
         """
         check_height(height)
         check_scene(replay, scene)
-        self.replay, self.height = replay, height
+        self.replay, self.height, self.views = replay, height, tuple(views)
         robot = get_robot(replay.robot)
+        self._middle_m = 0.6 * robot.height_m
         self._goal_radius_m = replay.success_distance_m or robot.body_width_m
         self._view = SceneView(robot, scene, replay.small, replay.segmentation_classes)
         yaw = np.unwrap(yaw_from_quat(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
+        self._cameras = {view: self._positions(view) for view in self.views if view in BEHIND_M}
         self._font = ImageFont.load_default(size=height / 24)
 
     @property
     def size(self) -> tuple[int, int]:
         """Columns and rows of a frame."""
-        return self.height * 4 // 3 + self.height // 3, self.height + self._strip
+        columns = len(self.views) * self._columns or self._columns + self.height // 3
+        return columns, self.height + self._strip
+
+    @property
+    def _columns(self) -> int:
+        return self.height * 4 // 3
 
     @property
     def _strip(self) -> int:
@@ -86,9 +101,12 @@ class Compositor:
     def frame(self, step: int) -> np.ndarray:
         """[rows, columns, 3] u8: the state after `step` control steps."""
         replay, height = self.replay, self.height
-        self._view.place(replay.bodies, replay.body_pos_w[step], replay.body_quat_w[step])
-        camera = chase_camera(self._target[step], float(self._yaw[step]), height, height * 4 // 3)
+        self._place(step)
         paint = FloorPaint(replay.goal_xy_w, self._goal_radius_m, _dense(replay.robot_xy_w[: step + 1]))
+        if self.views:
+            panes = [self._view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
+            return np.concatenate([np.concatenate(panes, 1), self._caption(step)], 0)
+        camera = chase_camera(self._target[step], float(self._yaw[step]), height, self._columns)
         behind = self._view.look(*camera, OUTSIDE, paint).colour
         side = height // 3
         own = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
@@ -100,6 +118,33 @@ class Compositor:
         ]
         picture = np.concatenate([behind, np.concatenate(column, 0)], 1)
         return np.concatenate([picture, self._caption(step)], 0)
+
+    def _place(self, step: int) -> None:
+        self._view.place(self.replay.bodies, self.replay.body_pos_w[step], self.replay.body_quat_w[step])
+
+    def _positions(self, view: str) -> np.ndarray:
+        """[T + 1, 3] m: behind the robot and in front of walls and furniture, without jerks."""
+        back_m, up_m = BEHIND_M[view]
+        steps = _CAMERA_LAG_S / self.replay.control_dt_s
+        # Behind where it goes, not where it looks: a robot turns on the spot.
+        ahead = gaussian_filter1d(np.gradient(self._target[:, :2], axis=0), 2 * steps, axis=0, mode="nearest")
+        yaw = gaussian_filter1d(np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), steps, mode="nearest")
+        back = np.stack([-back_m * np.cos(yaw), -back_m * np.sin(yaw), 0 * yaw + up_m - self._middle_m], -1)
+        target = self._target * [1, 1, 0] + [0, 0, self._middle_m]
+        share = []
+        for step, way in enumerate(zip(target, back, strict=True)):
+            self._place(step)
+            share.append(clear_way(self._view, *way))
+        share = gaussian_filter1d(minimum_filter1d(share, max(1, round(2 * steps))), steps / 2, mode="nearest")
+        return target + share[:, None] * back
+
+    def _camera(self, view: str, step: int) -> tuple[CameraPose, Lens]:
+        if view != "above":
+            eye = self._cameras[view][step]
+            ahead = self._target[step] * [1, 1, 0] + [0, 0, self._middle_m] - eye
+            return look_along(eye, ahead), Lens(self._columns, self.height, 60.0)
+        seen = np.vstack([self.replay.robot_xy_w, self.replay.goal_xy_w])
+        return straight_down(seen.min(0) - 1.2, seen.max(0) + 1.2, 4 / 3, 30.0), Lens(self._columns, self.height, 30.0)
 
     def _caption(self, step: int) -> np.ndarray:
         replay, (columns, _) = self.replay, self.size
@@ -163,7 +208,7 @@ def write_video(
 
     Args:
         compositor: the frames.
-        path: ends in .mp4 (H.264) or .gif.
+        path: ends in .mp4 (H.264), .gif or .webp.
         every: control steps from one frame to the next.
         on_progress: told the number of frames written.
 
@@ -177,7 +222,7 @@ def write_video(
     check_format(path)
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
     rate = 1.0 / (compositor.replay.control_dt_s * every)
-    write = _write_gif if path.suffix == ".gif" else write_mp4
+    write = write_mp4 if path.suffix == ".mp4" else _write_frames
     with whole_file(path) as partial:
         write(_counted(compositor, steps, on_progress), partial, rate, _HOLD_S)
     return len(steps)
@@ -220,10 +265,13 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: flo
     return count
 
 
-def _write_gif(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s: float) -> None:
-    pictures = [Image.fromarray(f).quantize(128, dither=Image.Dither.NONE) for f in frames]
+def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s: float) -> None:
+    pictures = [Image.fromarray(f) for f in frames]
+    if path.suffix == ".gif":
+        pictures = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]
     shown_ms = [round(1000 / rate)] * (len(pictures) - 1) + [round(1000 * hold_s)]
-    pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0)
+    words: dict[str, Any] = {"quality": 40, "method": 4} if path.suffix == ".webp" else {}
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0, **words)
 
 
 def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
@@ -243,8 +291,11 @@ def add_picture_words(made: argparse.ArgumentParser) -> None:
     """What to draw, and where to."""
     made.add_argument("--episode", type=int, default=0, metavar="K", help="which of the fixed episodes (default 0)")
     made.add_argument("--policy", default="learned", help="learned (default), or a policy of `train.evaluate`")
-    made.add_argument("-o", "--out", default="episode.mp4", metavar="PATH", help=".mp4 or .gif (default episode.mp4)")
+    made.add_argument(
+        "-o", "--out", default="episode.mp4", metavar="PATH", help=".mp4, .gif or .webp (default episode.mp4)"
+    )
     made.add_argument("--height", type=int, default=360, help="rows of the view from behind (default 360)")
+    made.add_argument("--views", nargs="+", choices=VIEWS, default=(), help="textured views, side by side, instead")
     made.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N control steps (default 1)")
 
 
@@ -267,7 +318,7 @@ def record(source: Path, arguments: argparse.Namespace, console: Console) -> Non
         UserError: the replay or its scene cannot be read, or the video not be written.
     """
     replay, out = load(source), Path(arguments.out)
-    compositor = Compositor(replay, load_scene(replay.scene), arguments.height)
+    compositor = Compositor(replay, load_scene(replay.scene), arguments.height, arguments.views)
     with progress_bar(console, "frames", -(-replay.num_steps // arguments.every) + 1, transient=True) as update:
         frames = write_video(compositor, out, arguments.every, lambda n: update(completed=n))
     console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")

@@ -11,6 +11,7 @@ on a CPU too, after a compilation of ten seconds a size, so there it is used onl
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,67 @@ VIEWS = ("robot", "top", "follow")
 ENGINES = ("auto", "gl", "warp", "rays")
 
 
+class Painter:
+    """RGB with textures of scene models, by the first engine that works here."""
+
+    def __init__(self, engine: str = "auto"):
+        """Prepares nothing that is not asked for; `engine` as `Camera` has it; auto until the first picture.
+
+        Raises:
+            ConfigError: unknown engine.
+        """
+        if engine not in ENGINES:
+            raise ConfigError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
+        self.engine = engine
+        self._painters: dict[tuple, Any] = {}
+
+    def draw(self, model: SceneModel, pose: CameraPose, lens: Lens, groups: Sequence[int]) -> np.ndarray | None:
+        """[H, W, 3] u8 of a model's geoms of these groups; None where rays must do."""
+        one = CameraPose(np.asarray(pose.pos_w)[None], np.asarray(pose.axes_w)[None])
+        if self.engine in ("auto", "gl"):
+            key = (model, lens.width, lens.height)
+            try:
+                if key not in self._painters:
+                    self._painters[key] = GlPainter(model.model, lens.width, lens.height, sky=None)
+                picture = self._painters[key].draw(model.data, one, lens.fov_deg, groups)[0]
+                self.engine = "gl"
+                return picture
+            except UserError:
+                if self.engine == "gl":
+                    raise
+                self.engine = "warp" if resolve_backend("auto") == "warp" else "rays"
+        if self.engine == "warp":
+            from interactive_nav.sensing.warp import WarpColour
+
+            key = (model, lens, tuple(groups))
+            if key not in self._painters:
+                self._painters[key] = WarpColour(model.model, lens, 1, list(groups))
+            arrays = model.data.geom_xpos[None], model.data.geom_xmat.reshape(1, -1, 3, 3)
+            return np.asarray(self._painters[key].draw(*arrays, one))[0]
+        return None
+
+    def depth(self, model: SceneModel, pose: CameraPose, lens: Lens, groups: Sequence[int]) -> np.ndarray:
+        """[H, W] depth along the axis, m, of the picture last drawn: GL looks through ceilings."""
+        if self.engine != "gl":
+            return trace(model.model, model.data, pose, lens, groups)[2]
+        one = CameraPose(np.asarray(pose.pos_w)[None], np.asarray(pose.axes_w)[None])
+        return self._painters[model, lens.width, lens.height].draw(model.data, one, lens.fov_deg, groups, depth=True)[0]
+
+
+def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray, groups: Sequence[int] = SCENE) -> float:
+    """Share of the way from a target (3,) along (3,), both m, at which a camera stands in front of what is behind."""
+    reach = np.linalg.norm(back_w)
+    hit = cast(model.model, model.data, target_w, back_w[None] / reach, groups)[1][0] / reach
+    return min(1.0, 0.9 * hit) if hit > 0 else 1.0
+
+
+def straight_down(low_w: np.ndarray, high_w: np.ndarray, aspect: float, fov_deg: float) -> CameraPose:
+    """A camera, x to the right and y up, that sees the floor between two corners (2,), m, and the walls around it."""
+    size, centre = np.subtract(high_w, low_w), np.add(high_w, low_w) / 2
+    above = max(size[1], size[0] / aspect) / 2 / math.tan(math.radians(fov_deg / 2)) + 2.5
+    return CameraPose(np.array([*centre, above]), np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float))
+
+
 class Camera:
     """Takes pictures of one environment."""
 
@@ -41,16 +103,13 @@ class Camera:
         Raises:
             ConfigError: unknown engine.
         """
-        if engine not in ENGINES:
-            raise ConfigError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
-        self._env, self._engine, self._fov_deg = env, engine, fov_deg or env.sensors.lens.fov_deg
+        self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
         self._models: dict[int, _PictureModel] = {}
-        self._painters: dict[tuple, Any] = {}
 
     @property
     def engine(self) -> str:
         """Who draws RGB; auto until the first picture."""
-        return self._engine
+        return self._painter.engine
 
     def frame(
         self,
@@ -97,7 +156,7 @@ class Camera:
         lens, groups = Lens(width, height, fov), SCENE if view == "robot" else (*SCENE, ROBOT, ROBOT_SOLIDS)
         out: dict[str, np.ndarray] = {}
         if "rgb" in streams:
-            drawn = self._textured(scene, model, pose, lens, groups)
+            drawn = self._painter.draw(model, pose, lens, groups)
             if drawn is not None:
                 out["rgb"] = drawn
         if set(streams) - set(out):
@@ -111,50 +170,16 @@ class Camera:
             pose = env.sensors.mount.pose(np.asarray(qpos, np.float32))
             return CameraPose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), self._fov_deg
         if view == "top":
-            maps, fov = env.scenes[scene].maps, 40.0
-            rows, columns = maps.traversable.shape
-            size = np.array([columns, rows]) * maps.resolution_m
-            centre = np.asarray(maps.origin_w) + size / 2
-            above = max(size[1], size[0] / aspect) / 2 / math.tan(math.radians(fov / 2)) + 2.5
-            down = np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float)
-            return CameraPose(np.array([*centre, above]), down), fov
+            maps = env.scenes[scene].maps
+            size = np.array(maps.traversable.shape[::-1]) * maps.resolution_m
+            return straight_down(maps.origin_w, maps.origin_w + size, aspect, 40.0), 40.0
         base = model.data.body(env.world.robot.base_body)
         ahead = base.xmat.reshape(3, 3)[:, 0] * [1, 1, 0]
         ahead /= max(np.linalg.norm(ahead), 1e-6)
         target = base.xpos + [0, 0, 0.6 * env.world.robot.height_m]
         back = -1.8 * ahead + [0, 0, 1.1]
-        # Not behind a wall.
-        reach = np.linalg.norm(back)
-        hit = cast(model.model, model.data, target, back[None] / reach, SCENE)[1][0] / reach
-        eye = target + back * (min(1.0, 0.9 * hit) if hit > 0 else 1.0)
+        eye = target + back * clear_way(model, target, back)
         return look_along(eye, target - eye), 70.0
-
-    def _textured(
-        self, scene: int, model: SceneModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...]
-    ) -> np.ndarray | None:
-        """RGB with textures, or None where rays must do."""
-        one = CameraPose(pose.pos_w[None], pose.axes_w[None])
-        if self._engine in ("auto", "gl"):
-            key = (scene, lens.width, lens.height)
-            try:
-                if key not in self._painters:
-                    self._painters[key] = GlPainter(model.model, lens.width, lens.height, sky=None)
-                picture = self._painters[key].draw(model.data, one, lens.fov_deg, groups)[0]
-                self._engine = "gl"
-                return picture
-            except UserError:
-                if self._engine == "gl":
-                    raise
-                self._engine = "warp" if resolve_backend("auto") == "warp" else "rays"
-        if self._engine == "warp":
-            from interactive_nav.sensing.warp import WarpColour
-
-            key = (scene, lens, groups)
-            if key not in self._painters:
-                self._painters[key] = WarpColour(model.model, lens, 1, list(groups))
-            arrays = model.data.geom_xpos[None], model.data.geom_xmat.reshape(1, -1, 3, 3)
-            return np.asarray(self._painters[key].draw(*arrays, one))[0]
-        return None
 
 
 class _PictureModel(SceneModel):

@@ -7,6 +7,7 @@ where there is no display.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import math
 import os
@@ -53,7 +54,8 @@ class GlPainter:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self._context = _context_class()(width, height)
-                weakref.finalize(self, self._context.free)  # at exit, before the modules that it needs are gone
+                # At exit, before the library that was imported just now ends.
+                atexit.register(weakref.finalize(self, self._context.free))
                 self._context.make_current()
                 self._drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # noqa: BLE001  (GL bindings raise what they like where no GL is)

@@ -19,7 +19,7 @@ from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
-from scenes_mjcf.categories import CATEGORIES, MaskClasses, class_id
+from scenes_mjcf.categories import MaskClasses, class_id
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
@@ -81,7 +81,6 @@ def picture_spec(
         plane, box = geom.type == mujoco.mjtGeom.mjGEOM_PLANE, geom.type == mujoco.mjtGeom.mjGEOM_BOX
         if name in own:
             geom.group = ROBOT_SOLIDS if visible_robot and geom.group != VISUAL_GROUP else ROBOT
-            geom.rgba = [*CATEGORIES["robot"].colour, 1.0]
             continue
         bare = box and name not in with_mesh
         if plane:

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
+from interactive_nav.pictures.camera import Painter
 from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, SCENE, THINGS, SceneModel, cast, trace
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
@@ -32,6 +33,8 @@ COLOURS = {category.name: category.colour for category in TABLE}
 GOAL_COLOUR = (0.30, 0.72, 0.36)
 TRAIL_COLOUR = (0.16, 0.47, 0.84)
 FLOOR_COLOUR = (0.80, 0.78, 0.74)
+ON_FLOOR_M = 0.03
+"""What is no higher, such as a carpet, is painted on."""
 NOTHING = 255
 """Class of a ray that meets nothing."""
 
@@ -70,6 +73,7 @@ class SceneView(SceneModel):
     def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
         """Compiles the model to look at; see `SceneModel`."""
         super().__init__(robot, scene, small, classes)
+        self._painter = Painter()
         self._floor = self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self._colour = np.array([COLOURS[category] for category in self.category])
         # Things of one kind differ a little, so that two chairs can be told apart.
@@ -104,6 +108,19 @@ class SceneView(SceneModel):
             depth_m=np.where(hit, depth_m, np.inf).astype(np.float32),
             classes=np.where(hit, self.class_id[geom], NOTHING).astype(np.uint8),
         )
+
+    def textured(
+        self, pose: CameraPose, lens: Lens, groups: Sequence[int], paint: FloorPaint | None = None
+    ) -> np.ndarray:
+        """[rows, columns, 3] u8 with textures; words as `look`'s, whose colours it has where no engine draws them."""
+        drawn = self._painter.draw(self, pose, lens, groups)
+        if drawn is None:
+            return self.look(pose, lens, tuple(groups), paint).colour
+        depth_m = self._painter.depth(self, pose, lens, groups)
+        points, colour = pose.pos_w + lens.rays(pose) * depth_m[..., None], drawn / 255
+        floor = np.abs(points[..., 2]) < ON_FLOOR_M
+        colour[floor] = _painted(colour[floor], points[floor, :2], paint or FloorPaint())
+        return (colour * 255 + 0.5).astype(np.uint8)
 
     def _light(self, points: np.ndarray, normal: np.ndarray, groups: tuple[int, ...]) -> np.ndarray:
         """[n] brightness: light of the sky, and a lamp high above the middle of the view that casts shadows."""
@@ -189,6 +206,10 @@ def _floor_colour(xy_w: np.ndarray, paint: FloorPaint) -> np.ndarray:
     colour = np.tile(np.array(FLOOR_COLOUR), (len(xy_w), 1))
     checker = np.floor(xy_w / 0.5).sum(-1) % 2 == 0
     colour[checker] *= 0.96
+    return _painted(colour, xy_w, paint)
+
+
+def _painted(colour: np.ndarray, xy_w: np.ndarray, paint: FloorPaint) -> np.ndarray:
     if not len(xy_w):
         return colour
     if paint.goal_xy_w is not None:

@@ -37,6 +37,7 @@ from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import CATEGORIES, SEGMENTATIONS, class_id
+from tests.gl_program import drawn, need_gl
 
 CLASSES = SEGMENTATIONS[4].names
 STEPS = 60
@@ -280,6 +281,42 @@ def test_parts_of_a_frame(compositor, played):
     assert (frame[:120, :160].std((0, 1)) > 5).all()
 
 
+FILM = """
+import sys, weakref, numpy as np
+early = weakref.finalize(sys.modules["numpy"], print)  # programs that JAX compiles make some before there is a GL
+from interactive_nav import record
+from interactive_nav.pictures.camera import Painter
+from interactive_nav.pictures.replay import load
+from interactive_nav.scenes.scene import load_scene
+replay = load(sys.argv[2])
+film = record.Compositor(replay, load_scene(replay.scene), height=120, views=("eye", "above"))
+film._view._painter = Painter(sys.argv[3])
+eye, _ = film._camera("eye", 0)
+above, lens = film._camera("above", 0)
+np.savez(sys.argv[1], frame=film.frame(replay.num_steps), eye=eye.pos_w, above=above.pos_w, pixel=lens.pixel)
+"""
+
+
+@pytest.mark.parametrize("engine", ["rays", "gl"])
+def test_a_film_from_eye_height_and_from_above(played, tmp_path, engine):
+    if engine == "gl":
+        need_gl()
+    replay.save(played, tmp_path / "a.npz")
+    made = drawn(FILM, tmp_path, tmp_path / "a.npz", engine)
+    frame, above = made["frame"], made["above"]
+    assert frame.shape == (140, 320, 3)
+    # The room is 4 by 3 m; whoever films stands in it, behind the robot.
+    x, y, z = made["eye"]
+    assert abs(x) < 2.0 and abs(y) < 1.5 and z <= 1.5 + 1e-6
+    assert (played.body_pos_w[0, 0, :2] - (x, y)) @ (played.robot_xy_w[20] - played.robot_xy_w[0]) > 0.02
+    # From above the goal is where a pinhole puts it, x to the right and y up, lighter within than grass.
+    at = (played.goal_xy_w - above[:2]) / above[2] / made["pixel"]
+    column, row = 160 + 80 + at[0], 60 - at[1]
+    red, green, blue = frame[int(row), int(column)].astype(int)
+    assert green > red + 15 and green > blue + 15
+    assert np.abs(frame[:120, :160].astype(int) - frame[0, 0]).max() > 50
+
+
 def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
     path = tmp_path / "a.npz"
     replay.save(played, path)
@@ -288,8 +325,12 @@ def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
     with Image.open(tmp_path / "a.gif") as gif:
         assert gif.n_frames == -(-played.num_steps // 30) + 1 and gif.size == (200, 140)
     capsys.readouterr()
+    assert record.main([*arguments, "--views", "above", "-o", str(tmp_path / "a.webp")]) == 0
+    with Image.open(tmp_path / "a.webp") as film:
+        assert film.n_frames == -(-played.num_steps // 30) + 1 and film.size == (160, 140)
+    capsys.readouterr()
     assert record.main([*arguments, "-o", str(tmp_path / "a.avi")]) == 2
-    assert "ends in '.avi', expected one of .mp4, .gif" in capsys.readouterr().err
+    assert "ends in '.avi', expected one of .mp4, .gif, .webp" in capsys.readouterr().err
     assert record.main([str(path), "--height", "125"]) == 2
     assert "height is 125, expected a multiple of 12" in capsys.readouterr().err
     other = dataclasses.replace(played, scene=str(two_rooms))
