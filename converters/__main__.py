@@ -14,18 +14,19 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from converters.furniture_library import add_library
-from converters.generating import Commands, add_generate, add_generate_scenes, add_launcher, add_models, positive
+from converters.furniture_library import LIBRARY
+from converters.generating import GENERATING
 from converters.records.errors import StageFailed
 from converters.segmenting import add_segmenting
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
+from interactive_nav_common.words import Command, Commands, add_words, read_words
 from scenes_mjcf.schema import CATEGORIES
 
 FORMATS = (
@@ -185,148 +186,40 @@ def _propose(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _positive_number(text: str) -> float:
-    value = float(text)
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
+RUNS: dict[str, Any] = {
+    "convert": _convert,
+    "propose": _propose,
+    "object": _object,
+    "check": _check,
+    **GENERATING,
+    "library": LIBRARY,
+    "preview": _preview,
+    "export": _export,
+}
+"""Command of words.yaml -> what runs it, or its actions' table."""
 
 
-def _add_decompose_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--seed", type=int, default=0, help="of the decomposition's search (default 0)")
-    command.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
-    command.add_argument("--strict", action="store_true", help="refuse what would be repaired with a warning")
-    command.add_argument(
-        "--timeout",
-        type=_positive_number,
-        default=240.0,
-        metavar="S",
-        help="seconds for the decomposition of one model before its convex hull is taken (default 240)",
-    )
-
-
-def _add_convert(commands: Commands) -> None:
-    command = commands.add_parser(
-        "convert",
-        help="turn a raw scan with alignments into a scene folder, or many",
-        usage="%(prog)s [options] SRC OUT | SRC... --into DIR | @LIST --into DIR  [KEY=VALUE ...]",
-        fromfile_prefix_chars="@",
-    )
-    command.convert_arg_line_to_args = lambda arg_line: [arg_line] if arg_line.strip() else []
-    command.add_argument(
-        "places",
-        nargs="+",
-        metavar="SRC OUT",
-        help="folder with the raw scan, or a mesh file, and the scene folder to make, whose name becomes the scene's; "
-        "several floors make OUT_0, OUT_1, ...; @LIST is a file of one SRC a line; KEY=VALUE: structure_faces, "
-        "object_faces (triangles drawn), structure_texture, object_texture (pixels)",
-    )
-    command.add_argument(
-        "--into",
-        type=Path,
-        metavar="DIR",
-        help="convert every SRC into a folder here, each in a process of its own, with a row in conversions.parquet; "
-        "those that are there with the same options and inputs are kept",
-    )
-    add_launcher(command)
-    command.add_argument("--up", choices=("auto", *"xyz", "-x", "-y", "-z"), default="auto", help="axis of a mesh file")
-    command.add_argument("--unit", choices=("auto", "m", "cm", "mm", "ft", "in"), default="auto", help="of a mesh file")
-    command.add_argument("--mirror", action="store_true", help="take -x for x in a mesh file")
-    about = "of an MJCF or Gazebo home that names files outside of its folder: the folder that may be read"
-    command.add_argument("--root", type=Path, metavar="DIR", help=about)
-    about = "layout of SRC (default: told from its files)"
-    command.add_argument("--format", choices=("auto", *FORMATS), default="auto", help=about)
-    command.add_argument("--split", choices=("train", "test"), default="train", help="recorded in scene.json")
-    command.add_argument(
-        "--jobs",
-        type=positive,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="decompositions side by side, with --into sources (default: one a processor)",
-    )
-    _add_decompose_options(command)
-    command.set_defaults(run=_convert, writes=("{}", "{}_[0-9]*"))
-    command.add_argument(
-        "--auto-align",
-        action="store_true",
-        help="also fit library models to labelled furniture that has no annotation",
-    )
-    command.add_argument(
-        "--library",
-        type=Path,
-        metavar="DIR",
-        help="folder with cad/ for --auto-align (default: SRC, else the packaged furniture)",
-    )
-
-
-def _add_propose(commands: Commands) -> None:
-    command = commands.add_parser("propose", help="find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG")
-    command.add_argument("source", type=Path, metavar="SRC", help="folder with the raw scan")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the two files")
-    command.add_argument("--format", choices=("auto", *FORMATS), default="auto")
-    command.add_argument(
-        "--auto-align", action="store_true", help="also pick model and pose, and compare with annotations"
-    )
-    command.add_argument(
-        "--library", type=Path, metavar="DIR", help="folder with cad/ (default: SRC, else the packaged furniture)"
-    )
-    command.set_defaults(run=_propose, writes=("{}/proposals.*",))
-
-
-def _add_object(commands: Commands) -> None:
-    command = commands.add_parser("object", help="turn one mesh or URDF into a folder with a MuJoCo body")
-    command.add_argument(
-        "source", type=Path, metavar="MESH_OR_URDF", help="OBJ, PLY, STL, GLB, ... in metres, or a URDF"
-    )
-    command.add_argument("out", type=Path, metavar="OUT", help="folder to make; its name becomes the body's")
-    command.add_argument("--category", choices=CATEGORIES, help="default: told from the file's name, else other")
-    command.add_argument(
-        "--mass", type=_positive_number, metavar="KG", help="default: the URDF's, else density x volume"
-    )
-    command.add_argument(
-        "--friction", type=_positive_number, metavar="MU", help="default: the URDF's, else the category's"
-    )
-    command.add_argument("--scale", type=_positive_number, default=1.0, help="of a mesh that is not in metres")
-    command.add_argument(
-        "--up", choices=("z", "y"), default="z", help="axis of the mesh that points up (default z; DAE says it itself)"
-    )
-    command.add_argument(
-        "--within", type=Path, metavar="DIR", help="folder that textures are read from (default: the model's own)"
-    )
-    _add_decompose_options(command)
-    command.set_defaults(run=_object, writes=("{}",))
-
-
-def _add_check(commands: Commands) -> None:
-    command = commands.add_parser("check", help="run the acceptance gates on a scene folder; exit 1 if one fails")
-    command.add_argument("scene", type=Path, metavar="SCENE_DIR")
-    command.set_defaults(run=_check, writes=())
-
-
-def _add_preview(commands: Commands) -> None:
-    command = commands.add_parser("preview", help="draw a conversion's stages from above")
-    command.add_argument("scene", type=Path, metavar="SCENE_OR_OBJECT_DIR")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
-    command.add_argument("--source", type=Path, metavar="SRC", help="raw folder or file: draws scan and cut too")
-    command.set_defaults(run=_preview, writes=("{}",))
-
-
-def _add_export(commands: Commands) -> None:
-    command = commands.add_parser(
-        "export", help="draw a scene for Sweet Home 3D, to edit it there and convert it again"
-    )
-    command.add_argument("scene", type=Path, metavar="SCENE_DIR")
-    command.add_argument("output", type=Path, metavar="HOME.sh3d", help="file to make")
-    command.set_defaults(run=_export, writes=("{}",))
+def _add(commands: Commands, name: str, row: Command, run: Any) -> None:
+    command = commands.add_parser(name, help=row.help, usage=row.usage)
+    add_words(command, row.words, formats=("auto", *FORMATS), categories=CATEGORIES, cores=os.cpu_count() or 1)
+    if not row.actions:
+        command.set_defaults(run=run, writes=row.writes)
+        return
+    actions = command.add_subparsers(required=True, metavar="ACTION")
+    for action, inner in row.actions.items():
+        _add(actions, action, inner, run[action])
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    generating = (add_generate, add_generate_scenes, add_models, add_library)
-    for add in (_add_convert, add_segmenting, _add_propose, _add_object, _add_check, *generating, _add_preview):
-        add(commands)
-    _add_export(commands)
+    for name, row in read_words(Path(__file__).with_name("words.yaml")).items():
+        _add(commands, name, row, RUNS[name])
+        if name == "convert":
+            add_segmenting(commands)
+    convert = commands.choices["convert"]
+    convert.fromfile_prefix_chars = "@"
+    convert.convert_arg_line_to_args = lambda arg_line: [arg_line] if arg_line.strip() else []
     return parser
 
 

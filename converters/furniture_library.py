@@ -1,14 +1,11 @@
-"""Command `library` of `python -m converters`: its words, and what they print."""
+"""Command `library` of `python -m converters`, and what it prints; its words are in words.yaml."""
 
 from __future__ import annotations
 
 import argparse
-import os
-from pathlib import Path
 
 from rich.console import Console
 
-from converters.generating import Commands, positive
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.progress import stage_progress
 
@@ -49,19 +46,5 @@ def _list(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def add_library(commands: Commands) -> None:
-    """Words of `library`."""
-    command = commands.add_parser("library", help="furniture that people modelled: fetch it, package it, list it")
-    actions = command.add_subparsers(required=True, metavar="ACTION")
-    get = actions.add_parser("get", help="fetch the furniture libraries of Sweet Home 3D")
-    get.add_argument("name", choices=("sweethome3d",))
-    get.add_argument("--from", dest="given", type=Path, metavar="FILE.deb|DIR", help="default: apt-get downloads it")
-    get.add_argument("-o", "--out", type=Path, metavar="DIR", help="default: the cache folder")
-    get.add_argument("--overwrite", action="store_true", help="replace what was fetched before")
-    get.set_defaults(run=_get, writes=("{}",))
-    build = actions.add_parser("build", help="make the packaged selection again: models.zip and ATTRIBUTION.md")
-    build.add_argument("out", type=Path, metavar="OUT", help="folder that takes both files")
-    build.add_argument("--from", dest="given", type=Path, metavar="DIR", help="of the .sh3f files; default: as fetched")
-    build.add_argument("--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="models side by side")
-    build.set_defaults(run=_build, writes=("{}/*",))
-    actions.add_parser("list", help="the packaged models, with size and credit").set_defaults(run=_list, writes=())
+LIBRARY = {"get": _get, "build": _build, "list": _list}
+"""Action -> what runs it."""

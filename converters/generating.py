@@ -1,33 +1,16 @@
-"""Commands of `python -m converters` that generate: their words, and what they print."""
+"""Commands of `python -m converters` that generate, and what they print; their words are in words.yaml."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
-from pathlib import Path
-from typing import TypeAlias
 
 from rich.console import Console
 
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.progress import stage_progress
-
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-
-
-def positive(text: str) -> int:
-    """A whole number above 0."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is not a positive number")
-    return value
-
-
-def add_launcher(command: argparse.ArgumentParser) -> None:
-    """Words that say where."""
-    command.add_argument("--launcher", choices=("local", "ray"), default="local", help="where (default: local)")
-    command.add_argument("--ray-address", metavar="HOST:PORT", help="of the cluster's head (default: auto)")
+from interactive_nav_common.words import Commands as Commands
+from interactive_nav_common.words import positive as positive
 
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
@@ -68,43 +51,5 @@ def _models(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def add_generate(commands: Commands) -> None:
-    """Words of `generate`."""
-    command = commands.add_parser("generate", help="write a synthetic building in the raw Gibson layout")
-    command.add_argument("out", type=Path, metavar="OUT", help="folder to make")
-    command.add_argument("--seed", type=int, required=True, metavar="N", help="same seed, same building")
-    command.add_argument("--tier", default="sparse", help="sparse (default), furnished or cluttered")
-    command.add_argument("--split", choices=("train", "test"), default="train", help="whose CAD models (default train)")
-    command.add_argument(
-        "settings", nargs="*", metavar="KEY=VALUE", help="of the tier's buildings, such as floor_area_m2=80"
-    )
-    command.set_defaults(run=_generate, writes=("{}",))
-
-
-def add_generate_scenes(commands: Commands) -> None:
-    """Words of `generate-scenes`."""
-    command = commands.add_parser(
-        "generate-scenes",
-        help="make the scenes of a recipe file, or so many homes of a tier: generate, convert, draw; goes on where it "
-        "stopped",
-    )
-    command.add_argument("out", type=Path, metavar="OUT", help="folder of scene folders; those that are there are kept")
-    command.add_argument("--recipes", type=Path, metavar="YAML", help="default: OUT/recipes.yaml")
-    command.add_argument("--tier", metavar="TIER", help="write OUT/recipes.yaml: sparse, furnished or cluttered homes")
-    command.add_argument("--count", type=positive, metavar="N", help="how many of a tier (default 10)")
-    command.add_argument("--seed", type=int, metavar="N", help="of a tier's first home (default 100000)")
-    command.add_argument("--only", nargs="+", default=(), metavar="NAME", help="scenes to make (default: all)")
-    command.add_argument("--overwrite", action="store_true", help="make those again that are there")
-    command.add_argument(
-        "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="scenes side by side; default: cores"
-    )
-    add_launcher(command)
-    command.set_defaults(run=_generate_scenes, writes=("{}/*",))
-
-
-def add_models(commands: Commands) -> None:
-    """Words of `models`."""
-    command = commands.add_parser("models", help="draw the CAD models that generated buildings are furnished with")
-    command.add_argument("names", nargs="*", metavar="NAME", help="models or categories (default: all models)")
-    command.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
-    command.set_defaults(run=_models, writes=("{}",))
+GENERATING = {"generate": _generate, "generate-scenes": _generate_scenes, "models": _models}
+"""Command -> what runs it."""

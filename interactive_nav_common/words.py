@@ -1,0 +1,79 @@
+"""YAML tables of command lines in, the words of argparse parsers out.
+
+A command has its `help` and its `words`: `name` or `-o, --out` -> what `add_argument` takes, `type` by its name in
+`KINDS`. `{name}` stands for a value that only code knows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from interactive_nav_common.records import read_packaged
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def positive(text: str) -> int:
+    """A whole number above 0."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not a positive number")
+    return value
+
+
+def positive_number(text: str) -> float:
+    """A number above 0."""
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+KINDS: dict[str, Callable[[str], Any]] = {
+    **{"path": Path, "int": int, "float": float},
+    **{"positive": positive, "positive_number": positive_number},
+}
+"""Name of a `type` -> what makes a value of a word's text."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A row of a table."""
+
+    help: str = ""
+    """What it does."""
+    words: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
+    usage: str | None = None
+    writes: tuple[str, ...] = ()
+    """Patterns of the files that it may write; {} is where it writes."""
+    actions: dict[str, Command] = dataclasses.field(default_factory=dict)
+    """Commands of its own."""
+
+
+def read_words(path: Path) -> dict[str, Command]:
+    """The table of a file that comes with the package."""
+    return read_packaged(path, dict[str, Command])
+
+
+def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, Any]], **known: Any) -> None:
+    """Adds words to a parser or to a group of one.
+
+    Args:
+        to: takes them.
+        words: of a `Command`.
+        **known: what `{name}` stands for; a value that is nothing but `{name}` becomes it, of whatever type.
+    """
+
+    def filled(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        return known[value[1:-1]] if value[1:-1] in known and value[0] == "{" else value.format_map(known)
+
+    for names, row in words.items():
+        about = {key: filled(value) for key, value in row.items()}
+        about |= {"type": KINDS[about["type"]]} if "type" in about else {}
+        to.add_argument(*names.split(", "), **about)

@@ -1,0 +1,38 @@
+"""Tables of command lines: what argparse makes of a row, and that every packaged row is one."""
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from interactive_nav_common.words import add_words, read_words
+
+TABLE = """
+draw:
+  help: draw it
+  writes: ['{}/*']
+  words:
+    places: {nargs: +, type: path}
+    -n, --count: {type: positive, default: "{cores}", help: "so many (default {cores})"}
+    --share: {type: positive_number, choices: "{shares}"}
+"""
+
+
+def test_a_row_becomes_words_of_a_parser(tmp_path):
+    (tmp_path / "words.yaml").write_text(TABLE)
+    row = read_words(tmp_path / "words.yaml")["draw"]
+    parser = argparse.ArgumentParser()
+    add_words(parser, row.words, cores=3, shares=(0.5, 2.0))
+    arguments = parser.parse_args(["a", "b", "--share", "0.5"])
+    assert arguments == argparse.Namespace(places=[Path("a"), Path("b")], count=3, share=0.5)
+    assert parser.parse_args(["a", "-n", "7"]).count == 7
+    assert "so many (default 3)" in parser.format_help() and row.writes == ("{}/*",)
+
+
+@pytest.mark.parametrize("words", [["-n", "0"], ["-n", "x"], ["--share", "-1"], ["--share", "3"]])
+def test_values_that_a_row_does_not_allow_are_refused(words, tmp_path):
+    (tmp_path / "words.yaml").write_text(TABLE)
+    parser = argparse.ArgumentParser()
+    add_words(parser, read_words(tmp_path / "words.yaml")["draw"].words, cores=3, shares=(0.5, 2.0))
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["a", *words])
