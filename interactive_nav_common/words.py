@@ -38,6 +38,8 @@ KINDS: dict[str, Callable[[str], Any]] = {
     **{"positive": positive, "positive_number": positive_number},
 }
 """Name of a `type` -> what makes a value of a word's text."""
+ACTIONS = {"yes_or_no": argparse.BooleanOptionalAction}
+"""Name of an `action` -> it, where argparse has no name for it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +73,11 @@ def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, A
     def filled(value: Any) -> Any:
         if not isinstance(value, str):
             return value
-        return known[value[1:-1]] if value[1:-1] in known and value[0] == "{" else value.format_map(known)
+        return known[value[1:-1]] if value[1:-1] in known and value[0] == "{" else value.format(**known)
 
     for names, row in words.items():
         about = {key: filled(value) for key, value in row.items()}
+        about |= {"metavar": tuple(row["metavar"])} if isinstance(row.get("metavar"), list) else {}
         about |= {"type": KINDS[about["type"]]} if "type" in about else {}
+        about |= {"action": ACTIONS.get(about["action"], about["action"])} if "action" in about else {}
         to.add_argument(*names.split(", "), **about)

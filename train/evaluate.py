@@ -18,15 +18,16 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
+from interactive_nav_common.words import add_words, read_words
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
 from train.scoring.brought import named
-from train.scoring.evaluation import AUTO_BATCH, LEARNED, SEED, add_playing_words, evaluate, write_paths
+from train.scoring.evaluation import AUTO_BATCH, LEARNED, POLICIES, SEED, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
-from train.scoring.policies import PLANNERS, YARDSTICKS
+from train.scoring.policies import PLANNERS
 from train.scoring.rollout import BatchPlayer
 from train.scoring.row_files import EvaluationAsked, paths_beside
 from train.scoring.rows import score_table
@@ -60,40 +61,16 @@ def _config_of_yardsticks(policies: Sequence[str], arguments: argparse.Namespace
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.evaluate", description="Plays fixed episodes.")
-    made.add_argument(
-        "words",
-        nargs="*",
-        metavar="RUN_DIR | env.key=value",
-        help="folders that `python -m train` wrote (several share what is compiled; without one, --scenes, --out and "
-        "--policies say what to play), and environment settings to change",
+    add_words(
+        made,
+        read_words(Path(__file__).with_name("words.yaml"))["evaluate"].words,
+        episodes=EPISODES,
+        policies=",".join(POLICIES),
+        planners=",".join(PLANNERS),
+        seed=SEED,
+        batches=", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items()),
+        rows=ROWS,
     )
-    made.add_argument("--episodes", type=int, help=f"for each policy (default {EPISODES}, of files all)")
-    made.add_argument(
-        "--episode-file",
-        action="append",
-        metavar="FILE",
-        help="play these (python -m interactive_nav.episodes make); may be given several times",
-    )
-    made.add_argument("--balanced", action="store_true", help="scenes take turns; otherwise each episode draws one")
-    names = ",".join((LEARNED, *YARDSTICKS))
-    made.add_argument(
-        "--policies",
-        help=f"comma-separated choice from {','.join((names, *PLANNERS))} (default: {names}; with --policy none)",
-    )
-    made.add_argument(
-        "--policy",
-        action="append",
-        default=[],
-        metavar="[NAME=]MODULE:FACTORY",
-        help="also play what this function of your module, or of path/to/file.py, returns; may be given several times",
-    )
-    add_playing_words(made)
-    made.set_defaults(seed=None)  # of a file's episodes it decides nothing
-    made.add_argument("--record", type=int, default=8, help="episodes to record paths of (default 8)")
-    sizes = ", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items())
-    made.add_argument("--batch", type=int, metavar="N", help=f"episodes played at a time (default: {sizes})")
-    made.add_argument("--out", metavar="PATH", help=f"Parquet file (default RUN_DIR/{ROWS})")
-    made.add_argument("--dataset", metavar="DIR", help="add a file for each run and evaluation to this folder instead")
     return made
 
 
@@ -102,7 +79,7 @@ def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:
     brought = [named(word) for word in arguments.policy]
     given = arguments.policies
     if given is None:
-        given = "" if brought else ",".join((LEARNED, *YARDSTICKS))
+        given = "" if brought else ",".join(POLICIES)
     policies = tuple(dict.fromkeys(name for name in given.split(",") if name))
     if not policies and not brought:
         raise ConfigError(f"--policies is {given!r}, expected at least one, such as {LEARNED}")

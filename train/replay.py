@@ -18,23 +18,20 @@ from rich.console import Console
 
 from interactive_nav.pictures import replay
 from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.words import add_words, read_words
 from train.config import EnvConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
-from train.scoring.evaluation import LEARNED, add_playing_words, make_policies
-from train.scoring.policies import YARDSTICKS
+from train.scoring.evaluation import POLICIES, SEED, make_policies
 from train.scoring.rollout import episode_keys
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.replay", description="Records episodes step by step.")
-    made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
-    made.add_argument("--episodes", default="0", metavar="K,K,...", help="which of the fixed episodes (default 0)")
-    names = ",".join((LEARNED, *YARDSTICKS))
-    made.add_argument("--policies", default=LEARNED, help=f"comma-separated choice from {names} (default {LEARNED})")
-    add_playing_words(made)
-    made.add_argument("overrides", nargs="*", metavar="env.key=value", help="environment settings to change")
+    add_words(
+        made, read_words(Path(__file__).with_name("words.yaml"))["replay"].words, policies=",".join(POLICIES), seed=SEED
+    )
     return made
 
 
@@ -53,8 +50,8 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     keys = episode_keys(arguments.seed, max(episodes) + 1)
     names = list(dict.fromkeys(arguments.policies.split(",")))
     for name in names:
-        if name not in (LEARNED, *YARDSTICKS):
-            known = ", ".join((LEARNED, *YARDSTICKS))
+        if name not in POLICIES:
+            known = ", ".join(POLICIES)
             raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
     made = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
     for name, (policy, meta) in made.items():

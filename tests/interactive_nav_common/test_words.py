@@ -14,6 +14,8 @@ draw:
   words:
     places: {nargs: +, type: path}
     -n, --count: {type: positive, default: "{cores}", help: "so many (default {cores})"}
+    --span: {nargs: 2, type: float, metavar: [FROM, TO], help: from and to}
+    --loud: {action: yes_or_no, default: true}
     --share: {type: positive_number, choices: "{shares}"}
 """
 
@@ -24,8 +26,10 @@ def test_a_row_becomes_words_of_a_parser(tmp_path):
     parser = argparse.ArgumentParser()
     add_words(parser, row.words, cores=3, shares=(0.5, 2.0))
     arguments = parser.parse_args(["a", "b", "--share", "0.5"])
-    assert arguments == argparse.Namespace(places=[Path("a"), Path("b")], count=3, share=0.5)
+    assert arguments == argparse.Namespace(places=[Path("a"), Path("b")], count=3, span=None, loud=True, share=0.5)
     assert parser.parse_args(["a", "-n", "7"]).count == 7
+    assert parser.parse_args(["a", "--span", "1", "2"]).span == [1.0, 2.0] and "--span FROM TO" in parser.format_help()
+    assert not parser.parse_args(["a", "--no-loud"]).loud
     assert "so many (default 3)" in parser.format_help() and row.writes == ("{}/*",)
 
 

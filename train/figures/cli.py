@@ -16,6 +16,7 @@ from interactive_nav_common.errors import FileError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
+from interactive_nav_common.words import add_words, read_words
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
 from train.figures.paths import side_by_side, spread_episodes, trajectories
@@ -164,16 +165,7 @@ def _name(path: Path) -> str:
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m train.figures", description="Draws what runs have written.")
-    made.add_argument("results", metavar="RESULTS_DIR", help="a run folder, a sweep's folder, or a folder of either")
-    made.add_argument("-o", "--out", default="figures", metavar="DIR", help="where to (default figures/)")
-    made.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the pictures (default png)")
-    made.add_argument(
-        "--split",
-        choices=("auto", "train", "test", "all"),
-        default="auto",
-        help="scenes of a sweep's figures: auto (default) takes test where there are rows of them",
-    )
-    made.add_argument("--tables", action="store_true", help="print Markdown tables of a sweep instead of drawing")
+    add_words(made, read_words(Path(__file__).parents[1] / "words.yaml")["figures"].words)
     return made
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import time
@@ -27,12 +26,13 @@ from train.runs.run import check_fits
 from train.runs.run_folder import RunFolder
 from train.scoring.brought import BroughtPolicy
 from train.scoring.planners import HostPolicy
-from train.scoring.policies import PolicyFn, make_yardstick
+from train.scoring.policies import YARDSTICKS, PolicyFn, make_yardstick
 from train.scoring.rollout import BatchPlayer, PlayedEpisodes, episode_keys
 from train.scoring.row_files import EvaluationAsked
 from train.scoring.rows import episode_table
 
 LEARNED = "learned"
+POLICIES = (LEARNED, *YARDSTICKS)
 SEED = 1_000_000
 """Of the fixed episodes where none is given."""
 OF_LEARNED = (
@@ -42,19 +42,6 @@ OF_LEARNED = (
 """Columns that are empty for a policy that never learned."""
 AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
 """PlayedEpisodes played at a time, per physics backend."""
-
-
-def add_playing_words(made: argparse.ArgumentParser) -> None:
-    """The words of a command line that say which policy of a run plays which of the fixed episodes where."""
-    made.add_argument("--scenes", nargs="+", metavar="SCENE_DIR", help="default: the scenes it was trained on")
-    made.add_argument("--seed", type=int, default=SEED, help=f"of the fixed episodes (default {SEED})")
-    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
-    made.add_argument(
-        "--stochastic",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="sample the learned policy's actions, as the original did (default), or take their mode",
-    )
 
 
 def load_policy(

@@ -12,6 +12,7 @@ from rich.console import Console
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.signals import stop_signals
+from interactive_nav_common.words import add_words, read_words
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
@@ -34,29 +35,8 @@ def parser() -> argparse.ArgumentParser:
         "file is wrong, 3 stopped by the time limit, 128 + signal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    known = ", ".join(spec.known_sweeps())
-    made.add_argument("sweep", nargs="?", metavar="NAME|PATH", help=f"a sweep ({known}) or a YAML file")
-    made.add_argument("--config", metavar="NAME|PATH", help="the same, as `python -m train` takes it")
-    made.add_argument("--status", action="store_true", help="print how far every run is, and do nothing")
-    made.add_argument("--export", metavar="DIR", help="copy rows, curves and the best run's checkpoint of each cell")
-    made.add_argument(
-        "--policy-step",
-        type=float,
-        default=STEP,
-        metavar="X",
-        help=f"with --export: round the checkpoint's weights to X standard deviations (default {STEP:g})",
-    )
-    made.add_argument("--resume", action="store_true", help="only continue: refuse a sweep that was never begun")
-    made.add_argument("--only", choices=STAGES, help="train without evaluating, or evaluate what is trained")
-    made.add_argument("--redo", action="store_true", help="evaluate again what is evaluated")
-    made.add_argument("--unfinished", action="store_true", help="evaluate unfinished runs too, as far as they are")
-    made.add_argument("--time-limit", type=float, metavar="SECONDS", help="then stop all runs, with their checkpoints")
-    made.add_argument(
-        "--where", action="append", default=[], metavar="KEY=VALUE[,VALUE]", help="only these runs (may be repeated)"
-    )
-    made.add_argument("--shard", metavar="I/N", help="only every N-th run, from the I-th: one machine's part")
-    made.add_argument("--launcher", choices=("local", "ray"), default="local", help="this machine, or a Ray cluster")
-    made.add_argument("--ray-address", metavar="ADDRESS", help="of the cluster (default: auto)")
+    words = read_words(Path(__file__).parents[1] / "words.yaml")["sweep"].words
+    add_words(made, words, known=", ".join(spec.known_sweeps()), step=STEP, stages=STAGES)
     return made
 
 
