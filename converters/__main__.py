@@ -23,10 +23,10 @@ from converters.generating import GENERATING
 from converters.records.errors import StageFailed
 from converters.segmenting import add_segmenting
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
-from interactive_nav_common.config import refuse_unused
+from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
-from interactive_nav_common.words import Command, Commands, add_words, read_words
+from interactive_nav_common.words import Command, Commands, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES
 
 FORMATS = (
@@ -49,9 +49,9 @@ def _on_sigterm(signum: int, frame: FrameType | None) -> None:
 
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import ConvertConfig, convert_building
-    from converters.recipes import check_conversion, parse_settings
+    from converters.recipes import check_conversion
 
-    check_conversion(settings := parse_settings(arguments.settings), "settings")
+    check_conversion(settings := read_words(arguments.settings, "object_faces=3000"), "settings")
     config = ConvertConfig(
         **{
             word: getattr(arguments, word)
@@ -213,7 +213,7 @@ def _add(commands: Commands, name: str, row: Command, run: Any) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, row in read_words(Path(__file__).with_name("words.yaml")).items():
+    for name, row in read_commands(Path(__file__).with_name("words.yaml")).items():
         _add(commands, name, row, RUNS[name])
         if name == "convert":
             add_segmenting(commands)

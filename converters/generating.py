@@ -7,7 +7,7 @@ import dataclasses
 
 from rich.console import Console
 
-from interactive_nav_common.config import refuse_unused
+from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.progress import stage_progress
 from interactive_nav_common.words import Commands as Commands
 from interactive_nav_common.words import positive as positive
@@ -15,9 +15,9 @@ from interactive_nav_common.words import positive as positive
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.generate import generate_building
-    from converters.recipes import building_of, parse_settings
+    from converters.recipes import building_of
 
-    settings = parse_settings(arguments.settings)
+    settings = read_words(arguments.settings, "floor_area_m2=80")
     config = building_of(arguments.tier, settings, arguments.split, "settings")
     with stage_progress(console) as report:
         generate_building(arguments.out, arguments.seed, report, config)

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from converters.check.preview import preview
 from converters.generate import generate_building
 from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
@@ -140,24 +138,6 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
         return home_config(tier, values, HOME_MODELS[split])
     except GenerationError as error:
         raise GenerationError(f"{where}: {error}") from error
-
-
-def parse_settings(words: Iterable[str]) -> dict[str, Any]:
-    """KEY=VALUE words of a command line -> settings, their values read as YAML.
-
-    Raises:
-        GenerationError: a word without '=', or with a value that is no YAML.
-    """
-    settings = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not equals:
-            raise GenerationError(f"got '{word}', expected KEY=VALUE, such as floor_area_m2=80")
-        try:
-            settings[key] = yaml.safe_load(value)
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            raise GenerationError(f"{key}: cannot read '{value}', expected a number or [lowest, highest]") from error
-    return settings
 
 
 def check_conversion(settings: dict[str, Any], where: str) -> None:

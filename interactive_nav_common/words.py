@@ -56,7 +56,7 @@ class Command:
     """Commands of its own."""
 
 
-def read_words(path: Path) -> dict[str, Command]:
+def read_commands(path: Path) -> dict[str, Command]:
     """The table of a file that comes with the package."""
     return read_packaged(path, dict[str, Command])
 

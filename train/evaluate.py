@@ -18,7 +18,7 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
-from interactive_nav_common.words import add_words, read_words
+from interactive_nav_common.words import add_words, read_commands
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="python -m train.evaluate", description="Plays fixed episodes.")
     add_words(
         made,
-        read_words(Path(__file__).with_name("words.yaml"))["evaluate"].words,
+        read_commands(Path(__file__).with_name("words.yaml"))["evaluate"].words,
         episodes=EPISODES,
         policies=",".join(POLICIES),
         planners=",".join(PLANNERS),

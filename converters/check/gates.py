@@ -18,11 +18,11 @@ from converters.check.surfaces import surface_values
 from converters.geometry.density import clearance_m
 from converters.records.gate import Gate, Limit
 from converters.structure.maps import label_pieces
+from interactive_nav_common.records import read_packaged
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
 
 ROBOT_RADIUS_M = 0.18
 """Free space is judged for a TurtleBot-sized disc."""
-START_GOAL_M = 1.0
 OFF_MAP_M = 1.0
 """An object with no free floor this near lies outside of what was mapped."""
 DRIFT_S = 5.0
@@ -30,36 +30,8 @@ TIMESTEP_S = 0.02
 """The environments' own physics timestep (`sim_dt_s`), for hulls and for boxes."""
 
 
-LIMITS: dict[str, Limit] = {
-    "compiles": Limit("bool", least=1, meaning="scene.xml compiles in MuJoCo"),
-    "unmatched_objects": Limit("count", most=0, meaning="names in only one of scene.json and scene.xml; off the map"),
-    "finite": Limit("bool", least=1, meaning="no non-finite number in 5 s, no simulation started over"),
-    "drift_hulls": Limit("m", most=0.01, meaning="largest move in 5 s untouched, hulls at the environments' timestep"),
-    "drift_boxes": Limit("m", most=0.01, meaning="the same with boxes"),
-    "turn_hulls": Limit("deg", most=1.0, meaning="largest turn in 5 s untouched, hulls"),
-    "turn_boxes": Limit("deg", most=1.0, meaning="the same with boxes"),
-    "penetration_hulls": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, hulls"),
-    "penetration_boxes": Limit("m", most=0.002, meaning="deepest contact at the start or at rest, boxes"),
-    "rim_without_wall": Limit("share", most=0.02, meaning="of the free floor's rim, what no wall bounds"),
-    "walls_in_floor": Limit("share", most=0.01, meaning="of the free floor, what lies within walls"),
-    "manifest_differs": Limit("count", most=0, meaning="masses and frictions that scene.xml and scene.json differ in"),
-    "mass_ratio": Limit("ratio", most=10.0, meaning="of a mass to the nearer end of its category's usual range"),
-    "least_friction": Limit("ratio", least=0.05, meaning="smallest sliding coefficient of a movable"),
-    "physics_changed": Limit("count", most=0, meaning="gravity, air, floor or flags other than every scene's"),
-    "traversable_area": Limit("m2", least=1.0, meaning="floor without static obstacles"),
-    "connected_share": Limit(
-        "share", least=0.8, meaning="of the free floor, what a disc of 0.18 m radius covers in one piece"
-    ),
-    "start_goal": Limit("m", least=START_GOAL_M, meaning="farthest two cells in that piece, straight line"),
-    "hulls_per_object": Limit("count", most=16, meaning="most hulls of one object"),
-    "hulls": Limit("count", most=600, meaning="hulls in all"),
-    "walls": Limit("count", most=200, meaning="wall boxes"),
-    "surface_kept": Limit("share", least=0.9, meaning="of a model's area, what is drawn"),
-    "unseen_hulls": Limit(
-        "share", most=0.13, meaning="of an object's hulls' sides, what lies over 10 cm from what is drawn"
-    ),
-    "unsolid_surface": Limit("share", most=0.1, meaning="of what is drawn, what lies over 5 cm outside of the hulls"),
-}
+LIMITS: dict[str, Limit] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Limit])
+"""Gate -> what it demands."""
 
 
 def judge(name: str, value: float, warnings: tuple[str, ...] = ()) -> Gate:

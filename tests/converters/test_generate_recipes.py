@@ -69,8 +69,8 @@ def test_a_tier_makes_a_home_with_the_split_s_models():
         (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9: expected 0 to 0.37"),
         (["--tier", "furnished", "furniture_share=x"], "furniture_share is 'x', expected a float"),
         (["--tier", "furnished", "n_chairs=3"], "unknown key 'n_chairs'"),
-        (["n_rooms=[3"], "n_rooms: cannot read '[3', expected a number or [lowest, highest]"),
-        (["n_rooms"], "got 'n_rooms', expected KEY=VALUE"),
+        (["n_rooms=[3"], "settings: n_rooms is '[3', expected a number or [lowest, highest]"),
+        (["n_rooms"], "override 'n_rooms': expected key=value, for example floor_area_m2=80"),
     ],
 )
 def test_wrong_tiers_and_settings_of_one_building_are_told_in_a_line(tmp_path, capsys, words, message):

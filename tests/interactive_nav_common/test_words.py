@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from interactive_nav_common.words import add_words, read_words
+from interactive_nav_common.words import add_words, read_commands
 
 TABLE = """
 draw:
@@ -22,7 +22,7 @@ draw:
 
 def test_a_row_becomes_words_of_a_parser(tmp_path):
     (tmp_path / "words.yaml").write_text(TABLE)
-    row = read_words(tmp_path / "words.yaml")["draw"]
+    row = read_commands(tmp_path / "words.yaml")["draw"]
     parser = argparse.ArgumentParser()
     add_words(parser, row.words, cores=3, shares=(0.5, 2.0))
     arguments = parser.parse_args(["a", "b", "--share", "0.5"])
@@ -37,6 +37,6 @@ def test_a_row_becomes_words_of_a_parser(tmp_path):
 def test_values_that_a_row_does_not_allow_are_refused(words, tmp_path):
     (tmp_path / "words.yaml").write_text(TABLE)
     parser = argparse.ArgumentParser()
-    add_words(parser, read_words(tmp_path / "words.yaml")["draw"].words, cores=3, shares=(0.5, 2.0))
+    add_words(parser, read_commands(tmp_path / "words.yaml")["draw"].words, cores=3, shares=(0.5, 2.0))
     with pytest.raises(SystemExit, match="2"):
         parser.parse_args(["a", *words])

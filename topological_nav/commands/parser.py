@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import settings_help
-from interactive_nav_common.words import add_words, read_words
+from interactive_nav_common.words import add_words, read_commands
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.commands.adapt import ADAPTED
 from topological_nav.config import (
@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
         description="Navigation by images and a graph. Words key=value change settings: COMMAND --help lists them.",
     )
     commands = made.add_subparsers(dest="command", required=True)
-    for name, row in read_words(Path(__file__).parents[1] / "words.yaml").items():
+    for name, row in read_commands(Path(__file__).parents[1] / "words.yaml").items():
         listed = [
             f"settings{of or ' (key=default)'}:\n{settings_help(config)}" for of, config in SETTINGS[name].items()
         ]

@@ -19,6 +19,7 @@ from typing import Any
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.signals import stop_signals
+from interactive_nav_common.words import add_words, read_commands
 from scenes_mjcf.schema import SceneError
 from topological_nav.config import RUNS, NavigatorConfig
 from topological_nav.ros import debian, launch
@@ -51,20 +52,16 @@ def parser() -> argparse.ArgumentParser:
     )
     alone = command("sim", "The simulator's node, and a master where none is.", sim)
     navigator = command("navigator", "The navigator's node, for a robot or a simulator.", heading, topological)
+    sets = read_commands(Path(__file__).with_name("words.yaml"))
     for sub in (everything, alone):
-        sub.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
-        sub.add_argument("--port", type=int, metavar="N", help="a master of its own on this port; 0: a free one")
-        pace = sub.add_mutually_exclusive_group()
-        pace.add_argument("--lockstep", action="store_true", help="each picture waits for its velocity command")
-        pace.add_argument("--factor", type=float, default=1.0, help="simulated seconds a second; 0: no waiting")
-        sub.add_argument("--limit", type=float, default=1800.0, metavar="S", help="simulated seconds of an episode")
-    alone.add_argument("--recorded", action="store_true", help="begin when every topic has a listener")
-    everything.add_argument("--bag", type=Path, metavar="PATH", help="record all topics there")
+        add_words(sub, sets["scene"].words)
+        add_words(sub.add_mutually_exclusive_group(), sets["pace"].words)
+        add_words(sub, sets["limit"].words)
+    add_words(alone, sets["sim"].words)
+    add_words(everything, sets["all"].words)
     for sub in (everything, navigator):
-        sub.add_argument("--driver", choices=list(DRIVERS), default="heading", help="what decides on velocities")
-        sub.add_argument("--heading-from", choices=("imu", "odom"), default="imu", help="topic of the heading")
-        sub.add_argument("--heading-offset", type=float, default=0.0, metavar="RAD", help="of that frame in the map's")
-        _add_journey(sub)
+        add_words(sub, sets["driver"].words, drivers=tuple(DRIVERS))
+        add_words(sub.add_argument_group("driver topological"), sets["topological"].words, runs=RUNS)
     record = command("record", "Writes all topics into a bag until it is stopped.")
     record.add_argument("bag", type=Path)
     command("check", "Says whether ROS can be used here.")
@@ -96,18 +93,6 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
     elif arguments.command != "sim" and arguments.driver == "heading":
         options = "--map --localiser --detector --policy --goal --goal-heading"
         refuse_unused(arguments, options, "with --driver heading, only with --driver topological")
-
-
-def _add_journey(sub: argparse.ArgumentParser) -> None:
-    group = sub.add_argument_group("driver topological")
-    group.add_argument("--map", type=Path, metavar="PATH", help="of `python -m topological_nav map`")
-    group.add_argument("--localiser", type=Path, metavar="RUN", help=f"embeds images (default {RUNS}, or packaged)")
-    group.add_argument("--detector", type=Path, metavar="RUN", help="judges passages (default: as the localiser)")
-    group.add_argument(
-        "--policy", metavar="RUN", help="drives along edges; or passage (default: as the networks, if none is named)"
-    )
-    group.add_argument("--goal", type=Path, action="append", default=[], metavar="PICTURE", help="taken at the goal")
-    group.add_argument("--goal-heading", type=float, metavar="RAD", help="along which the first was (default 0)")
 
 
 def _journey(arguments: argparse.Namespace) -> Any:

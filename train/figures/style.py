@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 
+from interactive_nav_common.records import read_packaged
 from interactive_nav_common.statistics import Estimate
 
 matplotlib.use("Agg")
@@ -30,22 +32,7 @@ FILLS = ("none", "left", "full")
 LINES: tuple[Any, ...] = (":", "--", "-", "-.")
 ANY = (-np.inf, np.inf)
 P_LABEL, E_LABEL = "P$_{eff}$ (SPL)", "E$_{eff}$"
-RC: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "legend.fontsize": 8,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "0.9",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "savefig.dpi": 200,
-}
+RC: dict[Any, Any] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Any])
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from rich.console import Console
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.signals import stop_signals
-from interactive_nav_common.words import add_words, read_words
+from interactive_nav_common.words import add_words, read_commands
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
         "file is wrong, 3 stopped by the time limit, 128 + signal",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    words = read_words(Path(__file__).parents[1] / "words.yaml")["sweep"].words
+    words = read_commands(Path(__file__).parents[1] / "words.yaml")["sweep"].words
     add_words(made, words, known=", ".join(spec.known_sweeps()), step=STEP, stages=STAGES)
     return made
 
