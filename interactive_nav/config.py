@@ -20,6 +20,7 @@ from interactive_nav_common.config import (
     overlay,
 )
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.records import read_packaged
 from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
@@ -28,25 +29,9 @@ SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "li
 """Parts of the state vector."""
 IMAGES = ("depth", "segmentation", "rgb", "normals")
 """Parts that are images."""
-ORIGINAL_CODE: dict[str, Any] = {
-    "episode_steps": 500,
-    "success_in_3d": True,
-    "fail_when_lifted": True,
-    "interaction_with": "anything",
-    "kinematic_sum": "touched",
-    "force_part": "normal",
-    "score_gravity_m_s2": 9.8,
-    "robot_mass": "links",
-    "effort_on_failure": False,
-    "waypoint_style": "grid",
-    "potential": "quantised",
-    "scene_choice": "slot",
-    "goal_clear": False,
-    "random_object_yaw": False,
-    "bootstrap_at_time_limit": False,
-}
+VARIANTS = read_packaged(Path(__file__).with_name("variants.yaml"), dict[str, dict[str, Any]])
+ORIGINAL_CODE: dict[str, Any] = VARIANTS["code"]
 """What the original's code did where it differs from its paper (reference benchmark, section 11)."""
-VARIANTS: dict[str, dict[str, Any]] = {"paper": {}, "code": ORIGINAL_CODE}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,7 @@ from converters.read.storeys import label_storeys
 from converters.read.surfaces import floor_level
 from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene, ScanMesh
+from interactive_nav_common.records import read_packaged
 
 NYU40 = tuple(
     re.findall(
@@ -56,18 +57,7 @@ class Collection:
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
-COLLECTIONS = {
-    "scannet": Collection(
-        "scannetv2", 2, ("*_vh_clean_2.ply", "*.aggregation.json"), {"segmentation_type": "semantic"}
-    ),
-    "scannetpp": Collection("scannetppv2", 2, ("scans/mesh_aligned_0.05.ply", "scans/segments_anno.json")),
-    "arkitscenes": Collection("arkitscenes", 3, ("*_3dod_mesh.ply", "*_3dod_annotation.json")),
-    "3rscan": Collection("3rscan", 1, ("labels.instances.annotated.v2.ply",), {"segmentation_type": "nyu40"}),
-    "multiscan": Collection("multiscan", 1, ("*.annotations.json", "*.ply")),
-    "matterport3d": Collection(
-        "matterport3d", 1, ("house_segmentations/*.ply",), {"segmentation_type": "semantic", "label_space": "nyu40"}
-    ),
-}
+COLLECTIONS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Collection])
 
 
 def looks_like(name: str) -> Callable[[Path], bool]:
