@@ -21,7 +21,7 @@ from rich.console import Console
 from converters.furniture_library import LIBRARY
 from converters.generating import GENERATING
 from converters.records.errors import StageFailed
-from converters.segmenting import add_segmenting
+from converters.segmenting import add_segmenting, label_unlabelled
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
@@ -58,12 +58,14 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
             for word in ("format", "up", "unit", "mirror", "root", "split", "jobs", "library", "strict")
         },
         overwrite=arguments.overwrite,
-        auto_align=arguments.auto_align or arguments.library is not None,
+        auto_align=arguments.auto_align or arguments.segment or arguments.library is not None,
         timeout_s=arguments.timeout,
         **{"seed": arguments.seed} | settings,
     )
     if arguments.into:
         return _convert_many(arguments, config, console)
+    if arguments.segment:
+        label_unlabelled(arguments, console)
     warn = warn_once(console)
     with stage_progress(console) as report:
         results = convert_building(arguments.source, arguments.out, config, report, warn=warn)

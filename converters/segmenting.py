@@ -32,19 +32,32 @@ def _segment(arguments: argparse.Namespace, console: Console) -> int:
     target = _labels_of(arguments.source)
     if target.exists() and not arguments.overwrite:
         raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
+    arguments.output = target
+    _label(arguments, target, arguments.weights, console)
+    return 0
+
+
+def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
+    """The step of `convert --segment`: labels the source beside it, unless it has labels, perhaps edited ones."""
+    target = _labels_of(arguments.source)
+    if target.exists():
+        console.print(f"{target}: is there, kept", soft_wrap=True)
+    else:
+        _label(arguments, target, None, console)
+
+
+def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, console: Console) -> None:
     import numpy as np
 
     from converters.read.source import read_source
     from converters.segment.labelling import label_scan, load_scores
     from converters.segment.network import WEIGHTS
 
-    arguments.output = target
-    scores = load_scores(arguments.weights or WEIGHTS)
+    scores = load_scores(weights or WEIGHTS)
     with stage_progress(console) as report:
         labels = label_scan(read_source(arguments.source, up=arguments.up, unit=arguments.unit), scores, report)
     write_arrays(target, label=labels.astype(np.uint8))
     console.print(f"{target}: labels of {len(labels)} vertices", soft_wrap=True)
-    return 0
 
 
 def _train(arguments: argparse.Namespace, console: Console) -> int:

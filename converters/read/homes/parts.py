@@ -68,8 +68,6 @@ class Part:
     static: bool
     mass_kg: float | None = None
     friction: float | None = None
-    low: bool = False
-    """Built in, and no higher than it shows."""
     held: bool = False
     """It stays where it is whatever its name says."""
     known_as: str = ""
@@ -77,6 +75,8 @@ class Part:
     swing: tuple[np.ndarray, tuple[float, float]] | None = None
     """Of a door's leaf: (3,) point of its upright hinge, own frame, and the angles (rad) that it turns by; None: they
     are found."""
+    low: bool = False
+    """Built in, and no higher than it shows."""
 
     @property
     def category(self) -> Category | None:

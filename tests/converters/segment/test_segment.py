@@ -182,6 +182,17 @@ def test_the_command_writes_what_the_reader_takes_and_replaces_nothing(room, tmp
     assert "segment-train" in capsys.readouterr().err
 
 
+def test_one_command_makes_a_scene_of_an_unlabelled_mesh_by_the_packaged_weights(room, tmp_path, capsys):
+    main(["convert", str(room), str(tmp_path / "scene"), "--segment"])
+    scan = read_source(room).scan
+    for there, label in ((scan.vertices[:, 2] < -1.2, 2), (np.abs(scan.vertices[:, 2]) < 0.9, 1)):
+        assert (scan.labels[there] == label).mean() > 0.8, label
+    assert json.loads((tmp_path / "scene" / "scene.json").read_text())["objects"] == []
+    before = labels_beside(room).read_bytes()
+    main(["convert", str(room), str(tmp_path / "scene"), "--segment", "--overwrite"])
+    assert "is there, kept" in capsys.readouterr().out and labels_beside(room).read_bytes() == before
+
+
 @pytest.mark.slow
 def test_training_goes_on_where_it_stopped(tmp_path):
     words = ["buildings=1", "held_out=1", "crops=2", "side=32", "widths=[8,8]", "batch=1", "workers=1", "save_s=0.5"]
