@@ -14,9 +14,12 @@ from typing import Any
 import jax
 
 from interactive_nav_common.versions import commit, package_versions
+from interactive_nav_common.words import add_words, read_commands
 
 RESULTS = Path("benchmarks/results")
 SCENE = "scenes_mjcf/apartment_0"
+TABLE = read_commands(Path(__file__).with_name("words.yaml"))
+"""Words of the command lines."""
 PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
 
 
@@ -30,8 +33,7 @@ def command_line(description: str | None, rows: str = "", settings: bool = False
     """
     made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if settings:
-        made.add_argument("--scenes", nargs="+", default=[SCENE])
-        made.add_argument("--robot", default="turtlebot")
+        add_words(made, TABLE["settings"].words)
         made.add_argument(
             "--set",
             dest="settings",
@@ -42,8 +44,7 @@ def command_line(description: str | None, rows: str = "", settings: bool = False
             help="environment settings",
         )
     if rows:
-        made.add_argument("--commit", default=None, help="recorded in the row; default: git's HEAD")
-        made.add_argument("--out", type=Path, default=RESULTS / f"{rows}.jsonl", help="where rows are appended")
+        add_words(made, TABLE["rows"].words, rows=RESULTS / f"{rows}.jsonl")
     return made
 
 

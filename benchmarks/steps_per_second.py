@@ -26,12 +26,13 @@ import numpy as np
 from rich.console import Console
 
 import interactive_nav
-from benchmarks.measurement import append_row, command_line, origin, random_driving, timed
+from benchmarks.measurement import TABLE, append_row, command_line, origin, random_driving, timed
 from interactive_nav.physics import resolve_backend
 from interactive_nav.physics.window import Window
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
+from interactive_nav_common.words import add_words
 from train import config_io
 from train.runs.run import train_run
 from train.sweep.devices import gpu_listing
@@ -258,13 +259,7 @@ def training(
 def main() -> None:
     """Measures and appends rows."""
     parser = command_line(__doc__, "steps_per_second", settings=True)
-    parser.add_argument("--backend", default="auto")
-    parser.add_argument("--devices", type=int, default=1, help="spread the environments over this many")
-    parser.add_argument("--num-envs", type=int, nargs="+", default=[64])
-    parser.add_argument("--steps", type=int, default=200, help="control steps of every environment")
-    parser.add_argument("--mode", nargs="+", choices=MODES, default=["simulation"])
-    parser.add_argument("--preset", default="turtlebot_ppo", help="of `python -m train`, for train")
-    parser.add_argument("--learner", nargs="*", default=[], metavar="key=value", help="laid over the preset, for train")
+    add_words(parser, TABLE["steps_per_second"].words, modes=MODES)
     args = parser.parse_args()
     settings = dict(args.settings)
     for num_envs in args.num_envs:

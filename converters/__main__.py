@@ -21,7 +21,7 @@ from rich.console import Console
 from converters.furniture_library import LIBRARY
 from converters.generating import GENERATING
 from converters.records.errors import StageFailed
-from converters.segmenting import add_segmenting, label_unlabelled
+from converters.segmenting import SEGMENTING, label_unlabelled
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
@@ -194,6 +194,7 @@ RUNS: dict[str, Any] = {
     "object": _object,
     "check": _check,
     **GENERATING,
+    **SEGMENTING,
     "library": LIBRARY,
     "preview": _preview,
     "export": _export,
@@ -217,8 +218,6 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, row in read_commands(Path(__file__).with_name("words.yaml")).items():
         _add(commands, name, row, RUNS[name])
-        if name == "convert":
-            add_segmenting(commands)
     convert = commands.choices["convert"]
     convert.fromfile_prefix_chars = "@"
     convert.convert_arg_line_to_args = lambda arg_line: [arg_line] if arg_line.strip() else []

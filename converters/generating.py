@@ -9,8 +9,6 @@ from rich.console import Console
 
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.progress import stage_progress
-from interactive_nav_common.words import Commands as Commands
-from interactive_nav_common.words import positive as positive
 
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:

@@ -1,4 +1,4 @@
-"""Commands of `python -m converters` that label scans: their words, and what they print."""
+"""Commands of `python -m converters` that label scans, and what they print; their words are in words.yaml."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from converters.generating import Commands, positive
 from converters.records.errors import SceneRejected
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.progress import stage_progress
@@ -100,22 +99,5 @@ def _table(console: Console, what: str, iou: dict[str, float]) -> None:
     console.print(f"{what}: mIoU {mean:.3f}; {row}", soft_wrap=True, highlight=False)
 
 
-def add_segmenting(commands: Commands) -> None:
-    """Words of `segment`, `segment-train` and `segment-score`."""
-    about = "weights.npz of a training (default: the packaged)"
-    command = commands.add_parser("segment", help="label an unlabelled scan by a network, for propose and convert")
-    command.add_argument("source", type=Path, metavar="SRC", help="a mesh file, or a folder of layout gibson")
-    command.add_argument("--weights", type=Path, metavar="NPZ", help=about)
-    command.add_argument("--up", choices=("auto", *"xyz", "-x", "-y", "-z"), default="auto", help="axis of a mesh file")
-    command.add_argument("--unit", choices=("auto", "m", "cm", "mm", "ft", "in"), default="auto", help="of a mesh file")
-    command.add_argument("--overwrite", action="store_true", help="replace labels that are there")
-    command.set_defaults(run=_segment, writes=("{}",))
-    command = commands.add_parser("segment-train", help="train the network of segment on generated buildings")
-    command.add_argument("out", type=Path, metavar="OUT", help="folder of the run; one that is there is gone on with")
-    command.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="such as steps=1000; see SegmentConfig")
-    command.set_defaults(run=_train, writes=("{}",))
-    command = commands.add_parser("segment-score", help="score the network on labelled scans and generated buildings")
-    command.add_argument("sources", nargs="*", type=Path, metavar="SRC", help="labelled scans")
-    command.add_argument("--homes", type=positive, metavar="N", help="also whole generated buildings, so many")
-    command.add_argument("--weights", type=Path, metavar="NPZ", help=about)
-    command.set_defaults(run=_score, writes=())
+SEGMENTING = {"segment": _segment, "segment-train": _train, "segment-score": _score}
+"""Command -> what runs it."""

@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import interactive_nav
 from interactive_nav.task.episode_files import EpisodeFile, EpisodeFileError, draw, load, load_all, save, starts_of
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.words import add_words, read_commands
 
 __all__ = ["EpisodeFile", "EpisodeFileError", "draw", "load", "load_all", "main", "save", "starts_of"]
 
@@ -23,16 +25,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Makes a file; 0 when done, 2 on a user's error."""
     parser = argparse.ArgumentParser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
     commands = parser.add_subparsers(dest="command", required=True)
-    make_parser = commands.add_parser("make", help="draw episodes and write them to a file")
-    make_parser.add_argument("--robot", default="turtlebot", help="default: turtlebot")
-    make_parser.add_argument("--scenes", nargs="+", required=True, metavar="SCENE_DIR")
-    make_parser.add_argument("--episodes", type=int, default=100, help="default: 100")
-    make_parser.add_argument("--seed", type=int, default=0, help="default: 0")
-    make_parser.add_argument("--num-objects", type=int, default=10, help="small objects (default 10)")
-    make_parser.add_argument(
-        "--objects", nargs="+", default=(), metavar="OBJECT_DIR", help="folders of small objects (default: built-in)"
-    )
-    make_parser.add_argument("-o", "--out", required=True, metavar="FILE")
+    row = read_commands(Path(__file__).with_name("words.yaml"))["episodes"]
+    make_parser = commands.add_parser("make", help=row.help)
+    add_words(make_parser, row.words)
     arguments = parser.parse_args(argv)
     env = interactive_nav.make(
         arguments.robot,

@@ -42,6 +42,7 @@ from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.progress import progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
+from interactive_nav_common.words import add_words, program, read_commands
 
 FORMATS = (".mp4", ".gif", ".webp")
 BEHIND_M = {"follow": (1.8, 1.8), "eye": (2.6, 1.5)}
@@ -289,14 +290,7 @@ def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
 
 def add_picture_words(made: argparse.ArgumentParser) -> None:
     """What to draw, and where to."""
-    made.add_argument("--episode", type=int, default=0, metavar="K", help="which of the fixed episodes (default 0)")
-    made.add_argument("--policy", default="learned", help="learned (default), or a policy of `train.evaluate`")
-    made.add_argument(
-        "-o", "--out", default="episode.mp4", metavar="PATH", help=".mp4, .gif or .webp (default episode.mp4)"
-    )
-    made.add_argument("--height", type=int, default=360, help="rows of the view from behind (default 360)")
-    made.add_argument("--views", nargs="+", choices=VIEWS, default=(), help="textured views, side by side, instead")
-    made.add_argument("--every", type=int, default=1, metavar="N", help="a frame every N control steps (default 1)")
+    add_words(made, read_commands(Path(__file__).with_name("words.yaml"))["picture"].words, views=VIEWS)
 
 
 def check_picture_words(arguments: argparse.Namespace) -> None:
@@ -327,8 +321,7 @@ def record(source: Path, arguments: argparse.Namespace, console: Console) -> Non
 @reports_errors("interactive_nav.record")
 def main(argv: Sequence[str] | None = None) -> int:
     """Records; 0 when done, 2 on a user's error, 130 when interrupted."""
-    made = argparse.ArgumentParser(prog="python -m interactive_nav.record", description="Makes a video of an episode.")
-    made.add_argument("replay", metavar="REPLAY", help="a replay (.npz), or a run folder that holds the episode's")
+    made = program(Path(__file__).with_name("words.yaml"), "record")
     add_picture_words(made)
     arguments = made.parse_args(argv)
     source = Path(arguments.replay)

@@ -7,7 +7,6 @@ robot's path coloured by time or by what it touched.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
+from interactive_nav_common.words import program
 
 COLOUR_BY = ("time", "contact")
 TOUCH_COLOURS = {"nothing": "#0072b2", "an object": "#d55e00", "a wall": "#555555"}
@@ -221,11 +221,7 @@ def _files(sources: Sequence[str]) -> list[Path]:
 @reports_errors("interactive_nav.topdown")
 def main(argv: Sequence[str] | None = None) -> int:
     """Draws; 0 when done, 2 on a user's error."""
-    made = argparse.ArgumentParser(prog="python -m interactive_nav.topdown", description="Draws episodes from above.")
-    made.add_argument("replays", nargs="+", metavar="REPLAY", help="replay files, or run folders that hold replays")
-    made.add_argument("-o", "--out", default="topdown.png", metavar="PATH", help="picture (default topdown.png)")
-    made.add_argument("--colour-by", choices=COLOUR_BY, default="time", help="colour of the path (default time)")
-    made.add_argument("--columns", type=int, default=3, help="panels in a row (default 3)")
+    made = program(Path(__file__).with_name("words.yaml"), "topdown", colour_by=COLOUR_BY)
     arguments = made.parse_args(argv)
     if arguments.columns < 1:
         raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")

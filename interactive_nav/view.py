@@ -5,7 +5,6 @@ A window where the machine has a screen, else a page in the browser (mjviser, an
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib
 import importlib.util
@@ -24,8 +23,8 @@ from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.errors import UserError, reports_errors
+from interactive_nav_common.words import program
 
-VIEWERS = ("auto", "window", "browser")
 GAP_M = 0.03
 """Least gap between what is placed at random."""
 
@@ -59,7 +58,7 @@ def choose_viewer(
     """'window' or 'browser'.
 
     Args:
-        wanted: one of `VIEWERS`; auto takes a window where there is a screen.
+        wanted: auto, window or browser; auto takes a window where there is a screen.
         window: tells whether a window can open.
         browser: tells whether the browser's viewer is installed.
 
@@ -164,22 +163,12 @@ def open_browser(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> None:
     viewer.run()
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m interactive_nav.view", description="Looks at a scene.")
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene folder")
-    parser.add_argument("--robot", metavar="NAME", help=f"robot to put in: {', '.join(robot_names())} (default: none)")
-    parser.add_argument("--objects", type=int, default=10, metavar="N", help="small objects (default 10)")
-    parser.add_argument("--small-objects", choices=SPLITS, default="train", help="whose models (default train)")
-    parser.add_argument("--seed", type=int, default=0, help="of the places (default 0)")
-    parser.add_argument("--viewer", choices=VIEWERS, default="auto", help="default: a window where there is a screen")
-    parser.add_argument("--port", type=int, default=8080, help="of the browser's viewer (default 8080)")
-    return parser
-
-
 @reports_errors("interactive_nav.view")
 def main(argv: Sequence[str] | None = None) -> int:
     """Opens a viewer; 0 when it was closed, 2 with one line on stderr when none can open."""
-    arguments = _parser().parse_args(argv)
+    table = Path(__file__).with_name("words.yaml")
+    made = program(table, "view", robots=", ".join(robot_names()), splits=SPLITS)
+    arguments = made.parse_args(argv)
     robot = get_robot(arguments.robot) if arguments.robot else None
     small = pick(arguments.objects, arguments.small_objects)
     model = build_model(arguments.scene, robot, small, arguments.seed)

@@ -81,3 +81,19 @@ def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, A
         about |= {"type": KINDS[about["type"]]} if "type" in about else {}
         about |= {"action": ACTIONS.get(about["action"], about["action"])} if "action" in about else {}
         to.add_argument(*names.split(", "), **about)
+
+
+def program(table: Path, name: str, epilog: str | None = None, **known: Any) -> argparse.ArgumentParser:
+    """The parser of `python -m PACKAGE.name`, where PACKAGE is the table's folder.
+
+    Args:
+        table: file of `read_commands`; its row `name` is taken.
+        name: of the program.
+        epilog: printed as it is.
+        **known: as of `add_words`.
+    """
+    row, how = read_commands(table)[name], argparse.RawDescriptionHelpFormatter
+    prog = f"python -m {table.parent.name}.{name}"
+    made = argparse.ArgumentParser(prog=prog, description=row.help, epilog=epilog, formatter_class=how)
+    add_words(made, row.words, **known)
+    return made

@@ -18,7 +18,7 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import program
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
@@ -60,18 +60,11 @@ def _config_of_yardsticks(policies: Sequence[str], arguments: argparse.Namespace
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(prog="python -m train.evaluate", description="Plays fixed episodes.")
-    add_words(
-        made,
-        read_commands(Path(__file__).with_name("words.yaml"))["evaluate"].words,
-        episodes=EPISODES,
-        policies=",".join(POLICIES),
-        planners=",".join(PLANNERS),
-        seed=SEED,
+    return program(
+        Path(__file__).with_name("words.yaml"), "evaluate", episodes=EPISODES, policies=",".join(POLICIES),
+        planners=",".join(PLANNERS), seed=SEED, rows=ROWS,
         batches=", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items()),
-        rows=ROWS,
-    )
-    return made
+    )  # fmt: skip
 
 
 def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from rich.console import Console
 from interactive_nav.pictures.replay import replay_path
 from interactive_nav.record import add_picture_words, check_picture_words, record
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.words import program
 from train import replay
 from train.config import EnvConfig
 from train.runs.run import make_env
@@ -24,11 +24,8 @@ from train.runs.run import make_env
 @reports_errors("train.record")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
     """Plays and draws; 0 when done, 2 on a user's error, 130 when interrupted."""
-    made = argparse.ArgumentParser(prog="python -m train.record", description="Makes a video of an episode of a run.")
-    made.add_argument("run", metavar="RUN_DIR", help="folder that `python -m train` wrote")
+    made = program(Path(__file__).with_name("words.yaml"), "record")
     add_picture_words(made)
-    made.add_argument("--checkpoint", default="best", metavar="best|last|STEPS", help="default: best")
-    made.add_argument("overrides", nargs="*", metavar="env.key=value", help="environment settings to change")
     arguments = made.parse_intermixed_args(argv)
     played = ["--episodes", str(arguments.episode), "--policies", arguments.policy]
     try:

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from interactive_nav.pictures import replay
 from interactive_nav_common.errors import ConfigError, reports_errors
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import program
 from train.config import EnvConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
@@ -28,14 +28,7 @@ from train.scoring.rollout import episode_keys
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(prog="python -m train.replay", description="Records episodes step by step.")
-    add_words(
-        made,
-        read_commands(Path(__file__).with_name("words.yaml"))["replay"].words,
-        policies=",".join(POLICIES),
-        seed=SEED,
-    )
-    return made
+    return program(Path(__file__).with_name("words.yaml"), "replay", policies=",".join(POLICIES), seed=SEED)
 
 
 @reports_errors("train.replay")

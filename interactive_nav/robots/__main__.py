@@ -5,14 +5,15 @@ Exit status: 0; 2 for a question that cannot be answered, with one line that say
 
 from __future__ import annotations
 
-import argparse
 import sys
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.words import program
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -50,9 +51,7 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 @reports_errors("interactive_nav.robots")
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    parser = argparse.ArgumentParser(prog="python -m interactive_nav.robots", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
-    parser.add_argument("--robots", default="all", help="names, comma between them; default all")
-    args = parser.parse_args(argv)
+    args = program(Path(__file__).parents[1] / "words.yaml", "robots").parse_args(argv)
     console = Console(width=None if sys.stdout.isatty() else 220)
     _print_table(_names(args.robots), console)
     return 0

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import add_words, program, read_commands
 
 TABLE = """
 draw:
@@ -40,3 +40,10 @@ def test_values_that_a_row_does_not_allow_are_refused(words, tmp_path):
     add_words(parser, read_commands(tmp_path / "words.yaml")["draw"].words, cores=3, shares=(0.5, 2.0))
     with pytest.raises(SystemExit, match="2"):
         parser.parse_args(["a", *words])
+
+
+def test_a_row_becomes_a_programs_parser(tmp_path):
+    (tmp_path / "words.yaml").write_text(TABLE)
+    made = program(tmp_path / "words.yaml", "draw", "told\n  as it is", cores=3, shares=(0.5, 2.0))
+    assert made.prog == f"python -m {tmp_path.name}.draw" and made.description == "draw it"
+    assert made.format_help().endswith("told\n  as it is\n") and made.parse_args(["a"]).count == 3

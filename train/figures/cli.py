@@ -16,7 +16,7 @@ from interactive_nav_common.errors import FileError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import program
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
 from train.figures.paths import side_by_side, spread_episodes, trajectories
@@ -164,9 +164,7 @@ def _name(path: Path) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(prog="python -m train.figures", description="Draws what runs have written.")
-    add_words(made, read_commands(Path(__file__).parents[1] / "words.yaml")["figures"].words)
-    return made
+    return program(Path(__file__).parents[1] / "words.yaml", "figures")
 
 
 @reports_errors("train.figures")

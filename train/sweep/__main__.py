@@ -12,7 +12,7 @@ from rich.console import Console
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.signals import stop_signals
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import program
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
@@ -26,18 +26,12 @@ from train.sweep.table import SweepDisplay, status_table, totals
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
-        prog="python -m train.sweep",
-        description="Trains and evaluates every run of a sweep. The same command continues what was stopped or killed, "
-        "and leaves out what is done.",
-        epilog=f"keys of the file (default):\n{spec.help_text()}\n\n"
-        "exit codes: 0 all done (or in another sweep's hands), 1 runs were given up or are not done, 2 the "
-        "file is wrong, 3 stopped by the time limit, 128 + signal",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    told = (
+        f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done (or in another sweep's hands), "
+        "1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal"
     )
-    words = read_commands(Path(__file__).parents[1] / "words.yaml")["sweep"].words
-    add_words(made, words, known=", ".join(spec.known_sweeps()), step=STEP, stages=STAGES)
-    return made
+    table, known = Path(__file__).parents[1] / "words.yaml", ", ".join(spec.known_sweeps())
+    return program(table, "sweep", told, known=known, step=STEP, stages=STAGES)
 
 
 def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
