@@ -93,14 +93,14 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
 
 def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console: Console) -> int:
     from converters.many import convert_many
-    from converters.sets import make_runner
+    from converters.sets import make_launcher
 
-    runner, side_by_side = make_runner(
+    launcher, side_by_side = make_launcher(
         arguments.launcher, arguments.ray_address, min(arguments.jobs, len(arguments.places)), len(arguments.places)
     )
     with stage_progress(console) as report:
         failed = convert_many(
-            [Path(place) for place in arguments.places], arguments.into, config, runner, side_by_side, report,
+            [Path(place) for place in arguments.places], arguments.into, config, launcher, side_by_side, report,
             lambda line: console.print(line, soft_wrap=True, highlight=False, markup=False),
         )  # fmt: skip
     if failed:

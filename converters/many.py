@@ -26,9 +26,10 @@ from converters.clock import STAGES, peak_memory_mib
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
 from converters.records.errors import StageFailed
-from converters.sets import Runner, run_side_by_side
+from converters.sets import run_side_by_side
 from interactive_nav_common.errors import ConfigError, FileError, UserError
 from interactive_nav_common.files import check_name, write_text
+from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.rows import write_parquet
 from scenes_mjcf.schema import SceneError, load_manifest
 
@@ -70,7 +71,7 @@ def digest_of(source: Path, config: ConvertConfig, scenes: Sequence[Path] = ()) 
 
 
 def convert_many(
-    sources: Sequence[Path], into: Path, config: ConvertConfig, runner: Runner, side_by_side: int,
+    sources: Sequence[Path], into: Path, config: ConvertConfig, launcher: Launcher, side_by_side: int,
     report: Callable[[str, float], None], tell: Callable[[str], None],
 ) -> list[str]:  # fmt: skip
     """Converts what has not been converted with these options; the row of each is written as it ends.
@@ -79,7 +80,7 @@ def convert_many(
         sources: raw folders; the scene of each is named after it.
         into: folder of scene folders.
         config: choices; `jobs` are decompositions side by side in all.
-        runner: where.
+        launcher: where.
         side_by_side: sources at a time.
         report: progress over all of them.
         tell: told one line a source.
@@ -126,7 +127,7 @@ def convert_many(
             write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
             return _told(rows[name])
 
-        return bad + run_side_by_side(commands, runner, side_by_side, report, tell, ended, "sources")
+        return bad + run_side_by_side(commands, launcher, into, report, tell, ended, "sources")
 
 
 def _told(row: Mapping[str, Any]) -> str:

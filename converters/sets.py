@@ -7,22 +7,18 @@ so that any machine that sees the folder can make it.
 from __future__ import annotations
 
 import dataclasses
-import logging
-import os
-import subprocess
 import sys
-import threading
+import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any, Protocol
 
 import yaml
 
 from converters.generate.design.config import GenerationError
 from converters.recipes import Recipes, Report, chosen, load_recipes, make_scenes, parse_recipes
-from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
+from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher
 from scenes_mjcf.schema import load_manifest
 from scenes_mjcf.sets import FILE, Member, SceneSet, read_set, scene_digest, write_set
 
@@ -32,6 +28,8 @@ SEEDS = 100_000
 TEST_SHARE = 0.2
 CONVERSION = {"structure_faces": 16000, "object_faces": 3000, "structure_texture": 1024, "object_texture": 256}
 """How large meshes and textures are."""
+GRACE_S = 10.0
+"""What was begun and is not wanted any more has this long to end itself."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,18 +46,6 @@ class Wanted:
     jobs: int
     launcher: str
     ray_address: str | None
-
-
-class Runner(Protocol):
-    """Where commands run."""
-
-    def run(self, command: list[str]) -> tuple[int, str]:
-        """Runs a command and waits for it: its exit code and what it printed."""
-        ...
-
-    def close(self) -> None:
-        """Ends what still runs."""
-        ...
 
 
 def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
@@ -120,81 +106,17 @@ def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda l
     return scenes
 
 
-class LocalRunner:
-    """Commands as processes of this machine."""
-
-    def __init__(self) -> None:
-        self._running: set[subprocess.Popen[str]] = set()
-        self._closed = threading.Event()
-
-    def run(self, command: list[str]) -> tuple[int, str]:
-        """Runs a command and waits for it: its exit code and what it printed."""
-        if self._closed.is_set():
-            return -1, "stopped"
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        self._running.add(process)
-        printed, _ = process.communicate()
-        self._running.discard(process)
-        return process.returncode, printed
-
-    def close(self) -> None:
-        """Ends what still runs."""
-        self._closed.set()
-        for process in list(self._running):
-            process.terminate()
-
-
-class RayRunner:
-    """Commands on a Ray cluster's machines, all of which see this folder.
-
-    Args:
-        address: of the cluster, as `ray.init` takes it.
-        cpus: cores of each command.
+def make_launcher(launcher: str, address: str | None, jobs: int, count: int) -> tuple[Launcher, int]:
+    """Where `count` commands run, and how many of them side by side.
 
     Raises:
         ConfigError: Ray is not installed, or there is no such cluster.
     """
+    if launcher == "ray":
+        from interactive_nav_common.jobs.on_ray import RayLauncher
 
-    def __init__(self, address: str, cpus: int):
-        try:
-            import ray
-        except ImportError:
-            raise ConfigError("--launcher ray: Ray is not installed; pip install 'interactive-nav[ray]'") from None
-        self._ray, self._mine, self._started = ray, not ray.is_initialized(), []
-        if self._mine:
-            try:
-                ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
-            except (ConnectionError, ValueError, RuntimeError) as error:
-                first = next(iter(str(error).splitlines()), "")
-                raise ConfigError(
-                    f"--launcher ray: no cluster at {address!r} ({first}); start one with `ray start --head`"
-                ) from None
-        self._there: Any = ray.remote(num_cpus=cpus, max_retries=0)(_command)
-
-    def run(self, command: list[str]) -> tuple[int, str]:
-        """Runs a command and waits for it: its exit code and what it printed."""
-        self._started.append(self._there.remote(command, os.getcwd()))
-        try:
-            return self._ray.get(self._started[-1])
-        except self._ray.exceptions.RayError as error:
-            return -1, f"lost: {next(iter(str(error).splitlines()), '')}"
-
-    def close(self) -> None:
-        """Ends what still runs, and leaves the cluster."""
-        for reference in self._started:
-            self._ray.cancel(reference, force=True)
-        if self._mine:
-            self._ray.shutdown()
-
-
-def _command(command: list[str], cwd: str) -> tuple[int, str]:
-    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    return done.returncode, done.stdout
-
-
-def make_runner(launcher: str, address: str | None, jobs: int, count: int) -> tuple[Runner, int]:
-    """Where `count` commands run, and how many of them side by side."""
-    return (RayRunner(address or "auto", 1), max(count, 1)) if launcher == "ray" else (LocalRunner(), jobs)
+        return RayLauncher(address or "auto"), max(count, 1)
+    return LocalLauncher(jobs), jobs
 
 
 def _last_line(name: str, code: int, printed: str) -> str:
@@ -203,15 +125,15 @@ def _last_line(name: str, code: int, printed: str) -> str:
 
 
 def run_side_by_side(
-    commands: Mapping[str, list[str]], runner: Runner, side_by_side: int, report: Report, tell: Callable[[str], None],
+    commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, tell: Callable[[str], None],
     ended: Callable[[str, int, str], str] = _last_line, what: str = "scenes",
 ) -> list[str]:  # fmt: skip
     """Runs commands, several at a time; what was begun when a signal or an error comes is ended.
 
     Args:
         commands: by name of what each makes.
-        runner: where.
-        side_by_side: commands at a time.
+        launcher: where; it is closed.
+        folder: seen from there, for what they print.
         report: progress over all of them.
         tell: told one line each.
         ended: name, exit code and what was printed -> that line.
@@ -221,21 +143,23 @@ def run_side_by_side(
         Names of those that did not exit with 0.
     """
     failed: list[str] = []
-    count = len(commands)
+    folder.mkdir(parents=True, exist_ok=True)
+    todo, running, count = list(commands), 0, len(commands)
     report(f"0/{count} {what}", 0.0)
-    with ThreadPoolExecutor(side_by_side) as pool:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".jobs-") as logs:
         try:
-            waiting: dict[Future[tuple[int, str]], str] = {pool.submit(runner.run, c): n for n, c in commands.items()}
-            while waiting:
-                done, _ = wait(waiting, timeout=0.5, return_when=FIRST_COMPLETED)
-                for future in done:
-                    name, (code, printed) = waiting.pop(future), future.result()
-                    tell(ended(name, code, printed))
-                    failed += [name] if code else []
-                    report(f"{count - len(waiting)}/{count} {what}", 1 - len(waiting) / count)
+            while todo or running:
+                while todo and launcher.start(Job(todo[0], tuple(commands[todo[0]]), Path(logs, todo[0]).absolute())):
+                    todo, running = todo[1:], running + 1
+                for job, code in launcher.ended():
+                    running -= 1
+                    printed = job.log.read_text(errors="replace").partition("\n")[2] if code != LOST else "lost"
+                    tell(ended(job.name, -1 if code == LOST else code, printed))
+                    failed += [job.name] if code else []
+                    report(f"{count - len(todo) - running}/{count} {what}", 1 - (len(todo) + running) / count)
+                time.sleep(0.05)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            runner.close()
+            launcher.end(GRACE_S)
     return failed
 
 
@@ -259,10 +183,10 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
     recipes = load_recipes(path)
     todo = chosen(recipes, wanted.out, tuple(wanted.only), wanted.overwrite, tell)
     if len(todo) > 1 and (wanted.jobs > 1 or wanted.launcher == "ray"):
-        runner, side_by_side = make_runner(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
+        launcher, _ = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
         words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
         words += ["--jobs", "1", *(["--overwrite"] if wanted.overwrite else []), "--only"]
-        failed = run_side_by_side({r.name: [*words, r.name] for r in todo}, runner, side_by_side, report, tell)
+        failed = run_side_by_side({r.name: [*words, r.name] for r in todo}, launcher, wanted.out, report, tell)
     else:
         gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, tell)
         failed = [name for name, failing in gates.items() if failing]

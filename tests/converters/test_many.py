@@ -16,29 +16,30 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from converters import many, sets
+from converters import many
 from converters.__main__ import main
 from converters.clock import STAGES, peak_memory_mib
 from converters.many import ROWS, convert_many, digest_of
 from converters.pipeline import ConvertConfig
+from interactive_nav_common.jobs.processes import LocalLauncher
 from scenes_mjcf.schema import load_manifest
 from tests.converters.read.test_single_mesh import tall_room
 
 QUICK = ConvertConfig(jobs=2, structure_texture=64, object_texture=32)
 
 
-class Killing(sets.LocalRunner):
+class Killing(LocalLauncher):
     """Runs commands; that of `killed` ends as the kernel would end it that is out of memory."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(2)
         self.tasks = []
 
-    def run(self, command):
-        self.tasks.append(json.loads(command[-1]))
-        if Path(self.tasks[-1]["target"]).name == "killed":
-            command = [sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"]
-        return super().run(command)
+    def start(self, job):
+        own, kills = job.command, (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)")
+        begun = super().start(dataclasses.replace(job, command=kills) if job.name == "killed" else job)
+        self.tasks += [json.loads(own[-1])] if begun else []
+        return begun
 
 
 def rows_of(into: Path) -> dict[str, dict]:

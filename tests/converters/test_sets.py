@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -14,25 +15,31 @@ from converters import sets
 from converters.__main__ import main
 from converters.generate.design.config import GenerationError
 from converters.recipes import load_recipes
+from interactive_nav_common.jobs.processes import Job, LocalLauncher
 from scenes_mjcf.schema import load_manifest, save_manifest
 from scenes_mjcf.sets import read_set, scene_digest, scene_folders
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 
 
-class Copier:
-    """A runner whose command copies a scene; `shed` fails a gate, `barn` cannot be made."""
+class Copier(LocalLauncher):
+    """Whose command copies a scene; 002 cannot be made."""
 
     def __init__(self, out: Path):
+        super().__init__(2)
         self.out, self.commands, self.closed = out, [], 0
 
-    def run(self, command: list[str]) -> tuple[int, str]:
-        name = command[-1]
-        self.commands.append(command)
-        if name.endswith("002"):
-            return 2, f"converters generate-scenes: {name}: no room\n"
-        shutil.copytree(SCENES / "apartment_0", self.out / name)
-        return 0, f"{name}: train, seed 1, every gate passes\n"
+    def start(self, job: Job) -> str | None:
+        code, said = 2, f"converters generate-scenes: {job.name}: no room"
+        if not job.name.endswith("002"):
+            code, said = 0, f"{job.name}: train, seed 1, every gate passes"
+        act = f"print({said!r}); raise SystemExit({code})"
+        begun = super().start(dataclasses.replace(job, command=(sys.executable, "-c", act)))
+        if begun is not None:
+            self.commands.append(list(job.command))
+            if code == 0:
+                shutil.copytree(SCENES / "apartment_0", self.out / job.name)
+        return begun
 
     def close(self) -> None:
         self.closed += 1
@@ -74,7 +81,7 @@ def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, m
     out, lines, shares = tmp_path / "homes", [], []
     sets.begin_set(out, "furnished", 5)
     runner = Copier(out)
-    monkeypatch.setattr(sets, "LocalRunner", lambda: runner)
+    monkeypatch.setattr(sets, "LocalLauncher", lambda jobs: runner)
     wanted = sets.Wanted(out, None, None, 10, 0, (), False, 2, "local", "auto")
     assert sets.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append) == ["furnished_002"]
     assert runner.closed == 1 and len(runner.commands) == 5 and shares[-1] == 1.0
@@ -112,8 +119,18 @@ def test_a_scene_that_differs_from_the_list_is_told(tmp_path: Path) -> None:
     assert lines == [f"two: not the scene that {tmp_path / 'set.json'} lists"]
 
 
-def test_processes_that_still_run_are_ended() -> None:
-    runner = sets.LocalRunner()
-    assert runner.run([sys.executable, "-c", "print('made'); raise SystemExit(3)"]) == (3, "made\n")
-    runner.close()
-    assert runner.run([sys.executable, "-c", "print('late')"]) == (-1, "stopped")
+def test_processes_that_still_run_are_ended(tmp_path: Path) -> None:
+    act = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60 * (sys.argv[1] == 'slow')); sys.exit(3)"
+    told: list[tuple[str, int, str]] = []
+
+    def ended(name: str, code: int, printed: str) -> str:
+        told.append((name, code, printed))
+        raise KeyboardInterrupt
+
+    commands = {name: [sys.executable, "-c", act, name] for name in ("slow", "quick", "late")}
+    launcher = LocalLauncher(2)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        sets.run_side_by_side(commands, launcher, tmp_path, lambda *_: None, lambda _: None, ended)
+    assert [(name, code) for name, code, _ in told] == [("quick", 3)] and told[0][2].strip().isdecimal()
+    assert launcher.ended() == [] and time.monotonic() - began < 30 and list(tmp_path.iterdir()) == []

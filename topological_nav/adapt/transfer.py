@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
@@ -40,7 +39,7 @@ from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
 from topological_nav.learn.localise import in_words, localisation_scores, nearest_turn
 from topological_nav.learn.pairs import need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
-from topological_nav.learn.training import Trained, length_scores, load_trained, save_trained
+from topological_nav.learn.training import Trained, class_scores, length_scores, load_trained, save_trained
 from topological_nav.maps.build import Built, edge_scores
 from topological_nav.maps.graph import assemble, lengths, near_pairs
 from topological_nav.scenes.space import free_space
@@ -205,8 +204,6 @@ def _scores(trained: Trained, tested: PassageImages) -> dict[str, Any]:
     logits = trained.logits(tested.images)
     found, truth = logits[:, tested.scored] > 0, tested.free[:, tested.scored]
     return {
-        "accuracy": float((found == truth).mean()),
-        "macro_f1": float(f1_score(truth, found, average="macro")),
-        "confusion": confusion_matrix(truth, found, labels=[False, True]).tolist(),
+        **class_scores(truth, found, 2),
         "lengths": length_scores(logits, tested.free, trained.about["lengths_m"]),
     }

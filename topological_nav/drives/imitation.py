@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav_common.config import to_dict
 from interactive_nav_common.files import write_text
@@ -41,6 +40,7 @@ from topological_nav.drives.sequences import (
 from topological_nav.errors import Asked, RunError, go_on
 from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, initial, shuffled
 from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
+from topological_nav.learn.training import class_scores
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
 """alpha and lambda of the report's table."""
@@ -274,10 +274,8 @@ def _scores(
     ):
         found, truth = found[held_out.valid], truth[held_out.valid]
         out[name] = {
-            "accuracy": float((found == truth).mean()),
-            "macro_f1": float(f1_score(truth, found, average="macro")),
+            **class_scores(truth, found, count),
             "commonest": float(np.bincount(truth, minlength=count).max() / len(truth)),
-            "confusion": confusion_matrix(truth, found, labels=range(count)).tolist(),
         }
     followed = held_out.followed
     out["forward"] = float(predicted[followed].mean()) if followed.any() else 0.0

@@ -11,14 +11,14 @@ from rich.console import Console
 
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
-from train.sweep.devices import Machine, find_gpus
+from train.sweep.devices import Machine, MachineLauncher, find_gpus
 from train.sweep.folder import SweepFolder
-from train.sweep.jobs import Launcher, LocalLauncher
 from train.sweep.scheduler import STAGES, Programs, Scheduler
 from train.sweep.spec import Sweep
 from train.sweep.table import SweepDisplay, status_table, totals
@@ -41,10 +41,10 @@ def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
         ConfigError: Ray is wanted and missing, or its cluster cannot be reached.
     """
     if name == "ray":
-        from train.sweep.on_ray import RayLauncher
+        from interactive_nav_common.jobs.on_ray import RayLauncher
 
         return RayLauncher(address)
-    return LocalLauncher(Machine(find_gpus(), sweep.config.launch.slots))
+    return MachineLauncher(Machine(find_gpus(), sweep.config.launch.slots))
 
 
 @reports_errors("train.sweep")

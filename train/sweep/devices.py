@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import subprocess
+from collections.abc import Mapping
 
+from interactive_nav_common.jobs.processes import Begun, Child, Job, Launcher
 from train.sweep.spec import LaunchConfig
 
 USABLE = 0.95
@@ -114,3 +116,34 @@ def share_env(share: Share, launch: LaunchConfig) -> dict[str, str]:
         "CUDA_VISIBLE_DEVICES": share.gpu.name,
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{memory:.3f}",
     }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunJob(Job):
+    """One program to run for one or several runs."""
+
+    kind: str
+    """train or evaluate."""
+    runs: tuple[str, ...]
+    launch: LaunchConfig
+    factor: float = 1.0
+    """Times the usual share of a GPU."""
+
+    def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
+        """Variables that keep it within its part."""
+        return share_env(Share(Gpu(gpu, 0.0) if gpu else None, part), self.launch)
+
+
+class MachineLauncher(Launcher):
+    """Processes on this machine, each with its share of a GPU or of the cores."""
+
+    def __init__(self, machine: Machine):
+        super().__init__()
+        self._machine = machine
+
+    def _begin(self, job: Job) -> Begun | None:
+        assert isinstance(job, RunJob)
+        share = self._machine.take(job.launch, job.factor)
+        if share is None:
+            return None
+        return Child(job, share_env(share, job.launch)), share.label, lambda: self._machine.give_back(share)

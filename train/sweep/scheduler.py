@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from interactive_nav_common.config import replace
+from interactive_nav_common.jobs.processes import LOCKED, LOST, Launcher
+from train.sweep.devices import RunJob
 from train.sweep.folder import (
     RunState,
     SweepFolder,
@@ -19,7 +21,6 @@ from train.sweep.folder import (
     words_of_evaluation,
     words_of_training,
 )
-from train.sweep.jobs import LOCKED, LOST, Job, Launcher
 from train.sweep.spec import RunSpec
 from train.sweep.table import SweepDisplay
 
@@ -198,15 +199,20 @@ class Scheduler:
 
     def _begin(self, kind: str, names: list[str], command: list[str]) -> bool:
         log = self._folder.log(names[0])
-        job = Job(
+        launch, (first, *others) = self._runs[names[0]].launch, names
+        factor = max(self._factor.get((kind, name), 1.0) for name in names)
+        job = RunJob(
+            name=f"{kind} {first}" + (f" and {len(others)} more" if others else ""),
             kind=kind,
             runs=tuple(names),
             command=tuple(command),
             log=log,
             locks=tuple(self._folder.lock(name) for name in names),
             env=programs_env(),
-            launch=self._runs[names[0]].launch,
-            factor=max(self._factor.get((kind, name), 1.0) for name in names),
+            launch=launch,
+            factor=factor,
+            cpus=launch.cpus_per_run,
+            gpus=min(1.0, factor / launch.runs_per_gpu),
         )
         where = self._launcher.start(job)
         if where is None:
@@ -218,7 +224,7 @@ class Scheduler:
         self._display.event(f"{job.name}: started ({where}), log {log}")
         return True
 
-    def _over(self, job: Job, code: int) -> None:
+    def _over(self, job: RunJob, code: int) -> None:
         for name in job.runs:
             self._busy.pop(name, None)
         if code == LOCKED:
@@ -246,7 +252,7 @@ class Scheduler:
         else:
             self._failed(job, code)
 
-    def _failed(self, job: Job, code: int) -> None:
+    def _failed(self, job: RunJob, code: int) -> None:
         (name,) = job.runs
         key = (job.kind, name)
         tail = log_tail(job.log, 40)

@@ -12,10 +12,10 @@ import pytest
 from rich.console import Console
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.jobs.on_ray import RayLauncher
 from tests.train.sweep.test_sweep import FAKE, ROOT, running, set_fates, write_sweep
 from train.sweep import spec
 from train.sweep.folder import SweepFolder, last_line
-from train.sweep.on_ray import RayLauncher
 from train.sweep.scheduler import Scheduler
 from train.sweep.table import SweepDisplay
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
 from typing import Any
 
 from interactive_nav_common.errors import ConfigError
-from train.sweep.devices import Gpu, Share, share_env
-from train.sweep.jobs import LOST, Child, Job, Launcher
+from interactive_nav_common.jobs.processes import LOST, Begun, Child, Job, Launcher
 
 
 class Worker(Child):
@@ -17,9 +15,9 @@ class Worker(Child):
 
     def __init__(self, job: Job, cwd: str, fraction: float):
         os.chdir(cwd)
-        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-        share = Share(Gpu(visible, 0.0) if visible and fraction else None, fraction or 1.0)
-        super().__init__(job, share_env(share, job.launch))
+        super().__init__(
+            job, job.env_on((fraction and os.environ.get("CUDA_VISIBLE_DEVICES")) or None, fraction or 1.0)
+        )
 
 
 class Actor:
@@ -50,7 +48,7 @@ class Actor:
 
 
 class RayLauncher(Launcher):
-    """Actors on a Ray cluster, each with the CPU cores and the part of a GPU that its run asks for.
+    """Actors on a Ray cluster, each with the CPU cores and the part of a GPU that it asks for.
 
     Args:
         address: of the cluster, as `ray.init` takes it.
@@ -83,13 +81,13 @@ class RayLauncher(Launcher):
         self._given = 0.0
         """GPUs."""
 
-    def _begin(self, job: Job) -> tuple[Any, str, Callable[[], None]] | None:
+    def _begin(self, job: Job) -> Begun | None:
         total = self._ray.cluster_resources()
-        cpus = total.get("CPU", 0.0) - sum(other.launch.cpus_per_run for other, *_ in self._running)
-        fraction = min(1.0, job.factor / job.launch.runs_per_gpu) if total.get("GPU") else 0.0
-        if cpus < job.launch.cpus_per_run or total.get("GPU", 0.0) - self._given < fraction - 1e-9:
+        cpus = total.get("CPU", 0.0) - sum(other.cpus for other, *_ in self._running)
+        fraction = job.gpus if total.get("GPU") else 0.0
+        if cpus < job.cpus or total.get("GPU", 0.0) - self._given < fraction - 1e-9:
             return None
-        room = self._worker.options(num_cpus=job.launch.cpus_per_run, num_gpus=fraction)
+        room = self._worker.options(num_cpus=job.cpus, num_gpus=fraction)
         self._given += fraction
 
         def give_back() -> None:

@@ -1,5 +1,4 @@
-"""A command in, its exit code out; it ends with whoever started it, and when it is asked to. On this machine each
-process has its share of a GPU or of the cores."""
+"""A command in, its exit code out; it ends with whoever started it, and when it is asked to."""
 
 from __future__ import annotations
 
@@ -14,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.locks import take_lock
-from train.sweep.devices import Machine, share_env
-from train.sweep.spec import LaunchConfig
 
 # The child gets SIGTERM (it saves and ends) when its parent dies, however that happens: a run that nobody watches
 # would be in the way of the same command given again. Linux only; elsewhere the lock alone guards.
@@ -26,35 +23,34 @@ GUARD = (
     "os.execv(sys.argv[1], sys.argv[1:])"
 )
 LOCKED = -1000
-"""In place of an exit code: somebody else works on one of the runs."""
+"""In place of an exit code: somebody else holds one of the locks."""
 LOST = -1001
 """In place of an exit code: the node that it ran on, or its worker there, is gone."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One program to run for one or several runs."""
+    """One program to run."""
 
-    kind: str
-    """train or evaluate."""
-    runs: tuple[str, ...]
+    name: str
+    """For people."""
     command: tuple[str, ...]
     log: Path
-    locks: tuple[Path, ...]
-    env: Mapping[str, str]
-    launch: LaunchConfig
-    factor: float = 1.0
-    """Times the usual share of a GPU."""
+    """What it prints is added there."""
+    locks: tuple[Path, ...] = ()
+    env: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    cpus: float = 1.0
+    """Cores, of a cluster's."""
+    gpus: float = 0.0
+    """GPUs, of a cluster's that has any."""
 
-    @property
-    def name(self) -> str:
-        """For people."""
-        first, *others = self.runs
-        return f"{self.kind} {first}" + (f" and {len(others)} more" if others else "")
+    def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
+        """More environment on a node of a cluster, with this part of its GPU of this name."""
+        return {}
 
 
 class Child:
-    """A job's process; holds the locks of its runs as long as it lives."""
+    """A job's process; holds its locks as long as it lives."""
 
     def __init__(self, job: Job, env: Mapping[str, str]):
         self._process: subprocess.Popen[bytes] | None = None
@@ -107,6 +103,10 @@ class Child:
                 self._process.send_signal(number)
 
 
+Begun = tuple[Any, str, Callable[[], None]]
+"""A job's process, where it runs in a few words, and what to do when it has ended."""
+
+
 class Launcher:
     """Where jobs run."""
 
@@ -114,8 +114,8 @@ class Launcher:
         self._running: list[tuple[Job, Any, Callable[[], None]]] = []
         """Job, its process (a `Child`, or what has its `poll`, `stop` and `kill`), and what to do when it has ended."""
 
-    def _begin(self, job: Job) -> tuple[Any, str, Callable[[], None]] | None:
-        """A job's process, where it runs in a few words, and what to do when it has ended; None: no room now."""
+    def _begin(self, job: Job) -> Begun | None:
+        """Starts a job; None: no room now."""
         raise NotImplementedError
 
     def start(self, job: Job) -> str | None:
@@ -127,7 +127,7 @@ class Launcher:
         self._running.append((job, process, give_back))
         return where
 
-    def ended(self) -> list[tuple[Job, int]]:
+    def ended(self) -> list[tuple[Any, int]]:
         """The jobs that have ended since it was last asked, with their exit codes (`LOCKED`: not begun)."""
         over, still = [], []
         for running in self._running:
@@ -151,19 +151,26 @@ class Launcher:
         for _, process, _ in self._running:
             process.kill()
 
+    def end(self, grace_s: float) -> None:
+        """Stops what still runs, kills it after `grace_s`, and closes."""
+        self.stop()
+        deadline = time.monotonic() + grace_s
+        while self._running and time.monotonic() < deadline:
+            self.ended()
+            time.sleep(0.05)
+        self.kill()
+        self.close()
+
     def close(self) -> None:
         """After the last job."""
 
 
 class LocalLauncher(Launcher):
-    """Processes on this machine."""
+    """Processes on this machine, so many side by side."""
 
-    def __init__(self, machine: Machine):
+    def __init__(self, side_by_side: int):
         super().__init__()
-        self._machine = machine
+        self._side_by_side = side_by_side
 
-    def _begin(self, job: Job) -> tuple[Any, str, Callable[[], None]] | None:
-        share = self._machine.take(job.launch, job.factor)
-        if share is None:
-            return None
-        return Child(job, share_env(share, job.launch)), share.label, lambda: self._machine.give_back(share)
+    def _begin(self, job: Job) -> Begun | None:
+        return (Child(job, {}), "here", lambda: None) if len(self._running) < self._side_by_side else None
