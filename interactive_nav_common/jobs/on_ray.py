@@ -15,9 +15,8 @@ class Worker(Child):
 
     def __init__(self, job: Job, cwd: str, fraction: float):
         os.chdir(cwd)
-        super().__init__(
-            job, job.env_on((fraction and os.environ.get("CUDA_VISIBLE_DEVICES")) or None, fraction or 1.0)
-        )
+        gpu = os.environ.get("CUDA_VISIBLE_DEVICES") if fraction else None
+        super().__init__(job, job.env_on(gpu or None, fraction or 1.0))
 
 
 class Actor:

@@ -18,8 +18,9 @@ import pytest
 import yaml
 from rich.console import Console
 
+from interactive_nav_common.jobs import processes as jobs
 from interactive_nav_common.locks import is_locked, take_lock
-from train.sweep import jobs, spec
+from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.devices import Gpu, Machine, MachineLauncher, find_gpus, parse_gpus, share_env
 from train.sweep.folder import RunState, SweepFolder, last_line
