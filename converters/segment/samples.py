@@ -115,42 +115,42 @@ def _recoloured(colours: np.ndarray | None, rng: np.random.Generator) -> np.ndar
     return 255 * np.clip(c + rng.normal(0, rng.uniform(0, 0.06), c.shape) + rng.normal(0, 0.04), 0, 1)
 
 
+def _rows(surface: Surface, rows: np.ndarray) -> Surface:
+    columns = (surface.points, surface.normals, surface.colours, surface.face)
+    return Surface(*(None if column is None else column[rows] for column in columns))  # type: ignore[arg-type]
+
+
 def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m: float) -> tuple[Surface, np.ndarray]:
     """A square column of a building turned, mirrored and scanned badly around its middle, which is at x = y = 0."""
     floor = np.flatnonzero((classes == NAMES.index("floor")) & (surface.normals[:, 2] > 0.9))
     middle = surface.points[rng.choice(floor)] if len(floor) else surface.points.mean(axis=0)
     angle, mirror = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]) @ np.diag(
-        [mirror, 1, 1]
-    )
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[mirror * c, -s, 0], [mirror * s, c, 0], [0, 0, 1]])
     points = (surface.points - [*middle[:2], 0]) @ turn.T * rng.uniform(0.9, 1.1)
     keep = (np.abs(points[:, :2]) < side_m / 2).all(axis=1) & (rng.random(len(points)) < rng.uniform(0.4, 1.0))
     if rng.random() < 0.5:
         keep &= classes != NAMES.index("ceiling")
     if rng.random() < 0.5:
         keep &= points[:, 2] < rng.uniform(1.1, 2.6)
-    keep = np.flatnonzero(keep)
-    points, normals = points[keep], surface.normals[keep] @ turn.T
-    taken = np.zeros(len(keep), bool)
-    for spot in points[rng.integers(len(points), size=rng.integers(0, 12))] if len(points) else ():
-        taken |= ((points - spot) ** 2).sum(axis=1) < rng.uniform(0.05, 0.4) ** 2
-    if len(points) and rng.random() < 0.5:
-        taken |= smooth_noise(points, rng.uniform(0.15, 0.5), rng) > rng.uniform(1.2, 2.5)
-    if len(points):
-        wave = smooth_noise(points, rng.uniform(0.08, 0.3), rng) * rng.uniform(0, 0.015)
-        moved = points + normals * (wave + rng.normal(0, rng.uniform(0, 0.008), len(points)))[:, None]
-        normals = normals + rng.normal(0, rng.uniform(0, 0.3), normals.shape)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        points = moved + [0, 0, rng.normal(0, 0.02)]
-    colours = _recoloured(None if surface.colours is None else surface.colours[keep], rng)
-    out = Surface(points, normals, colours, surface.face[keep])
-    left = ~taken
-    if len(points) and rng.random() < 0.7:
+    out = _rows(dataclasses.replace(surface, points=points, normals=surface.normals @ turn.T), keep)
+    points, normals, classes = out.points, out.normals, classes[keep]
+    if not len(points):
+        return out, classes
+    left = np.ones(len(points), bool)
+    for spot in points[rng.integers(len(points), size=rng.integers(0, 12))]:
+        left &= ((points - spot) ** 2).sum(axis=1) >= rng.uniform(0.05, 0.4) ** 2
+    if rng.random() < 0.5:
+        left &= smooth_noise(points, rng.uniform(0.15, 0.5), rng) <= rng.uniform(1.2, 2.5)
+    wave = smooth_noise(points, rng.uniform(0.08, 0.3), rng) * rng.uniform(0, 0.015)
+    moved = points + normals * (wave + rng.normal(0, rng.uniform(0, 0.008), len(points)))[:, None]
+    normals = normals + rng.normal(0, rng.uniform(0, 0.3), normals.shape)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    points = moved + [0, 0, rng.normal(0, 0.02)]
+    out = Surface(points, normals, _recoloured(out.colours, rng), out.face)
+    if rng.random() < 0.7:
         left &= _seen(out, rng, side_m)
-    return (
-        Surface(points[left], normals[left], None if colours is None else colours[left], out.face[left]),
-        classes[keep][left],
-    )
+    return _rows(out, left), classes[left]
 
 
 def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side: int) -> Crop:
@@ -164,23 +164,27 @@ def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, s
     """
     column, of = worn(surface, classes, rng, side * VOXEL_M)
     voxels = voxelise(column, 0.0)
-    votes = np.zeros((len(NAMES), len(voxels.index)), np.int32)
-    for k in range(len(NAMES)):
-        votes[k] = np.bincount(voxels.of_point[(of == k) & (voxels.of_point >= 0)], minlength=len(voxels.index))
-    inside = (voxels.index < side).all(axis=1) if len(voxels.index) else np.zeros(0, bool)
-    return Crop(
-        voxels.index[inside].astype(np.uint8), voxels.features[inside], votes.argmax(axis=0)[inside].astype(np.uint8)
-    )
+    votes, known = np.zeros((len(voxels.index), len(NAMES)), np.int32), (voxels.of_point >= 0) & (of < len(NAMES))
+    np.add.at(votes, (voxels.of_point[known], of[known]), 1)
+    inside = (voxels.index < side).all(axis=1)
+    index, classes = voxels.index.astype(np.uint8), votes.argmax(axis=1).astype(np.uint8)
+    return Crop(index[inside], voxels.features[inside], classes[inside])
 
 
-def write_crops(path: Path, seed: int, split: str, count: int, side: int) -> Path:
-    """Writes crops of one building; one that cannot be built gives its place to the next of 1,000,000 seeds on."""
+def generate_crops(task: tuple[Path, int, str, int, int]) -> Path:
+    """Writes crops of one building (path, seed, split, count, side), unless they are there.
+
+    One that cannot be built gives its place to the next of 1,000,000 seeds on.
+    """
+    path, seed, split, count, side = task
+    if path.exists():
+        return path
     rng = np.random.default_rng((seed, 7))
     tier = str(rng.choice(TIERS, p=(0.5, 0.25, 0.25)))
     try:
         surface, classes = building_surface(seed, tier, split)
     except GenerationError:
-        return write_crops(path, seed + 1_000_000, split, count, side)
+        return generate_crops((path, seed + 1_000_000, split, count, side))
     crops = [make_crop(surface, classes, rng, side) for _ in range(count)]
     crops = [c for c in crops if len(c.index) > 500] or crops
     columns = {f.name: np.concatenate([getattr(c, f.name) for c in crops]) for f in dataclasses.fields(Crop)}
@@ -188,13 +192,8 @@ def write_crops(path: Path, seed: int, split: str, count: int, side: int) -> Pat
     return path
 
 
-def generate_crops(task: tuple[Path, int, str, int, int]) -> Path:
-    """`write_crops` of these words, unless they are there."""
-    return task[0] if task[0].exists() else write_crops(*task)
-
-
 def read_crops(path: Path) -> list[Crop]:
-    """What `write_crops` wrote."""
+    """What `generate_crops` wrote."""
     with np.load(path) as file:
         ends = np.cumsum(file["lengths"])[:-1]
         return [

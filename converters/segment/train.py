@@ -6,6 +6,7 @@ OUT/crops/SEED.npz   labelled voxels of a generated building, held_out/SEED.npz 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -85,14 +86,11 @@ def batch_of(crops: Sequence[Crop], config: SegmentConfig, rng: np.random.Genera
     index, classes = np.full((n, k, 3), -1, np.int32), np.full((n, k), UNKNOWN, np.uint8)
     features = np.zeros((n, k, FEATURES), np.int8)
     for row, crop in enumerate(crops):
+        pick = np.arange(len(crop.index))
         if rng is not None:
-            crop = turned(crop, config.side, int(rng.integers(4)), bool(rng.integers(2)))
-            pick = rng.permutation(len(crop.index))[:k]
-        else:
-            pick = np.arange(min(k, len(crop.index)))
-        count = len(pick)
-        index[row, :count], features[row, :count] = crop.index[pick], crop.features[pick]
-        classes[row, :count] = crop.classes[pick]
+            crop, pick = turned(crop, config.side, int(rng.integers(4)), bool(rng.integers(2))), rng.permutation(pick)
+        for column, given in ((index, crop.index), (features, crop.features), (classes, crop.classes)):
+            column[row, : len(pick[:k])] = given[pick[:k]]
     return index, features, classes
 
 
@@ -148,102 +146,85 @@ def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None]
     Returns:
         IoU by class on what was held out, and `mean`.
     """
-    tasks = [
-        (out / folder / f"{seed}.npz", seed, split, config.crops if split == "train" else 8, config.side)
-        for folder, split, start, count in (
-            ("held_out", "test", HELD_OUT_SEED, config.held_out),
-            ("crops", "train", config.seed, config.buildings),
-        )
-        for seed in range(start, start + count)
-    ]
-    for folder in ("held_out", "crops"):
+    tasks = []
+    for folder, split, seed, count, crops in (
+        ("held_out", "test", HELD_OUT_SEED, config.held_out, 8),
+        ("crops", "train", config.seed, config.buildings, config.crops),
+    ):
         (out / folder).mkdir(parents=True, exist_ok=True)
+        tasks += [(out / folder / f"{k}.npz", k, split, crops, config.side) for k in range(seed, seed + count)]
     with multiprocessing.get_context("spawn").Pool(
         config.workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)
     ) as pool:
-        made = pool.imap_unordered(generate_crops, tasks)
-        learner, held_out = _Learner(out, config, report, tell), []
+        learner = _Learner(out, config, tell, pool.imap_unordered(generate_crops, tasks))
         try:
-            ready, least = [], min(len(tasks), config.held_out + min(config.buildings, 2 * config.workers))
-            while len(ready) < least:
-                ready.append(next(made))
-                report("generating", len(ready) / least)
-            for path in ready:
-                (learner.crops if path.parent.name == "crops" else held_out).extend(read_crops(path))
-            learner.run(functools.partial(_newly, made), held_out)
+            least = min(len(tasks), config.held_out + min(config.buildings, 2 * config.workers))
+            for k in range(least):
+                learner.take(None)
+                report("generating", (k + 1) / least)
+            learner.run(report)
         finally:
             learner.save()
-            pool.terminate()
-    scores = learner.score(held_out)
-    learner.note(scores)
-    return scores
-
-
-def _newly(made: Any) -> list[Path]:
-    """Buildings that were finished since the last call."""
-    found = []
-    while True:
-        try:
-            found.append(made.next(timeout=0))
-        except (multiprocessing.TimeoutError, StopIteration):
-            return found
+    return learner.score(len(learner.crops["held_out"]))
 
 
 class _Learner:
-    """Network, optimiser and how far they are."""
+    """Network, optimiser, crops and how far they are."""
 
-    def __init__(self, out: Path, config: SegmentConfig, report: Callable, tell: Callable[[str], None]) -> None:
-        self.out, self.config, self.report, self.tell = out, config, report, tell
-        self.crops: list[Crop] = []
+    def __init__(self, out: Path, config: SegmentConfig, tell: Callable[[str], None], made: Any) -> None:
+        self.out, self.config, self.tell, self.made = out, config, tell, made
+        self.crops: dict[str, list[Crop]] = {"crops": [], "held_out": []}
         self.net = VoxelNet(config.widths, jnp.bfloat16 if config.half else jnp.float32)
         start, self.step = make_step(self.net, config)
         nothing = jnp.zeros((1, 8, 8, 8, FEATURES + 2))
-        self.state: State = start(self.net.init(jax.random.key(config.seed), nothing)["params"])
-        self.steps, self.seconds = 0, 0.0
+        params = self.net.init(jax.random.key(config.seed), nothing)["params"]
+        self.at: dict[str, Any] = {"state": start(params), "steps": 0, "seconds": 0.0}
         self.loss: Any = float("nan")
         if (out / "checkpoint.msgpack").is_file():
-            kept = {"state": self.state, "steps": 0, "seconds": 0.0}
-            kept = flax.serialization.from_bytes(kept, (out / "checkpoint.msgpack").read_bytes())
-            self.state, self.steps, self.seconds = kept["state"], kept["steps"], kept["seconds"]
+            self.at = flax.serialization.from_bytes(self.at, (out / "checkpoint.msgpack").read_bytes())
 
-    def run(self, newly: Callable[[], list[Path]], held_out: list[Crop]) -> None:
+    def take(self, wait_s: float | None) -> None:
+        """Reads the next building that is finished."""
+        path = self.made.next(wait_s)
+        self.crops[path.parent.name] += read_crops(path)
+
+    def run(self, report: Callable[[str, float], None]) -> None:
         """Steps until there were enough."""
-        rng = np.random.default_rng((self.config.seed, self.steps))
+        at, config, crops = self.at, self.config, self.crops["crops"]
+        rng = np.random.default_rng((config.seed, at["steps"]))
         saved = last = time.monotonic()
-        while (share := max(self.steps / self.config.steps, self.seconds / 60 / self.config.minutes)) < 1:
-            rate = self.config.learning_rate * (0.5 + 0.5 * np.cos(np.pi * share)) * min(1.0, (self.steps + 1) / 100)
-            chosen = [self.crops[k] for k in rng.integers(len(self.crops), size=self.config.batch)]
-            self.state, self.loss = self.step(self.state, rate, *batch_of(chosen, self.config, rng))
-            self.steps += 1
-            if self.steps % 10 == 0:
-                self.report("training", share)
-                self.crops += [c for p in newly() if p.parent.name == "crops" for c in read_crops(p)]
+        while (share := max(at["steps"] / config.steps, at["seconds"] / 60 / config.minutes)) < 1:
+            rate = config.learning_rate * (0.5 + 0.5 * np.cos(np.pi * share)) * min(1.0, (at["steps"] + 1) / 100)
+            batch = batch_of([crops[k] for k in rng.integers(len(crops), size=config.batch)], config, rng)
+            at["state"], self.loss = self.step(at["state"], rate, *batch)
+            at["steps"] += 1
+            if at["steps"] % 10 == 0:
+                report("training", share)
+                with contextlib.suppress(multiprocessing.TimeoutError, StopIteration):
+                    while True:
+                        self.take(0)
             now = time.monotonic()
-            self.seconds, last = self.seconds + now - last, now
-            if now - saved > self.config.save_s:
+            at["seconds"], last = at["seconds"] + now - last, now
+            if now - saved > config.save_s:
                 self.save()
-                self.note(self.score(held_out[: 4 * self.config.batch]))
+                self.score(4 * config.batch)
                 saved = last = time.monotonic()
 
     def save(self) -> None:
         """Writes checkpoint and weights."""
-        if self.steps:
-            kept = jax.device_get({"state": self.state, "steps": self.steps, "seconds": self.seconds})
+        if self.at["steps"]:
             with whole_file(self.out / "checkpoint.msgpack") as partial:
-                partial.write_bytes(flax.serialization.to_bytes(kept))
-            write_weights(self.out / "weights.npz", self.net, {"params": self.state[0]})
+                partial.write_bytes(flax.serialization.to_bytes(jax.device_get(self.at)))
+            write_weights(self.out / "weights.npz", self.net, {"params": self.at["state"][0]})
 
-    def score(self, held_out: list[Crop]) -> dict[str, float]:
-        """IoU by class, and `mean`."""
-        found = score_crops(self.net, self.state[0], held_out, self.config)
-        return found | {"mean": float(np.mean(list(found.values()))) if found else 0.0}
-
-    def note(self, scores: dict[str, float]) -> None:
-        """One line of metrics.jsonl, and of the console."""
-        loss = float(self.loss)
-        row = {"step": self.steps, "seconds": round(self.seconds, 1), "loss": loss, "iou": scores}
-        row |= {"loss": None} if np.isnan(loss) else {}
+    def score(self, most: int) -> dict[str, float]:
+        """IoU by class of so many held-out crops, and `mean`: one line of metrics.jsonl, and of the console."""
+        scores = score_crops(self.net, self.at["state"][0], self.crops["held_out"][:most], self.config)
+        scores["mean"] = float(np.mean(list(scores.values()))) if scores else 0.0
+        steps, seconds, loss = self.at["steps"], self.at["seconds"], float(self.loss)
+        row = {"step": steps, "seconds": round(seconds, 1), "loss": None if np.isnan(loss) else loss, "iou": scores}
         path = self.out / "metrics.jsonl"
         write_text(path, (path.read_text() if path.is_file() else "") + json.dumps(row) + "\n")
-        self.tell(f"step {self.steps}, {self.seconds:.0f} s, {len(self.crops)} crops: loss {loss:.3f}, "
+        self.tell(f"step {steps}, {seconds:.0f} s, {len(self.crops['crops'])} crops: loss {loss:.3f}, "
                   f"held-out mIoU {scores['mean']:.3f}")  # fmt: skip
+        return scores
