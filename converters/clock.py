@@ -8,17 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-STAGES = {
-    "read": 1.0,
-    "align": 0.5,
-    "decompose": 25.0,
-    "cut": 3.0,
-    "map": 1.0,
-    "settle": 4.0,
-    "texture": 10.0,
-    "write": 1.0,
-    "gates": 3.0,
-}
+STAGES = dict(read=1.0, align=0.5, decompose=25.0, cut=3.0, map=1.0, settle=4.0, texture=10.0, write=1.0, gates=3.0)
 """Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
 
 Report = Callable[[str, float], None]

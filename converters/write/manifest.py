@@ -13,17 +13,7 @@ from converters.write.emit import SceneParts
 from converters.write.measures import measure_parts
 from scenes_mjcf.schema import SceneManifest, SceneMaps, SceneObject
 
-PACKAGES = (
-    "mujoco",
-    "coacd",
-    "trimesh",
-    "fast-simplification",
-    "xatlas",
-    "numpy",
-    "scipy",
-    "pillow",
-    "shapely",
-)
+PACKAGES = ("mujoco", "coacd", "trimesh", "fast-simplification", "xatlas", "numpy", "scipy", "pillow", "shapely")
 
 
 def scene_objects(parts: SceneParts) -> tuple[SceneObject, ...]:

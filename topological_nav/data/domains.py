@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from interactive_nav_common.config import Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.records import read_packaged
 
 _GAMMA = 2.2
 """Between grey levels and light, for rendered images."""
@@ -51,17 +53,7 @@ class DomainConfig(Settings):
     """Standard deviation of light in the dark, as a share of full scale."""
 
 
-PRESETS: dict[str, DomainConfig] = {
-    "clean": DomainConfig(),
-    "lens": DomainConfig(zoom=1.25, barrel=0.3, vignette=0.4),
-    "light": DomainConfig(exposure_ev=-0.8, exposure_spread_ev=0.3, warmth=0.2, contrast=1.25),
-    "noise": DomainConfig(shot_noise=0.05, read_noise=0.015),
-    "blur": DomainConfig(blur_px=5.0),
-    "camera": DomainConfig(
-        zoom=1.25, barrel=0.3, vignette=0.4, blur_px=3.0, exposure_ev=-0.8, exposure_spread_ev=0.3, warmth=0.2,
-        contrast=1.25, shot_noise=0.05, read_noise=0.015,
-    ),
-}  # fmt: skip
+PRESETS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, DomainConfig])
 """Named cameras; `camera` is all of them at once. Sizes in pixels are meant for images of 64 x 48."""
 
 

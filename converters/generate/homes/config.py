@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.models.cad import HOME_TRAIN_MODELS
 from interactive_nav_common.config import nearest
+from interactive_nav_common.records import read_packaged
 
 Range = tuple[float, float]
 SHARE_TOLERANCE = 0.02
 """`furniture_share` is met to within this."""
-SHELL = BuildingConfig(
-    floor_area_m2=(60.0, 110.0), n_rooms=(5, 7), min_room_side_m=1.5, corridor_width_m=1.4,
-    doorway_width_m=(0.92, 1.04), corner_doorways=1.0, corner_margin_m=0.28, leaf_wall_gap_m=0.16, leaf_proud_m=0.02,
-    leaves_at_walls=True, n_windows=(5, 9), n_doors=(1, 12), voxel_m=0.03, faces_per_m2=600.0, texels_per_m=40.0,
-    n_static=(0, 0), n_chairs=(0, 0), n_tables=(0, 0), n_desks=(0, 0), n_sofas=(0, 0), n_bottlenecks=0,
-)  # fmt: skip
+SHELL = read_packaged(Path(__file__).with_name("shell.yaml"), BuildingConfig)
 """Rooms, walls, doorways and scan of a home; it counts no furniture."""
 COUNTED = (
     *("n_static", "n_chairs", "n_tables", "n_desks", "n_sofas", "n_bottlenecks", "n_blockers", "bottleneck_gap_m"),
@@ -93,15 +90,7 @@ class HomeConfig:
 
 MOST_SHARE = 0.42
 """Largest `furniture_share`: of sixteen homes of four and five rooms 13 take 0.37, 7 take 0.40 and 2 take 0.43."""
-TIERS: dict[str, dict[str, Any]] = {
-    "furnished": {},
-    "cluttered": {
-        "furniture_share": 0.33,
-        "clutter_per_10_m2": (1.5, 2.5),
-        "must_push_turtlebot": (0.08, 0.30),
-        "must_push_fetch": (0.22, 0.46),
-    },
-}
+TIERS = read_packaged(Path(__file__).with_name("tiers.yaml"), dict[str, dict[str, float | Range]])
 """Tier -> how it departs from the defaults. Shares that must be pushed: so that planners that never push arrive in the
 other episodes."""
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.parts import Parts
 from converters.generate.design.plan import Plan, Rect, make_plan
+from interactive_nav_common.records import read_packaged
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,16 +35,7 @@ class RoomUse:
     """How often it is one of the rooms beyond the first four, against the others."""
 
 
-USES = {
-    "living": RoomUse(2.1, 2.8),
-    "bedroom": RoomUse(1.25, 2.3, most=4, extra=4.0),
-    "bathroom": RoomUse(0.55, 1.5, most=2, extra=0.7),
-    "kitchen": RoomUse(1.0, 1.8, ("living", "dining")),
-    "dining": RoomUse(1.1, 2.2, ("living", "kitchen"), extra=2.0),
-    "office": RoomUse(0.85, 2.0, extra=2.0),
-    "storage": RoomUse(0.45, 1.5, extra=1.0),
-    "hall": RoomUse(0.5, 1.1),
-}
+USES = read_packaged(Path(__file__).with_name("rooms.yaml"), dict[str, RoomUse])
 """Use -> what it is like. A corridor is a hall."""
 FIRST = ("living", "bedroom", "bathroom", "kitchen")
 ORDER = ("kitchen", "dining", "living", "office", "hall", "storage", "bathroom", "bedroom")

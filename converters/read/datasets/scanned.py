@@ -26,21 +26,8 @@ from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene, ScanMesh
 from interactive_nav_common.records import read_packaged
 
-NYU40 = tuple(
-    re.findall(
-        r"\w+",
-        "wall floor cabinet bed chair sofa table door window bookshelf picture counter blinds desk shelves curtain "
-        "dresser pillow mirror floor_mat clothes ceiling books refrigerator television paper towel shower_curtain box "
-        "whiteboard person night_stand toilet sink lamp bathtub bag otherstructure otherfurniture otherprop",
-    )
-)
-"""Names of the ids from 1 on."""
-OTHER = {
-    "armchair": 5, "beam": 38, "blind": 13, "bookcase": 10, "column": 38, "couch": 6, "doorframe": 8, "frame": 9,
-    "fridge": 24, "monitor": 25, "nightstand": 32, "pillar": 38, "railing": 38, "rug": 20, "shelf": 15, "stairs": 38,
-    "stool": 5, "tv": 25, "carpet": 20, "windowsill": 9, "closet": 3, "wardrobe": 3, "cupboard": 3,
-}  # fmt: skip
-"""Names that collections use for the same."""
+NYU40 = read_packaged(Path(__file__).with_name("nyu40.yaml"), dict[str, int])
+"""Name, without what lies between its words -> id: NYU40's own, then those that collections use for the same."""
 PROP = 40
 
 
@@ -154,10 +141,9 @@ def _record(
 def label_of(name: str) -> int:
     """NYU40 id of a class's name, by its last words: an office chair is a chair."""
     words = [w for w in re.findall(r"[a-z]+", name.lower()) if len(w) > 1]
-    known = {n.replace("_", ""): i for i, n in enumerate(NYU40, start=1)} | OTHER
     for first in range(len(words)):
         tail = "".join(words[first:])
-        found = known.get(tail) or known.get(tail.removesuffix("s"))
+        found = NYU40.get(tail) or NYU40.get(tail.removesuffix("s"))
         if found is not None:
             return found
     category = category_of(name)

@@ -13,13 +13,15 @@ from __future__ import annotations
 
 import functools
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from interactive_nav.metrics import GRAVITY
 from interactive_nav.robots.build import FOLDER, read_file
-from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
+from interactive_nav.robots.spec import RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
+from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import rotate_back, yaw_from_quat
 
 MASS_KG = 0.5
@@ -34,9 +36,7 @@ _SPIN = (1.0, -1.0, 1.0, -1.0)
 _AXES = tuple(f"quadrotor_{kind}_{axis}" for kind in ("linear", "angular") for axis in "xyz")
 _MODES = ("native", "velocity", "rate", "thrust", "kinematic", "twist")
 
-MAX_SPEED_M_S = 1.0
 MAX_CLIMB_M_S = 0.5
-MAX_YAW_RAD_S = 1.5
 MAX_RATE_RAD_S = 3.0
 MAX_TILT_RAD = 0.4
 _ALTITUDE_GAIN = 1.5
@@ -131,36 +131,12 @@ def _twist_law(command, state, xp):
     return _velocity_law(xp.stack([command[..., 0], zero, climb, command[..., 1]], -1), state, xp)
 
 
-_VELOCITY = ("vx m/s", "vy m/s", "vz m/s", "yaw rate rad/s")
-_TABLE: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...], ControlLaw | None]] = {
-    "velocity": (
-        _VELOCITY,
-        (-MAX_SPEED_M_S, -MAX_SPEED_M_S, -MAX_CLIMB_M_S, -MAX_YAW_RAD_S),
-        (MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_CLIMB_M_S, MAX_YAW_RAD_S),
-        _velocity_law,
-    ),
-    "rate": (
-        ("roll rate rad/s", "pitch rate rad/s", "yaw rate rad/s", "total thrust N"),
-        (-MAX_RATE_RAD_S, -MAX_RATE_RAD_S, -MAX_YAW_RAD_S, 0.0),
-        # Action 0 hovers: the middle of the range is the weight.
-        (MAX_RATE_RAD_S, MAX_RATE_RAD_S, MAX_YAW_RAD_S, 2 * MASS_KG * GRAVITY),
-        _rate_law,
-    ),
-    "thrust": (tuple(f"{name[16:]} rotor N" for name in ROTORS), (0.0,) * 4, (MAX_THRUST_N,) * 4, None),
-    "kinematic": (
-        ("vx m/s", "vy m/s", "vz m/s", "roll rate rad/s", "pitch rate rad/s", "yaw rate rad/s"),
-        (-1.0,) * 6,
-        (1.0,) * 6,
-        None,
-    ),
-    "twist": (
-        ("forward m/s", "yaw rate rad/s"),
-        (-MAX_SPEED_M_S, -MAX_YAW_RAD_S),
-        (MAX_SPEED_M_S, MAX_YAW_RAD_S),
-        _twist_law,
-    ),
-}
-"""Mode -> action names, commands at -1 and +1, control law."""
+_TABLE = read_packaged(
+    Path(__file__).with_suffix(".yaml"),
+    dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...], tuple[tuple[float, float], ...]]],
+)
+"""Mode -> action names, commands at -1 and +1, matrix of a `TwistMap` (empty: none)."""
+_LAWS = {"native": _velocity_law, "velocity": _velocity_law, "rate": _rate_law, "twist": _twist_law}
 
 
 def quadrotor(control_mode: str = "native") -> RobotSpec:
@@ -175,15 +151,7 @@ def quadrotor(control_mode: str = "native") -> RobotSpec:
         ConfigError: unknown mode.
     """
     check_mode("quadrotor", control_mode, _MODES)
-    names, low, high, law = _TABLE["velocity" if control_mode == "native" else control_mode]
-    velocity = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 1.0))
-    drive = {
-        "native": velocity,
-        "velocity": velocity,
-        "kinematic": ((1.0, 0.0), *((0.0, 0.0),) * 4, (0.0, 1.0)),
-        "twist": ((1.0, 0.0), (0.0, 1.0)),
-    }
-    matrix = drive.get(control_mode)
+    (names, low, high, matrix), law = _TABLE[control_mode], _LAWS.get(control_mode)
     return RobotSpec(
         name="quadrotor",
         add_to=functools.partial(_add_to, mode=control_mode),
@@ -207,5 +175,5 @@ def quadrotor(control_mode: str = "native") -> RobotSpec:
         control_modes=_MODES,
         control=law,
         control_every_substep=law is not None,
-        twist=None if matrix is None else TwistMap(matrix, high[0], high[-1]),
+        twist=None if not matrix else TwistMap(matrix, high[0], high[-1]),
     )
