@@ -32,7 +32,8 @@ def test_the_last_words_of_a_class_tell_its_id(name, label):
 
 
 def test_every_name_of_nyu40_is_its_own():
-    assert [label_of(name) for name in NYU40] == list(range(1, 41))
+    assert {name: label_of(name) for name in NYU40} == NYU40
+    assert list(dict.fromkeys(NYU40.values())) == list(range(1, 41))
 
 
 def a_room() -> tuple[trimesh.Trimesh, np.ndarray, dict[int, str]]:
