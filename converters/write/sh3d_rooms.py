@@ -31,10 +31,10 @@ def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: flo
     x, y = np.meshgrid(x0 + (columns + 0.5) * res, y0 + (rows + 0.5) * res)
     floor = (maps.traversable | shapely.contains_xy(low, x, y)) & ~shapely.contains_xy(high, x, y)
     wide = np.asarray(ndimage.distance_transform_edt(np.pad(floor, 1)))[1:-1, 1:-1] * res > DOORWAY_M / 2
-    label, count = ndimage.label(wide)
+    label, count = ndimage.label(wide)  # pyright: ignore[reportGeneralTypeIssues]
     small = 1 + np.flatnonzero(np.bincount(label.ravel(), minlength=count + 1)[1:] * res**2 < CORE_M2)
     label[np.isin(label, small)] = 0
-    pieces, many = ndimage.label(floor)
+    pieces, many = ndimage.label(floor)  # pyright: ignore[reportGeneralTypeIssues]
     for k in range(1, many + 1):  # a room that is narrow everywhere
         if not label[pieces == k].any():
             label[pieces == k] = label.max() + 1

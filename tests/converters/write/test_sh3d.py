@@ -110,8 +110,8 @@ def test_hulls_come_back_in_their_pieces(drawing):
             assert pieces is not None
             if a.category == thing.category and len(pieces) == len(own):
                 again = np.vstack([p for p, _ in pieces]) @ a.pose[:3, :3].T + a.pose[:3, 3]
-                corners = [[p.min(axis=0), p.max(axis=0)] for p in (again, points)]
-                found.append(max(np.abs(np.subtract(*corners)).max(), KDTree(points).query(again)[0].max()))
+                ends, old = (np.array([p.min(axis=0), p.max(axis=0)]) for p in (again, points))
+                found.append(max(np.abs(ends - old).max(), KDTree(points).query(again)[0].max()))
         assert min(found) < 0.002, thing.name
 
 
