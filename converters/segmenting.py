@@ -88,8 +88,8 @@ def _score(arguments: argparse.Namespace, console: Console) -> int:
             )
         if arguments.homes:
             # Whole buildings of other seeds than those whose crops the training was watched by.
-            homes = range(HELD_OUT_SEED + 50_000, HELD_OUT_SEED + 50_000 + arguments.homes)
-            _table(console, f"{arguments.homes} held-out buildings", score_homes(homes, scores, report))
+            found = score_homes(HELD_OUT_SEED + 50_000, arguments.homes, scores, report)
+            _table(console, f"{arguments.homes} held-out buildings", found)
     return 0
 
 

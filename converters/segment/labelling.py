@@ -92,17 +92,25 @@ def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any
     return {"iou": iou, "objects": len(raw.annotations), "found": found, "found_true": objects_found(raw, raw.scan)}
 
 
-def score_homes(seeds: range, scores: Scores, report: Report) -> dict[str, float]:
-    """IoU by class over the surfaces of whole generated buildings of each tier, their furniture held out."""
+def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[str, float]:
+    """IoU by class over the surfaces of whole generated buildings of all tiers, their furniture held out.
+
+    Args:
+        seed: of the first; one whose home misses its shares gives way to the next.
+        count: of buildings.
+        scores: of `load_scores`.
+        report: progress, (stage, share).
+    """
     truth, found = [], []
-    for k, seed in enumerate(seeds):
+    while len(truth) < count:
+        seed += 1
         try:
-            surface, classes = building_surface(seed, TIERS[k % len(TIERS)], "test")
-        except GenerationError:  # a seed whose home misses its shares has no home
+            surface, classes = building_surface(seed - 1, TIERS[len(truth) % len(TIERS)], "test")
+        except GenerationError:
             continue
         guess = score_points(surface, (0.0,), scores, lambda stage, share: None)
         inside = guess.any(axis=1)
         truth.append(classes[inside])
         found.append(guess[inside].argmax(axis=1))
-        report("score", (k + 1) / len(seeds))
+        report("score", len(truth) / count)
     return intersection_over_union(np.concatenate(truth), np.concatenate(found))

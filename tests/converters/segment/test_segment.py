@@ -12,11 +12,13 @@ import pytest
 import trimesh
 
 from converters.__main__ import main
+from converters.generate import GenerationError
 from converters.read.meshes import labels_beside
 from converters.read.source import read_source
 from converters.records.errors import SceneRejected
 from converters.records.raw import ScanMesh
-from converters.segment.labelling import label_scan
+from converters.segment import labelling
+from converters.segment.labelling import label_scan, score_homes
 from converters.segment.network import VoxelNet, read_weights, score_voxels, write_weights
 from converters.segment.samples import Crop, building_surface, make_crop, read_crops
 from converters.segment.train import SegmentConfig, batch_of, make_step, score_crops, turned
@@ -144,6 +146,23 @@ def test_every_voxel_of_a_long_building_is_scored_once():
     surface = sample_surface(square(8.0), spacing_m=0.02)
     found = score_voxels(voxelise(surface, 0.0), by_normal)
     assert 40000 <= len(found) <= 40401 and (found[:, FLOOR] == 1).all()
+
+
+def test_as_many_buildings_are_scored_as_were_asked_for(monkeypatch):
+    asked = []
+
+    def building(seed, tier, split):
+        asked.append((seed, tier))
+        if seed == 8:
+            raise GenerationError("its shares are missed")
+        surface = sample_surface(square(), spacing_m=0.1)
+        return surface, np.full(len(surface.points), FLOOR if seed == 7 else WALL, np.uint8)
+
+    monkeypatch.setattr(labelling, "building_surface", building)
+    # All that is level is found as floor: right in the first of two buildings of one size.
+    found = score_homes(7, 2, by_normal, lambda stage, share: None)
+    assert asked == [(7, "furnished"), (8, "cluttered"), (9, "cluttered")]
+    assert found == {"wall": 0.0, "floor": 0.5}
 
 
 @pytest.fixture
