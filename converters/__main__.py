@@ -58,17 +58,20 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
             for word in ("format", "up", "unit", "mirror", "root", "split", "jobs", "library", "strict")
         },
         overwrite=arguments.overwrite,
-        auto_align=arguments.auto_align or arguments.segment or arguments.library is not None,
+        auto_align=arguments.auto_align or arguments.segment or bool(arguments.library and not arguments.annotations),
         timeout_s=arguments.timeout,
         **{"seed": arguments.seed} | settings,
     )
     if arguments.into:
+        refuse_unused(arguments, "--annotations", "with --into: a file is of one scan")
         return _convert_many(arguments, config, console)
     if arguments.segment:
         label_unlabelled(arguments, console)
     warn = warn_once(console)
     with stage_progress(console) as report:
-        results = convert_building(arguments.source, arguments.out, config, report, warn=warn)
+        results = convert_building(
+            arguments.source, arguments.out, config, report, warn=warn, annotations=arguments.annotations
+        )
     for result in results:
         if any(row.get("n_keypoints") for row in result.manifest.alignment):
             console.print(alignment_table(result.manifest.alignment))

@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from converters.annotate.session import with_annotations
 from converters.bodies.alignment import Alignment
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject, name_objects, place_object
@@ -317,6 +318,18 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds, decomposed.worker_mib)
 
 
+def _read(source: Path, name: str, config: ConvertConfig, annotations: Path | None) -> RawScene:
+    """The source under its scene's name, with a file's annotations if one is given."""
+    about = config.up, config.unit, config.root, config.mirror
+    raw = read_source(source, config.format, config.strict, *about)
+    if annotations is not None:
+        raw = with_annotations(raw, annotations, config.library)
+    labelled = np.isin(raw.scan.labels, [label for own in CATEGORY_LABELS.values() for label in own]).any()
+    unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
+    told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
+    return dataclasses.replace(raw, name=name, warnings=told)
+
+
 def convert_building(
     source: Path,
     target: Path,
@@ -325,6 +338,7 @@ def convert_building(
     cache: Path | None = None,
     warn: Callable[[str], None] = lambda warning: None,
     floors: int | None = None,
+    annotations: Path | None = None,
 ) -> tuple[Converted, ...]:
     """Converts one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
 
@@ -337,6 +351,7 @@ def convert_building(
         cache: folder of hulls and stage results by content; default `cache_folder()`.
         warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
         floors: that it must have; None: any number.
+        annotations: Scan2CAD's file, in place of the source's own; its models are those of `config.library`.
 
     Raises:
         SceneRejected: bad input, or another number of floors.
@@ -345,22 +360,17 @@ def convert_building(
         OSError: the disk is full or gone.
     """
     clock = Clock(report or (lambda stage, share: None))
+    if config.library is None and (source / "cad").is_dir():
+        config = dataclasses.replace(config, library=source)
     check_name(target.name, f"{target}: the scene's name")
     with contextlib.ExitStack() as stack:
         # Before reading, which may take a while: an OUT that cannot be written is told at once.
         first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
-            about = config.up, config.unit, config.root, config.mirror
-            raw = read_source(source, config.format, config.strict, *about)
-            labelled = np.isin(raw.scan.labels, [label for own in CATEGORY_LABELS.values() for label in own]).any()
-            unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
-            told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
-            raw = dataclasses.replace(raw, name=target.name, warnings=told)
+            raw = _read(source, target.name, config, annotations)
             scenes = split_storeys(raw)
         for warning in raw.warnings:
             warn(warning)
-        if config.auto_align and config.library is None and (source / "cad").is_dir():
-            config = dataclasses.replace(config, library=source)
         if floors is not None and len(scenes) != floors:
             raise SceneRejected(f"{source}: has {len(scenes)} floors, expected {floors}; use convert_building")
         clock.floors = len(scenes)

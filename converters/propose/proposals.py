@@ -127,7 +127,7 @@ def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def _trs(scale: np.ndarray, yaw: float, translation: np.ndarray) -> dict[str, list[float]]:
+def scan2cad_trs(scale: np.ndarray, yaw: float, translation: np.ndarray) -> dict[str, list[float]]:
     """Scan2CAD's scale, quaternion (w x y z) and translation in a y-up world; arguments are z up."""
     return {
         "scale": np.round([scale[0], scale[2], scale[1]], 6).tolist(),
@@ -156,7 +156,7 @@ def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int,
             "catid_cad": synset[proposal.category],
             "id_cad": "",
             "sym": "__SYM_NONE",
-            "trs": _trs(proposal.extent_m, proposal.yaw, proposal.centre),
+            "trs": scan2cad_trs(proposal.extent_m, proposal.yaw, proposal.centre),
             "bbox": [0.5, 0.5, 0.5],
             "center": [0.0, 0.0, 0.0],
             "keypoints_cad": empty,
@@ -174,12 +174,17 @@ def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int,
             entry |= {
                 "catid_cad": synset[found.cad.category],
                 "id_cad": found.cad.cad_id,
-                "trs": _trs(found.pose.scale, found.pose.yaw, found.pose.translation),
+                "trs": scan2cad_trs(found.pose.scale, found.pose.yaw, found.pose.translation),
                 "bbox": np.round((high - low) / 2, 6).tolist(),
                 "center": np.round((high + low) / 2, 6).tolist(),
             }
             entry["proposal"] |= {"retrieval_confidence": found.confidence, "residual_m": found.residual_m}
         models.append(entry)
+    return scan2cad_list(scan_id, models)
+
+
+def scan2cad_list(scan_id: str, models: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Scan2CAD's list of one scan, whose `trs` turns its z up to the file's y."""
     half = math.sqrt(0.5)
     return [
         {

@@ -1,0 +1,295 @@
+"""What a person has said about a scan so far: objects, their models and keypoint pairs; as files, and back.
+
+Nothing here knows of a browser. An action makes a new `Session`; `Store` writes it after each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from converters.bodies.alignment import (
+    MIN_POINTS,
+    SYMMETRY_PERIOD_RAD,
+    Alignment,
+    AlignmentError,
+    apply_alignment,
+    solve_alignment,
+)
+from converters.geometry.rotations import Y_UP_TO_Z_UP
+from converters.propose.proposals import Proposal, bounds, scan2cad_list, scan2cad_trs
+from converters.propose.retrieval import read_library
+from converters.read.annotations import inside_scan, parse_annotations
+from converters.read.files import SourceFolder, read_json
+from converters.read.scan2cad import ANNOTATION
+from converters.records.errors import SceneRejected
+from converters.records.raw import SYNSETS, CadModel, RawScene
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.records import Reader
+
+SESSION = "session.json"
+MAX_UNDO = 200
+"""Actions that can be taken back."""
+Point = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    """One object of the scan and what was said about it."""
+
+    category: str
+    centre: Point
+    """Of its box, scan frame, m."""
+    extent_m: Point
+    """Full sizes along the box's own axes."""
+    yaw: float
+    """rad, of the box's x axis."""
+    label: int
+    """NYU40 id that most of it carries; 0: nobody proposed it."""
+    cad_id: str = ""
+    symmetry: str = "__SYM_NONE"
+    scan: tuple[Point, ...] = ()
+    """Clicked points, scan frame, m."""
+    model: tuple[Point, ...] = ()
+    """Clicked points, CAD frame; of these and of `scan` one may have a point more, whose partner is not yet clicked."""
+    state: Literal["open", "accepted", "skipped"] = "open"
+
+    @property
+    def pairs(self) -> int:
+        """Number of whole pairs."""
+        return min(len(self.scan), len(self.model))
+
+    def fit(self) -> Alignment:
+        """The model's placement by the whole pairs, as `convert` would solve it.
+
+        Raises:
+            AlignmentError: too few pairs, or pairs that do not determine it.
+        """
+        return solve_alignment(np.array(self.model[: self.pairs]), np.array(self.scan[: self.pairs]), self.symmetry)
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """All objects, the one that is worked on, and the way back."""
+
+    scan_id: str
+    scan_sha256: str
+    """Of the vertices: pairs of one scan mean nothing on another."""
+    items: tuple[Item, ...]
+    at: int = 0
+    """Index of the object that is worked on."""
+    undo: tuple[tuple[int, Item | None], ...] = ()
+    """Index and what stood there before, the last action last; None: it was not there."""
+    wrote_sha256: tuple[str, ...] = ()
+    """Of the annotation file, as it was before this action and as it is after."""
+
+    @property
+    def item(self) -> Item:
+        """The object that is worked on.
+
+        Raises:
+            AlignmentError: there is none at all.
+        """
+        if not self.items:
+            raise AlignmentError("there is no object yet; add one first")
+        return self.items[self.at]
+
+    def changed(self, **what: Any) -> Session:
+        """The object that is worked on, changed."""
+        items, undo = list(self.items), (*self.undo, (self.at, self.item))[-MAX_UNDO:]
+        items[self.at] = dataclasses.replace(self.item, **what)
+        return dataclasses.replace(self, items=tuple(items), undo=undo)
+
+    def chose(self, cad: CadModel) -> Session:
+        """Takes a model: points that were clicked on another one are dropped with it, and its class is taken."""
+        model = self.item.model if self.item.cad_id == cad.cad_id else ()
+        return self.changed(cad_id=cad.cad_id, category=cad.category, model=model, state="open")
+
+    def clicked(self, side: Literal["scan", "model"], point: np.ndarray) -> Session:
+        """Adds a point; a second one on a side whose last point has no partner yet takes that one's place."""
+        own, other = (self.item.scan, self.item.model)[:: 1 if side == "scan" else -1]
+        kept = own[:-1] if len(own) > len(other) else own
+        x, y, z = np.round(np.asarray(point, float), 6).tolist()
+        return self.changed(**{side: (*kept, (x, y, z))}, state="open")
+
+    def accepted(self) -> Session:
+        """Accepts the fit and goes on to the next open object.
+
+        Raises:
+            AlignmentError: no model is chosen, or there is no fit.
+        """
+        if not self.item.cad_id:
+            raise AlignmentError("no model is chosen; choose one, then click pairs")
+        self.item.fit()
+        return self.changed(state="accepted").next_open()
+
+    def skipped(self) -> Session:
+        """Leaves the object out and goes on to the next open one."""
+        return self.changed(state="skipped").next_open()
+
+    def next_open(self) -> Session:
+        """The next object that is neither accepted nor skipped; stays where none is."""
+        order = [(self.at + k) % len(self.items) for k in range(len(self.items))]
+        return dataclasses.replace(self, at=next((k for k in order if self.items[k].state == "open"), self.at))
+
+    def added(self, category: str, centre: np.ndarray) -> Session:
+        """Adds an object that nobody proposed, and works on it."""
+        x, y, z = np.round(centre, 4).tolist()
+        item = Item(category, (x, y, z), (1.0, 1.0, 1.0), 0.0, 0)
+        undo = (*self.undo, (len(self.items), None))[-MAX_UNDO:]
+        return dataclasses.replace(self, items=(*self.items, item), at=len(self.items), undo=undo)
+
+    def undone(self) -> Session:
+        """Takes the last action back; without one nothing changes."""
+        if not self.undo:
+            return self
+        (at, before), items = self.undo[-1], list(self.items)
+        items[at : at + 1] = [] if before is None else [before]
+        at = max(min(at, len(items) - 1), 0)
+        return dataclasses.replace(self, items=tuple(items), at=at, undo=self.undo[:-1])
+
+
+def scan_sha256(raw: RawScene) -> str:
+    """Digest of the scan's vertices."""
+    return hashlib.sha256(np.ascontiguousarray(raw.scan.vertices, np.float64).tobytes()).hexdigest()
+
+
+def start(raw: RawScene, proposals: tuple[Proposal, ...]) -> Session:
+    """A session in which nothing has been said yet."""
+    items = [
+        Item(p.category, *(tuple(np.round(v, 4).tolist()) for v in (p.centre, p.extent_m)), round(p.yaw, 6), p.label)
+        for p in proposals
+    ]
+    return Session(raw.name, scan_sha256(raw), tuple(items))
+
+
+def as_annotations(session: Session, library: Mapping[str, CadModel]) -> list[dict[str, Any]]:
+    """The accepted objects as Scan2CAD's annotation list."""
+    synset, models = {category: key for key, category in SYNSETS.items()}, []
+    for item in session.items:
+        if item.state != "accepted":
+            continue
+        cad, fit = library[item.cad_id], item.fit()
+        low, high = bounds(cad.vertices @ Y_UP_TO_Z_UP)
+        placed, seen = apply_alignment(fit, np.array(item.model[: item.pairs])), np.array(item.scan[: item.pairs])
+        points = {"keypoints_cad": placed @ Y_UP_TO_Z_UP, "keypoints_scan": seen @ Y_UP_TO_Z_UP}
+        models.append(
+            {"catid_cad": synset[item.category], "id_cad": item.cad_id, "sym": item.symmetry}
+            | {"trs": scan2cad_trs(fit.scale, fit.yaw, fit.translation)}
+            | {"bbox": np.round((high - low) / 2, 6).tolist(), "center": np.round((high + low) / 2, 6).tolist()}
+            | {
+                key: {"n_keypoints": item.pairs, "position": np.round(at, 6).ravel().tolist()}
+                for key, at in points.items()
+            }
+        )
+    return scan2cad_list(session.scan_id, models)
+
+
+def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> RawScene:
+    """The scene with a file's annotations in place of its own.
+
+    Args:
+        raw: as read.
+        path: of the file.
+        library_root: folder with `cad/`; None: the packaged furniture.
+
+    Raises:
+        SceneRejected: damaged, of another scan, or a model that the library lacks.
+    """
+    _, records = parse_annotations(read_json(path), path)
+    library, annotations = read_library(library_root), tuple(a for _, a in records)
+    missing = sorted({a.cad_id for a in annotations} - set(library))
+    if missing:
+        where = library_root / "cad" if library_root else "the packaged furniture"
+        raise SceneRejected(f"{path}: names model {missing[0]}, which {where} lacks; give its --library")
+    source = SourceFolder(path.parent)
+    source.use(path.name, "")
+    kept = inside_scan(source, path.name, annotations, library, raw.scan.vertices, raw.scan.faces)
+    return dataclasses.replace(
+        raw,
+        annotations=kept,
+        cads={a.cad_id: library[a.cad_id] for a in kept},
+        sources=raw.sources | source.sha256,
+        warnings=raw.warnings + tuple(source.warnings),
+    )
+
+
+class Store:
+    """The folder of one session. Nobody else may write there meanwhile (`interactive_nav_common.locks.alone_in`)."""
+
+    def __init__(self, folder: Path, library: Mapping[str, CadModel]) -> None:
+        """Of a folder, with the models that annotations may name."""
+        self.folder, self.library = folder, library
+        self._known: dict[str, str] = {}
+
+    def _digest(self, name: str) -> str:
+        try:
+            return hashlib.sha256((self.folder / name).read_bytes()).hexdigest()
+        except FileNotFoundError:
+            return ""
+        except OSError as error:
+            raise FileError(f"{self.folder / name}: cannot be read ({error.strerror}); mend it") from None
+
+    def open(self, raw: RawScene, begin: Callable[[], Session]) -> Session:
+        """The session that the folder holds, or what `begin` makes.
+
+        Raises:
+            FileError: its file is damaged or of another scan, or an annotation file there is somebody else's.
+        """
+        path = self.folder / SESSION
+        self._known = {name: self._digest(name) for name in (SESSION, ANNOTATION)}
+        given = Reader(FileError, "remove it to begin anew").json(path, absent={})
+        session = Reader(FileError, "remove it to begin anew").record(given, Session, str(path)) if given else None
+        if self._known[ANNOTATION] not in ("", *(session.wrote_sha256 if session else ())):
+            raise FileError(
+                f"{self.folder / ANNOTATION}: was not written by this session, expected none or its own; "
+                "choose another folder (-o) or move the file away"
+            )
+        if session is None:
+            return begin()
+        if session.scan_sha256 != scan_sha256(raw):
+            raise FileError(
+                f"{path}: is of scan {session.scan_id} with other vertices than {raw.name}; "
+                "choose another folder (-o), or give the scan that it was begun with"
+            )
+        for k, item in enumerate(session.items):
+            if item.category not in SYNSETS.values() or item.symmetry not in SYMMETRY_PERIOD_RAD:
+                raise FileError(f"{path}: items[{k}] has class {item.category}, symmetry {item.symmetry}; mend them")
+            if (item.cad_id or item.state == "accepted") and item.cad_id not in self.library:
+                raise FileError(f"{path}: items[{k}] names model {item.cad_id}, which is not there; give its --library")
+        if session.items and not 0 <= session.at < len(session.items):
+            raise FileError(f"{path}: at is {session.at}, expected an index of {len(session.items)} items; mend it")
+        return session
+
+    def save(self, session: Session) -> Session:
+        """Writes the session, then its annotations, each whole or not at all; returns what stands there.
+
+        Raises:
+            FileError: one cannot be written, or another program has changed it since; nothing is overwritten then.
+        """
+        for name, digest in self._known.items():
+            if self._digest(name) != digest:
+                raise FileError(
+                    f"{self.folder / name}: another program has changed it since it was read, expected it as it was; "
+                    "nothing was overwritten: move it away, or stop and start again to take it"
+                )
+        text = json.dumps(as_annotations(session, self.library), indent=1, allow_nan=False) + "\n"
+        own = hashlib.sha256(text.encode()).hexdigest()
+        session = dataclasses.replace(session, wrote_sha256=(self._known[ANNOTATION], own))
+        write_text(self.folder / SESSION, json.dumps(dataclasses.asdict(session), allow_nan=False) + "\n")
+        self._known[SESSION] = self._digest(SESSION)
+        write_text(self.folder / ANNOTATION, text)
+        self._known[ANNOTATION] = own
+        return session
+
+
+def step_of(item: Item) -> int:
+    """Which step is next: 1 choose a model, 2 click pairs, 3 look and accept."""
+    return 1 if not item.cad_id else 2 if item.pairs < MIN_POINTS else 3
