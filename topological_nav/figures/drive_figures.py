@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -14,8 +13,9 @@ from matplotlib.figure import Figure
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
-from topological_nav.figures.maps import floor_plan
+from topological_nav.figures.maps import curves, floor_plan, scene_axes
 from topological_nav.scenes.space import free_space
+from train.figures.style import panels, plt
 
 SHOWN = 4
 """Drives whose images are shown."""
@@ -32,16 +32,12 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
     """
     header, config = read_drives_header(folder)
     drives, robot = load_drives(folder), get_robot(config.robot)
-    columns = min(4, len(scene_folders))
-    lines = -(-len(scene_folders) // columns)
+    lines = -(-len(scene_folders) // min(4, len(scene_folders)))
     picked = _some(folder, SHOWN)
     figure = plt.figure(figsize=(12, 3.8 * lines + 1.2 * len(picked) + 2.4), layout="constrained")
     parts: Any = figure.subfigures(3, 1, height_ratios=[3.8 * lines, 1.2 * len(picked) + 0.01, 2.4])
     above, middle, below = parts
-    axes = np.ravel(above.subplots(lines, columns, squeeze=False))
-    for axis in axes[len(scene_folders) :]:
-        axis.set_axis_off()
-    shade = None
+    axes, shade = scene_axes(above, len(scene_folders)), None
     for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
         axis, mine = axes[index], np.flatnonzero(drives.scene == index)
         floor_plan(axis, free_space(load_scene(scene_folder), robot.height_m))
@@ -123,23 +119,16 @@ def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
         lines: of metrics.jsonl.
         results: of results.json.
     """
-    figure, axes = plt.subplots(1, 4, figsize=(15, 3.6), layout="constrained")
-    epochs = [line["epoch"] for line in lines]
-    for name in ("forward", "consistency"):
-        axes[0].plot(epochs, [line[name] for line in lines], label=name)
+    figure, (axes,) = panels((15, 3.6), 1, 4)
+    curves(axes[0], lines, {"forward": "forward", "consistency": "consistency"})
     axes[0].set_yscale("log")
     axes[0].set_title("errors in feature space", fontsize=9)
-    for name in ("linear", "angular"):
-        axes[1].plot(epochs, [line[f"{name}_accuracy"] for line in lines], label=f"{name}, learned from")
     if "test" in results:
         for name, colour in (("linear", "tab:blue"), ("angular", "tab:orange")):
             axes[1].axhline(results["test"][name]["accuracy"], color=colour, ls="--", label=f"{name}, held out")
+    curves(axes[1], lines, {f"{name}_accuracy": f"{name}, learned from" for name in ("linear", "angular")})
     axes[1].set_title("accuracy", fontsize=9)
     axes[1].set_ylim(0, 1)
-    for axis in axes[:2]:
-        axis.set_xlabel("epoch")
-        axis.legend(fontsize=7)
-        axis.grid(alpha=0.3)
     for axis, name, unit in ((axes[2], "linear", "m/s"), (axes[3], "angular", "rad/s")):
         if "test" not in results:
             axis.set_axis_off()

@@ -6,19 +6,16 @@ import io
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from topological_nav.figures.maps import floor_plan, room_points
+from topological_nav.figures.maps import floor_plan, room_points, scene_axes
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
+from train.figures.style import plt
 
 WON, LOST = "tab:blue", "tab:red"
 FEW = 100
@@ -53,16 +50,10 @@ def journeys_figure(
     columns = len(panels) if extent[1] >= extent[0] or len(panels) == 1 else min(2, len(panels))
     lines = -(-len(panels) // columns)
     width = 5.4
-    figure, grid = plt.subplots(
-        lines,
-        columns,
-        figsize=(width * columns, (width * extent[1] / extent[0] + 0.5) * lines),
-        squeeze=False,
-        layout="constrained",
-    )
-    for axis in grid.ravel()[len(panels) :]:
-        axis.set_axis_off()
-    for axis, (name, (made, tracks, rows)) in zip(grid.ravel(), panels.items(), strict=False):
+    size = (width * columns, (width * extent[1] / extent[0] + 0.5) * lines)
+    figure = plt.figure(figsize=size, layout="constrained")
+    axes = scene_axes(figure, len(panels), columns)
+    for axis, (name, (made, tracks, rows)) in zip(axes, panels.items(), strict=True):
         floor_plan(axis, space)
         if made is not None:
             map_lines(axis, made, passable)

@@ -19,11 +19,12 @@ from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, play
-from topological_nav.figures.episode_figures import map_lines, plan_picture, plt
+from topological_nav.figures.episode_figures import map_lines, plan_picture
 from topological_nav.figures.maps import floor_plan
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
 from topological_nav.scenes.simulation import Seen
+from train.figures.style import plt
 
 FILM_EVERY_S = 0.5
 FILM_RATE = 20.0

@@ -6,10 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -21,6 +17,7 @@ from topological_nav.data.dataset import load_plan, load_rooms, read_header
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route
 from topological_nav.scenes.space import FreeSpace
+from train.figures.style import panels, plt
 
 PALETTE = [*plt.get_cmap("tab20").colors[::2], *plt.get_cmap("tab20").colors[1::2]]  # type: ignore[attr-defined]
 """Colours of rooms; after twenty they repeat."""
@@ -31,6 +28,24 @@ def save(figure: Figure, path: Path) -> None:
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=130, format="png")
     plt.close(figure)
+
+
+def curves(axis: Axes, lines: Sequence[Mapping[str, Any]], labels: Mapping[str, str], **style: Any) -> None:
+    """Draws metrics (name -> label) of a run's lines over its epochs."""
+    for name, label in labels.items():
+        axis.plot([line["epoch"] for line in lines], [line[name] for line in lines], label=label, **style)
+    axis.set_xlabel("epoch")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+
+
+def scene_axes(part: Any, count: int, columns: int = 4) -> np.ndarray:
+    """[count] axes of a figure or a part of one, at most so many in a line."""
+    columns = min(columns, count)
+    axes = part.subplots(-(-count // columns), columns, squeeze=False).ravel()
+    for axis in axes[count:]:
+        axis.set_axis_off()
+    return axes[:count]
 
 
 def floor_plan(axis: Axes, space: FreeSpace) -> None:
@@ -63,14 +78,11 @@ def dataset_figure(folder: Path) -> Figure:
     scenes = [(s["name"], load_plan(folder, s["name"])) for s in header["scenes"]]
     rooms = load_rooms(folder)
     shown = np.linspace(0, len(rooms.xy_w) - 1, min(6, len(rooms.xy_w))).astype(int)
-    columns = min(4, len(scenes))
-    lines = -(-len(scenes) // columns)
+    lines = -(-len(scenes) // min(4, len(scenes)))
     figure = plt.figure(figsize=(12, 3.4 * lines + 1.25 * len(shown)), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=[3.4 * lines, 1.25 * len(shown)])
     above, below = parts
-    for axis in np.ravel(above.subplots(lines, columns, squeeze=False))[len(scenes) :]:
-        axis.set_axis_off()
-    for axis, (name, plan) in zip(above.axes, scenes, strict=False):
+    for axis, (name, plan) in zip(scene_axes(above, len(scenes)), scenes, strict=True):
         axis.scatter(*plan.rooms.points_w.T, s=1, c="0.85", linewidths=0)
         for held, marker in ((False, "o"), (True, "^")):
             mine = plan.test == held
@@ -103,18 +115,13 @@ def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
     """
     names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
     phases = list(dict.fromkeys(line["phase"] for line in lines))
-    figure, grid = plt.subplots(1, len(phases), figsize=(4.6 * len(phases), 3.2), squeeze=False, layout="constrained")
+    figure, grid = panels((4.6 * len(phases), 3.2), 1, len(phases))
     for axis, phase in zip(grid[0], phases, strict=True):
         mine = [line for line in lines if line["phase"] == phase]
-        epochs = [line["epoch"] for line in mine]
-        axis.plot(epochs, [line["loss"] for line in mine], marker=".", label="loss")
-        if "accuracy" in mine[0]:
-            axis.plot(epochs, [line["accuracy"] for line in mine], marker=".", label="accuracy on training images")
+        labels = {"loss": "loss", "accuracy": "accuracy on training images"}
+        curves(axis, mine, {name: label for name, label in labels.items() if name in mine[0]}, marker=".")
         axis.set_title(names[phase], fontsize=9)
-        axis.set_xlabel("epoch")
         axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
     return figure
 
 

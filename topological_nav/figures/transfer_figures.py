@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from topological_nav.figures.maps import curves
 from topological_nav.weights.export import PRECISION, Exported
+from train.figures.style import panels, plt
 
 _SHOWN = 6
 """Pairs of images."""
@@ -31,19 +29,11 @@ def features_figure(
         lines: of metrics.jsonl.
         results: of results.json.
     """
-    figure: Any = plt.figure(figsize=(11, 5.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
-    _pairs(above, source, target)
-    course, scores = below.subplots(1, 2)
-    epochs = [line["epoch"] for line in lines]
-    for name, label in (("loss", "extractor's loss"), ("critic_loss", "critic's loss")):
-        course.plot(epochs, [line[name] for line in lines], marker=".", label=label)
-    course.plot(epochs, [line["critic_accuracy"] for line in lines], marker=".", label="critic's accuracy")
+    figure, course, scores = _domains(source, target)
+    labels = {"loss": "extractor's loss", "critic_loss": "critic's loss", "critic_accuracy": "critic's accuracy"}
+    curves(course, lines, labels, marker=".")
     course.axhline(0.5, color="0.7", linewidth=0.8, zorder=0)
-    course.set_xlabel("epoch")
     course.set_ylim(bottom=0)
-    course.legend(fontsize=7)
-    course.grid(alpha=0.3)
     kinds = (("node", "nearest node"), ("room", "right room"))
     for k, (name, colour) in enumerate(_STAGES.items()):
         values = [results[name]["mean"][kind] for kind, _ in kinds]
@@ -62,18 +52,12 @@ def passages_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
     """Images of both domains, fine-tuning, and accuracy of the four configurations; see `features_figure`."""
-    figure: Any = plt.figure(figsize=(11, 5.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
-    _pairs(above, source, target)
-    course, scores = below.subplots(1, 2)
+    figure, course, scores = _domains(source, target)
     for name, label in (("B", "B: fresh weights"), ("D", "D: the source's")):
-        mine = [line for line in lines if line["phase"] == name]
-        course.plot([line["epoch"] for line in mine], [line["accuracy"] for line in mine], marker=".", label=label)
+        curves(course, [line for line in lines if line["phase"] == name], {"accuracy": label}, marker=".")
     course.set_xlabel("epoch of fine-tuning")
     course.set_ylim(0, 1)
     course.set_title("accuracy on the images learned from", fontsize=9)
-    course.legend(fontsize=7)
-    course.grid(alpha=0.3)
     names = ("A", "B", "C", "D")
     _bars(scores, np.arange(4), [results[name]["accuracy"] for name in names], 0.6, "tab:blue", None)
     scores.axhline(0.5, color="0.5", linewidth=0.8)
@@ -84,14 +68,18 @@ def passages_figure(
     return figure
 
 
-def _pairs(part: Any, source: np.ndarray, target: np.ndarray) -> None:
-    grid = part.subplots(2, _SHOWN, squeeze=False)
+def _domains(source: np.ndarray, target: np.ndarray) -> tuple[Figure, Axes, Axes]:
+    """A figure with images of both domains, and its axes for the course of learning and for the scores."""
+    figure: Any = plt.figure(figsize=(11, 5.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    grid = above.subplots(2, _SHOWN, squeeze=False)
     for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):
         rows = np.linspace(0, len(images) - 1, _SHOWN).astype(int)
         for axis, row in zip(line, rows, strict=True):
             axis.imshow(images[row])
             axis.set_axis_off()
         line[0].set_title(name, fontsize=9, loc="left")
+    return figure, *below.subplots(1, 2)
 
 
 def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, colour: str, label: str | None) -> None:
@@ -106,7 +94,7 @@ def export_figure(made: Exported, limit_mib: float) -> Figure:
         made: of `export.export`.
         limit_mib: that it had to keep to.
     """
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
+    figure, ((left, middle, right),) = panels((13, 3.8), 1, 3)
     compared = made.compared
     rows = [("by precision, localiser", compared.embedding[0]), ("by precision, detector", compared.embedding[1])]
     if (compared.apart > 0).any():
