@@ -57,7 +57,7 @@ class StageCache:
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
-        self._digests: dict[int, tuple[np.ndarray, bytes]] = {}
+        self._digests: dict[int, tuple[np.ndarray, str]] = {}
 
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
         """`function(*arguments)`, from the folder where it is there.
@@ -70,8 +70,7 @@ class StageCache:
         if self.folder is None:
             return function(*arguments)
         digest = hashlib.sha256(fingerprint() + f"{function.__module__}.{function.__qualname__}".encode())
-        for argument in arguments:
-            self._feed(digest, argument)
+        digest.update(json.dumps(_encode(arguments, self._array_digest, key=True)).encode())
         path = self.folder / f"{function.__name__.strip('_')}-{digest.hexdigest()}.npz"
         found, value = _load(path)
         if not found:
@@ -79,56 +78,34 @@ class StageCache:
             _store(path, value)
         return value
 
-    def _feed(self, digest: Any, value: Any) -> None:
-        if isinstance(value, np.ndarray):
-            known = self._digests.get(id(value))
-            if known is None:
-                own = hashlib.sha256(f"{value.dtype.str}{value.shape}".encode())
-                own.update(np.ascontiguousarray(value).tobytes())
-                known = self._digests[id(value)] = (value, own.digest())  # the reference keeps the id taken
-            digest.update(b"a" + known[1])
-        elif dataclasses.is_dataclass(value):
-            digest.update(f"d{type(value).__qualname__}(".encode())
-            for field in dataclasses.fields(value):
-                if field.metadata.get("hashed", True):
-                    digest.update(field.name.encode() + b"=")
-                    self._feed(digest, getattr(value, field.name))
-            digest.update(b")")
-        elif isinstance(value, (tuple, list)):
-            digest.update(b"l(")
-            for item in value:
-                self._feed(digest, item)
-            digest.update(b")")
-        elif isinstance(value, dict):
-            digest.update(b"m(")
-            for key in sorted(value):
-                digest.update(repr(key).encode())
-                self._feed(digest, value[key])
-            digest.update(b")")
-        elif value is None or isinstance(value, (bool, int, float, str, Path, np.generic)):
-            digest.update(f"s{type(value).__name__}{value!r};".encode())
-        else:
-            raise TypeError(f"a {type(value).__name__} cannot be hashed by content")
+    def _array_digest(self, array: np.ndarray) -> str:
+        if id(array) not in self._digests:
+            own = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+            own.update(np.ascontiguousarray(array).tobytes())
+            self._digests[id(array)] = (array, own.hexdigest())  # the reference keeps the id taken
+        return self._digests[id(array)][1]
 
 
-def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
-    """JSON tree of a value; arrays go to the list and leave their number."""
+def _encode(value: Any, of_array: Callable[[np.ndarray], int | str], key: bool = False) -> Any:
+    """JSON tree of a value, `of_array` in place of its arrays; for a `key` without what is not hashed, with types."""
     if isinstance(value, np.ndarray):
-        arrays.append(value)
-        return {"array": len(arrays) - 1}
+        return {"array": of_array(value)}
     if dataclasses.is_dataclass(value):
-        kind = type(value)
-        fields = {f.name: _encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
-        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": fields}
-    if isinstance(value, tuple):
-        return {"tuple": [_encode(v, arrays) for v in value]}
-    if isinstance(value, list):
-        return {"list": [_encode(v, arrays) for v in value]}
+        kind, fields = type(value), [f for f in dataclasses.fields(value) if not key or f.metadata.get("hashed", True)]
+        tree = {f.name: _encode(getattr(value, f.name), of_array, key) for f in fields}
+        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": tree}
+    if isinstance(value, (tuple, list)):
+        name = "tuple" if isinstance(value, tuple) and not key else "list"
+        return {name: [_encode(v, of_array, key) for v in value]}
+    if key and isinstance(value, dict):
+        return {"map": [[repr(k), _encode(value[k], of_array, key)] for k in sorted(value)]}
+    if key and (value is None or isinstance(value, (bool, int, float, str, Path, np.generic))):
+        return {type(value).__name__: repr(value)}
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, int, float, str)):
         return {"value": value}
-    raise TypeError(f"a {type(value).__name__} cannot be kept in the cache")
+    raise TypeError(f"a {type(value).__name__} cannot be {'hashed by content' if key else 'kept in the cache'}")
 
 
 def _decode(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -163,7 +140,12 @@ def _load(path: Path) -> tuple[bool, Any]:
 
 def _store(path: Path, value: Any) -> None:
     arrays: list[np.ndarray] = []
-    tree = np.frombuffer(json.dumps(_encode(value, arrays)).encode(), np.uint8)
+
+    def number(array: np.ndarray) -> int:
+        arrays.append(array)
+        return len(arrays) - 1
+
+    tree = np.frombuffer(json.dumps(_encode(value, number)).encode(), np.uint8)
     named = {f"a{i}": a for i, a in enumerate(arrays)}
     store(path, lambda partial: np.savez(partial, tree=tree, **named))  # pyright: ignore[reportArgumentType]
 
