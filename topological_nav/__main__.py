@@ -5,17 +5,24 @@ Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when 
 
 from __future__ import annotations
 
+import importlib
 import re
 import signal
 import sys
 from collections.abc import Sequence
 
-from interactive_nav_common.errors import UserError
-from topological_nav.commands import adapt, episodes, learning, maps
+from interactive_nav_common.errors import reports_errors
 from topological_nav.commands.parser import parser
 from topological_nav.errors import Stopped
 
+RUNS = {
+    **{"data": "learning.data", "train": "learning.train", "map": "maps.make_map", "navigate": "episodes.navigate"},
+    **{"evaluate": "episodes.evaluate", "adapt": "adapt.run", "export": "maps.export_runs"},
+}
+"""Command -> what runs it, in a module that is imported once the command is known: it is heavy."""
 
+
+@reports_errors("topological_nav")
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -23,19 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
     try:
-        run = {
-            "data": learning.data,
-            "train": learning.train,
-            "map": maps.make_map,
-            "navigate": episodes.navigate,
-            "evaluate": episodes.evaluate,
-            "adapt": adapt.run,
-            "export": maps.export_runs,
-        }
-        run[arguments.command](arguments)
-    except UserError as error:
-        print(f"topological_nav: {error}", file=sys.stderr)
-        return 2
+        module, _, name = RUNS[arguments.command].partition(".")
+        getattr(importlib.import_module(f"topological_nav.commands.{module}"), name)(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)
         return 128 + (stopped.args[0] if isinstance(stopped, Stopped) else signal.SIGINT)

@@ -14,7 +14,7 @@ PITCHES = ("up", "level", "down")
 """Order of a position's images by pitch."""
 RUNS = Path("runs/topological")
 """Where commands write and read when they are told no other place."""
-DATASET, DRIVES = RUNS / "data", RUNS / "drives"
+DATASET, DRIVES, ADAPTED = RUNS / "data", RUNS / "drives", RUNS / "adapted"
 PASSAGE_POLICY = "passage"
 """The local policy without weights of its own: straight on while the passage detector agrees, else turn."""
 

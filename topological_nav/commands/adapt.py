@@ -7,13 +7,21 @@ from pathlib import Path
 
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.records import read_metrics
 from interactive_nav_common.signals import stop_signals
+from topological_nav.adapt.adaptation import adapt_features, target_rooms
 from topological_nav.adapt.config import AdaptConfig
+from topological_nav.adapt.transfer import CONFIGURATIONS, collected_map, passage_configurations
+from topological_nav.commands.maps import keep_map
 from topological_nav.commands.progress import asked_by, say, tell_line
-from topological_nav.config import DATASET, PITCHES, RUNS
+from topological_nav.config import ADAPTED, DATASET, PITCHES
+from topological_nav.data.dataset import load_passages, load_rooms
+from topological_nav.data.domains import as_seen, preset
 from topological_nav.errors import Asked
-
-ADAPTED = RUNS / "adapted"
+from topological_nav.figures.maps import save
+from topological_nav.figures.transfer_figures import features_figure, passages_figure
+from topological_nav.learn.localise import in_words
+from topological_nav.weights.packaged import choose
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -29,8 +37,6 @@ def run(arguments: argparse.Namespace) -> None:
     _refuse_unused(arguments)
     arguments.data = arguments.data or DATASET
     arguments.target = arguments.target or arguments.data
-    from topological_nav.weights.packaged import choose
-
     needs = _NEEDS[arguments.what]
     chosen = choose(arguments.localiser, arguments.detector, needs=needs)
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
@@ -58,13 +64,6 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
 
 
 def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
-    from interactive_nav_common.records import read_metrics
-    from topological_nav.adapt.adaptation import adapt_features, target_rooms
-    from topological_nav.data.dataset import load_rooms
-    from topological_nav.figures.maps import save
-    from topological_nav.figures.transfer_figures import features_figure
-    from topological_nav.learn.localise import in_words
-
     out = arguments.out or ADAPTED / "features"
     results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, tell_line, should_stop)
     rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
@@ -77,13 +76,6 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
 
 
 def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
-    from interactive_nav_common.records import read_metrics
-    from topological_nav.adapt.transfer import CONFIGURATIONS, passage_configurations
-    from topological_nav.data.dataset import load_passages
-    from topological_nav.data.domains import as_seen, preset
-    from topological_nav.figures.maps import save
-    from topological_nav.figures.transfer_figures import passages_figure
-
     out = arguments.out or ADAPTED / "passages"
     results = passage_configurations(arguments.detector, arguments.target, out, config, tell_line, should_stop)
     images = load_passages(arguments.target).images
@@ -98,18 +90,9 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
 
 def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
     del should_stop
-    from topological_nav.adapt.transfer import collected_map
-    from topological_nav.figures.maps import map_figure, save
-    from topological_nav.maps.graph import save_map
-
     scene = Path(arguments.scene)
     out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"
-    built = collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config)
-    save_map(built.map, out)
-    save(map_figure(built), out.with_suffix(".png"))
-    for name, value in built.scores.items():
-        print(f"{name}: {value}")
-    print(f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges; drawn in {out.with_suffix('.png')}")
+    keep_map(collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config), out)
 
 
 _NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}

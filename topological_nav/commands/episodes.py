@@ -7,26 +7,29 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import write_text
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
 from topological_nav.commands.progress import bar, say, stopping
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
-
-if TYPE_CHECKING:
-    from topological_nav.evaluate.contest import Contest
+from topological_nav.evaluate.contest import Contest, contest_scenes
+from topological_nav.evaluate.rows import play_contest, tracks_of
+from topological_nav.evaluate.scores import console_table, differences, markdown, summary, where
+from topological_nav.figures.episode_figures import journeys_figure
+from topological_nav.figures.journey import drive_episode, film
+from topological_nav.figures.maps import save
+from topological_nav.weights.packaged import choose, fitting_map
 
 
 def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
     """The contest asked for; networks and maps that were not named are chosen, and maps that are nowhere made."""
-    from topological_nav.evaluate.contest import Contest
-
     contest = Contest(
         scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
         contenders=tuple(contenders),
@@ -40,9 +43,6 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     _refuse_unused(arguments, contest)
     if arguments.truth or not {"dense", "sparse"} & set(contenders):
         return contest
-    from interactive_nav.scenes.scene import load_scene
-    from topological_nav.weights.packaged import choose, fitting_map
-
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
     if chosen.told:
         say(chosen.told)
@@ -88,9 +88,6 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
 
 def navigate(arguments: argparse.Namespace) -> None:
     """Drives one episode and draws it."""
-    from topological_nav.figures.journey import drive_episode, film
-    from topological_nav.figures.maps import save
-
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
     refuse_unused(arguments, "batch", "in 'navigate', which drives one episode")
@@ -116,13 +113,6 @@ def navigate(arguments: argparse.Namespace) -> None:
 
 def evaluate(arguments: argparse.Namespace) -> None:
     """Plays episodes and scores them."""
-    from interactive_nav_common.files import write_text
-    from topological_nav.evaluate.contest import contest_scenes
-    from topological_nav.evaluate.rows import play_contest, tracks_of
-    from topological_nav.evaluate.scores import console_table, differences, markdown, summary, where
-    from topological_nav.figures.episode_figures import journeys_figure
-    from topological_nav.figures.maps import save
-
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
     if "ppo" not in names:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from interactive_nav_common.config import overridden, refuse_unused
+from interactive_nav_common.records import read_metrics
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.progress import asked_by, bar, stopping, tell_line
@@ -19,6 +20,15 @@ from topological_nav.config import (
     passage_config,
     room_config,
 )
+from topological_nav.data.dataset import make_dataset
+from topological_nav.data.folders import folder_bytes
+from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
+from topological_nav.drives.frames import embed_drives
+from topological_nav.drives.imitation import grid_table, train_grid, train_policy
+from topological_nav.figures.drive_figures import drives_figure, policy_figure
+from topological_nav.figures.maps import curves_figure, dataset_figure, save
+from topological_nav.learn.localise import in_words
+from topological_nav.learn.training import train as train_network
 
 TASKS = {"rooms": room_config, "passages": passage_config}
 
@@ -29,10 +39,6 @@ def data(arguments: argparse.Namespace) -> None:
         return _drives(arguments)
     config = overridden(DataConfig(), arguments.settings)
     out = arguments.out or DATASET
-    from topological_nav.data.dataset import make_dataset
-    from topological_nav.data.folders import folder_bytes
-    from topological_nav.figures.maps import dataset_figure, save
-
     with stop_signals() as stops, bar() as tell:
         header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, stopping(tell, stops))
     save(dataset_figure(out), out / "preview.png")
@@ -50,11 +56,6 @@ def data(arguments: argparse.Namespace) -> None:
 def _drives(arguments: argparse.Namespace) -> None:
     config = overridden(DriveConfig(), arguments.settings)
     out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
-    from topological_nav.data.folders import folder_bytes
-    from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
-    from topological_nav.figures.drive_figures import drives_figure
-    from topological_nav.figures.maps import save
-
     with stop_signals() as stops:
         with bar() as tell:
             drives = simulate_drives(scenes, out, config, stopping(tell, stops))
@@ -83,11 +84,6 @@ def train(arguments: argparse.Namespace) -> None:
     if config.init != "selfsup":
         refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
-    from interactive_nav_common.records import read_metrics
-    from topological_nav.figures.maps import curves_figure, save
-    from topological_nav.learn.localise import in_words
-    from topological_nav.learn.training import train as train_network
-
     with stop_signals() as stops:
         data = arguments.data or DATASET
         results = train_network(arguments.task, data, out, config, tell_line, asked_by(stops))
@@ -106,12 +102,6 @@ def _policy(arguments: argparse.Namespace) -> None:
     if arguments.grid:
         refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
-    from interactive_nav_common.records import read_metrics
-    from topological_nav.drives.frames import embed_drives
-    from topological_nav.drives.imitation import grid_table, train_grid, train_policy
-    from topological_nav.figures.drive_figures import policy_figure
-    from topological_nav.figures.maps import save
-
     with stop_signals() as stops:
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
         frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell_line, asked_by(stops))

@@ -10,13 +10,17 @@ from interactive_nav_common.config import overridden
 from interactive_nav_common.signals import stop_signals
 from topological_nav.commands.progress import bar, say, stopping
 from topological_nav.config import PASSAGE_POLICY, ExportConfig, MapConfig
+from topological_nav.figures.maps import map_figure, save
+from topological_nav.figures.transfer_figures import export_figure
+from topological_nav.maps.build import Built, build_map, forget
+from topological_nav.maps.graph import save_map
+from topological_nav.weights.export import export, size_lines
+from topological_nav.weights.packaged import choose
 
 
 def make_map(arguments: argparse.Namespace) -> None:
     """Builds a map and draws it."""
     config = overridden(MapConfig(), arguments.settings)
-    from topological_nav.weights.packaged import choose
-
     chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
     if chosen.said:
         say(chosen.said)
@@ -28,15 +32,16 @@ def build(
     scene: Path, localiser: Path, detector: Path, config: MapConfig, out: Path, ends: Sequence[int] | None = None
 ) -> None:
     """Makes a map, draws it and tells of it."""
-    from topological_nav.figures.maps import map_figure, save
-    from topological_nav.maps.build import build_map, forget
-    from topological_nav.maps.graph import save_map
-
     parts = out.with_name(f"{out.name}.parts")
     with stop_signals() as stops, bar() as tell:
         built = build_map(scene, localiser, detector, config, stopping(tell, stops), parts)
-    save_map(built.map, out)
+    keep_map(built, out, ends)
     forget(parts)
+
+
+def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None:
+    """Writes a map, draws it, with the way between two nodes where it is asked for, and tells of it."""
+    save_map(built.map, out)
     route = None
     if ends:
         route = built.map.plan(*ends)
@@ -54,10 +59,6 @@ def build(
 def export_runs(arguments: argparse.Namespace) -> None:
     """Writes finished runs as a small folder."""
     config = overridden(ExportConfig(), arguments.settings)
-    from topological_nav.figures.maps import save
-    from topological_nav.figures.transfer_figures import export_figure
-    from topological_nav.weights.export import export, size_lines
-
     with stop_signals() as stops, bar() as tell:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
         made = export(*runs, arguments.images, arguments.out, config, stopping(tell, stops))

@@ -9,8 +9,8 @@ from typing import Any
 from interactive_nav_common.config import settings_help
 from interactive_nav_common.words import add_words, read_commands
 from topological_nav.adapt.config import AdaptConfig
-from topological_nav.commands.adapt import ADAPTED
 from topological_nav.config import (
+    ADAPTED,
     DATASET,
     DRIVES,
     RUNS,
