@@ -19,7 +19,7 @@ from converters.bodies.alignment import Alignment
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject, name_objects, place_object
 from converters.bodies.physical import Physical, physical_properties, with_source
-from converters.bodies.placement import compare, upright
+from converters.bodies.placement import align_objects
 from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
@@ -121,18 +121,6 @@ def with_retrieved(
         cads=raw.cads | {r.cad.cad_id: r.cad for r in sure},
     )
     return added, {first + k: r.confidence for k, r in enumerate(sure)}
-
-
-def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
-    """Upright placements from the annotations, and the report that compares them with re-solved ones."""
-    placements, rows = [], []
-    for name, annotation in zip(name_objects(raw.annotations), raw.annotations, strict=True):
-        vertices = raw.cads[annotation.cad_id].vertices
-        pivot = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-        placed, tilt = upright(annotation.pose, pivot)
-        placements.append(placed)
-        rows.append(compare(annotation, placed, tilt, pivot, name))
-    return placements, rows
 
 
 def _structure_visual(
@@ -306,7 +294,9 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     with clock.stage("write"):
         visuals = tuple(own.mesh for own in drawn)
         lamps = tuple(dataclasses.replace(p, at=p.at - [0.0, 0.0, floor_height]) for p in raw.lamps)
-        parts = dataclasses.replace(settled.parts, structure_visual=structure, object_visuals=visuals, lamps=lamps)
+        windows = tuple(dataclasses.replace(w, middle=w.middle - [0.0, 0.0, floor_height]) for w in raw.windows)
+        seen = {"structure_visual": structure, "object_visuals": visuals, "lamps": lamps, "windows": windows}
+        parts = dataclasses.replace(settled.parts, **seen)
         write_scene(parts, folder)
         save_maps(maps, folder)
     with clock.stage("gates"):

@@ -16,7 +16,8 @@ from converters.bodies.alignment import (
     gross_outliers,
     solve_alignment,
 )
-from converters.records.raw import Annotation
+from converters.bodies.objects import name_objects
+from converters.records.raw import Annotation, RawScene
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 
 LYING_DEG = 15.0
@@ -114,3 +115,15 @@ def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, sym
     )
     scale = one.scale[[1, 0, 2]] if quarter_turns % 2 else one.scale
     return PoseDifference(float(np.linalg.norm(at[0] - at[1])), yaw, scale / other.scale)
+
+
+def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
+    """Upright placements from the annotations, and the report that compares them with re-solved ones."""
+    placements, rows = [], []
+    for name, annotation in zip(name_objects(raw.annotations), raw.annotations, strict=True):
+        vertices = raw.cads[annotation.cad_id].vertices
+        pivot = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        placed, tilt = upright(annotation.pose, pivot)
+        placements.append(placed)
+        rows.append(compare(annotation, placed, tilt, pivot, name))
+    return placements, rows

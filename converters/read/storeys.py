@@ -72,6 +72,7 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
                 given_map=storey.given_map,
                 storeys=(),
                 lamps=tuple(p for p in raw.lamps if storey_of(p.at[2], heights, 0.0) == k),
+                windows=tuple(w for w in raw.windows if storey_of(w.middle[2], heights, 0.0) == k),
                 picture=tuple(p for v, f in raw.picture for p in _cut(v, f, heights, k)),
                 warnings=(
                     *raw.warnings,

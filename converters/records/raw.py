@@ -134,6 +134,18 @@ class Lamp:
 
 
 @dataclasses.dataclass(frozen=True)
+class Window:
+    """A box that a window's opening fills."""
+
+    middle: np.ndarray
+    """(3,) scan frame, m."""
+    half: np.ndarray
+    """(3,) along the wall, across it and up, m."""
+    yaw: float
+    """Of the wall, rad."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RawScene:
     """Everything that a reader hands to the pipeline."""
 
@@ -154,6 +166,8 @@ class RawScene:
     picture: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     """Vertices (n, 3) and faces (m, 3) of the parts that a modelled structure is drawn with, in place of the scan."""
     lamps: tuple[Lamp, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    windows: tuple[Window, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    """Where the source says so."""
     warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """What the reader repaired or found missing, for scene.json."""
     attribution: str = dataclasses.field(default="", metadata=NOT_HASHED)

@@ -15,9 +15,10 @@ import numpy as np
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import Physical
 from converters.geometry.boxes import OrientedBox, least_turned
-from converters.records.raw import Lamp
+from converters.records.raw import Lamp, Window
 from converters.records.visual import VisualMesh
 from converters.write.texture import as_png, quantise, share_plain
+from interactive_nav_common.rotations import yaw_matrix
 
 TIMESTEP_S = 0.005
 DOOR_DAMPING = 2.0
@@ -67,6 +68,8 @@ class SceneParts:
     object_visuals: tuple[VisualMesh, ...] = ()
     """Body frame, one an object; empty: no visuals (the settling model)."""
     lamps: tuple[Lamp, ...] = ()
+    """World frame."""
+    windows: tuple[Window, ...] = ()
     """World frame."""
 
 
@@ -283,6 +286,10 @@ def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) ->
             quat=np.round(_quaternion(wall.rotation), 9),
             friction=[0.6, 0.005, 0.0001],
         )
+    for k, window in enumerate(parts.windows):  # of a group that viewers hide
+        quat = np.round(_quaternion(yaw_matrix(window.yaw)), 9)
+        place = {"pos": _tidy(window.middle), "size": _tidy(window.half), "quat": quat}
+        structure.add_site(name=f"window_{k}", type=mujoco.mjtGeom.mjGEOM_BOX, group=5, **place)
 
 
 def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:

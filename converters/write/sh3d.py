@@ -23,12 +23,20 @@ from converters.geometry.boxes import convex_hull
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import read_image, read_obj
 from converters.read.homes.sh3d import OURS
-from converters.read.homes.sh3d_models import HULLS
+from converters.read.homes.sh3d_models import GLASS, HULLS, PANE
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION
 from converters.records.visual import ColourCloud, TexturedMesh
-from converters.structure.walls import cover_rectangles
-from converters.write.sh3d_rooms import rooms_of
+from converters.write.sh3d_rooms import (
+    BESIDE_M,
+    SIDE_M,
+    THICK_M,
+    crossed,
+    gap_around,
+    merged_walls,
+    rooms_of,
+    wall_between,
+)
 from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
@@ -39,39 +47,19 @@ WALL_M = 1.8
 """What is built in and lower is furniture or a parapet: it bounds no room."""
 FRAME_M = 0.008
 """Of a door's frame, within the wall beside the leaf and above it."""
-GAP_M = 0.6
-"""A doorway may be so much wider than its leaf."""
-BESIDE_M = 0.08
-"""A leaf may hang so far beside the middle of its wall."""
-BEYOND_M, THICK_M = (0.01, 0.06, 0.11), (0.04, 0.4)
-"""So far beyond a gap's ends it is seen how thick the wall is, within these bounds; else it is `INNER_M`."""
-INNER_M, ROOM_M2, SLACK_RAD, TILT_RAD, FACING = 0.1, 0.5, 0.15, 0.01, 0.9
+ROOM_M2, SLACK_RAD, TILT_RAD, FACING = 0.5, 0.15, 0.01, 0.9
 IN_M = 0.002
 """Free faces are drawn so far back: those on the border of two cells of a map would fill both."""
+APART_M = 0.04
+"""Between the points at which the structure's colours are looked at."""
 WALL, FLOOR = "FFEDEAE4", "FFC8B9A0"
-SIDE_M, APART_M = 0.08, 0.04
-"""What shows a wall's face or a floor lies so near to it; its colours are looked at so far apart."""
 LEAF = "sweethome3d_opening_on_hinge_1"
+BAR_M = 0.05
+"""Of a window's frame, within its opening."""
 
 
 Place = Callable[[np.ndarray], np.ndarray]
 """(n, 3) points in one frame -> in another."""
-
-
-class Wall(NamedTuple):
-    """A straight wall, m."""
-
-    ends: np.ndarray  # (2, 2) of its middle line
-    thickness: float
-    height: float
-
-    def polygon(self) -> Any:
-        """Its footprint."""
-        return shapely.LineString(self.ends).buffer(self.thickness / 2, cap_style="flat")
-
-    def side(self, out: np.ndarray) -> Any:
-        """In plan what is nearest to the face that looks along (2,) unit `out`."""
-        return shapely.LineString(self.ends + self.thickness / 2 * out).buffer(SIDE_M, cap_style="flat")
 
 
 class Mesh(NamedTuple):
@@ -109,34 +97,6 @@ def export_sh3d(folder: Path, target: Path) -> list[str]:
     return told
 
 
-def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall]:
-    """Walls side by side, of boxes that overlap: (3,) centres, (3,) half sizes, m, and yaws, rad; high ones first."""
-    walls, groups = [], {}
-    for centre, half, yaw in boxes:
-        turn = round(yaw, 3)
-        at, flat = centre[:2] @ yaw_matrix(turn)[:2, :2], half[:2]
-        groups.setdefault(turn, []).append(np.round([*(at - flat), *(at + flat), centre[2] + half[2]], 4))
-    for turn, edges in groups.items():
-        x0, y0, x1, y1, top = np.array(edges).T
-        xs, ys = np.unique([x0, x1]), np.unique([y0, y1])
-        taken = np.zeros((len(ys) - 1, len(xs) - 1), bool)
-        for height in np.unique(top)[::-1]:
-            own = np.zeros_like(taken)
-            for k in np.flatnonzero(top == height):
-                rows, columns = ys.searchsorted([y0[k], y1[k]]), xs.searchsorted([x0[k], x1[k]])
-                own[slice(*rows), slice(*columns)] = True
-            own &= ~taken
-            taken |= own
-            for r0, r1, c0, c1 in cover_rectangles(own, own, disjoint=True):
-                low, high = np.array([xs[c0], ys[r0]]), np.array([xs[c1], ys[r1]])
-                along = int(np.argmax(high - low))
-                ends = np.tile((low + high) / 2, (2, 1))
-                ends[:, along] = low[along], high[along]
-                ends = ends @ yaw_matrix(turn)[:2, :2].T
-                walls.append(Wall(ends, float((high - low)[1 - along]), float(height)))
-    return walls
-
-
 class _Export:
     """A drawing in the making."""
 
@@ -165,7 +125,7 @@ class _Export:
         self.high = [w for w in self.walls if w.height > self.low_m]
         self.stands = shapely.union_all([w.polygon() for w in self.high])
         self.cloud = self._cloud()
-        told, doors, pieces = ["left out: windows, textures of walls and floors, lamps' light, and masses"], 0, 0
+        told, doors, pieces = ["left out: textures of walls and floors, lamps' light, and masses"], 0, 0
         if len(self.high) < len(self.walls):
             told.append("built-in furniture is drawn as low walls")
         bodies = [b for b in self.spec.bodies if b.name in category]
@@ -180,6 +140,9 @@ class _Export:
                 pieces += 1
                 self._piece(body, mesh, category[body.name])
                 told += [f"{body.name}: stands in no gap of a wall; drawn as a piece that does not turn"] * hinge
+        sites = [site for site in self.spec.sites if site.name.startswith("window_")]
+        windows = [site.name for site in sites if self._window(site)]
+        told += [f"left out: {site.name}, which lies in no wall" for site in sites if site.name not in windows]
         every = shapely.union_all([w.polygon() for w in self.walls])
         for k, wall in enumerate(self.walls):
             run = np.diff(wall.ends, axis=0)[0] / np.linalg.norm(wall.ends[1] - wall.ends[0])
@@ -207,7 +170,9 @@ class _Export:
                 self._add("point", room, x=x, y=y)
         ElementTree.indent(self.root)
         self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
-        count = f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {pieces} other things"
+        count = (
+            f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(windows)} windows, {pieces} other things"
+        )
         return [count, *told]
 
     def _cloud(self) -> ColourCloud:
@@ -317,12 +282,12 @@ class _Export:
             turn = math.remainder(yaw - rest, math.tau)
             if joint.range[0] - SLACK_RAD <= turn <= joint.range[1] + SLACK_RAD:
                 shut = hinge + yaw_matrix(turn)[:2, :2] @ (own @ middle)[:2]
-                gap = _gap(self.stands, shut, yaw_matrix(yaw)[:2, 0], length)
+                gap = gap_around(self.stands, shut, yaw_matrix(yaw)[:2, 0], length)
                 gaps += [] if gap is None else [(float(np.linalg.norm(gap[1] - gap[0])), yaw, gap)]
         if not gaps:
             return False
         wide, yaw, gap = min(gaps, key=lambda g: g[:2])
-        wall = _between(self.stands, gap, max(w.height for w in self.high))
+        wall = wall_between(self.stands, gap, max(w.height for w in self.high))
         self.walls.append(wall)
         back, centre = yaw_matrix(yaw), np.array([*wall.ends.mean(axis=0), 0.0])
 
@@ -346,6 +311,27 @@ class _Export:
         self._add("sash", door, **sash, width=length / width, startAngle=start, endAngle=end)
         return True
 
+    def _window(self, site: Any) -> bool:
+        """A pane in a frame that is as deep as the wall around it; False where there is no wall."""
+        at, (x, deep, up), yaw = np.array(site.pos), np.array(site.size), float(yaw_from_quat(site.quat))
+        across = yaw_matrix(yaw)[:2, 1]
+        walls = crossed(self.stands, at[:2], across, deep + BESIDE_M)
+        if not walls:
+            return False
+        y, high = min(float(np.abs(walls).max()), THICK_M[1]), 2 * up
+        sides = (-x, BAR_M - x, 0.0, high), (x - BAR_M, x, 0.0, high), (-x, x, 0.0, BAR_M), (-x, x, high - BAR_M, high)
+        pane, glass = convex_hull(_bar(-x, x, 0.0, high, IN_M)), io.BytesIO()
+        Image.fromarray(GLASS).save(glass, "PNG")
+        rest = "vt 0.5 0.5\n" + "\n".join(f"f {a}/1 {b}/1 {c}/1" for a, b, c in pane.faces + 1)
+        mesh = Mesh(pane.vertices, rest, glass.getvalue(), (site.name, ""), [])
+        model = self._model(site.name, lambda points: points, mesh, PANE, np.array([_bar(*s, y) for s in sides]))
+        box = np.array([[-x, -y, 0.0], [x, y, high]])
+        words = self._words("window", model, box, yaw, at - [0.0, 0.0, up])
+        self._add(
+            "doorOrWindow", movable="false", cutOutShape="M0,0 v1 h1 v-1 z", wallCutOutOnBothSides="true", **words
+        )
+        return True
+
 
 def _lines(vertices: np.ndarray) -> str:
     """An OBJ's, in cm and y up, of (n, 3) vertices in m and z up."""
@@ -355,31 +341,3 @@ def _lines(vertices: np.ndarray) -> str:
 def _bar(x0: float, x1: float, z0: float, z1: float, half: float) -> np.ndarray:
     """(8, 3) corners of an upright bar across a wall: four below, four above."""
     return np.array([(x, y, z) for z in (z0, z1) for x, y in ((x0, -half), (x1, -half), (x1, half), (x0, half))])
-
-
-def _gap(stands: Any, middle: np.ndarray, along: np.ndarray, length: float) -> np.ndarray | None:
-    """(2, 2) ends, in its direction, of the gap between walls in which a shut leaf stands; None where there is none."""
-    reach = along * (length + GAP_M)
-    band = shapely.LineString([middle - reach, middle + reach]).buffer(BESIDE_M, cap_style="flat")
-    parts = shapely.get_parts(shapely.intersection(band, stands))
-    runs = [(shapely.get_coordinates(part) - middle) @ along for part in parts]
-    start = max((r.max() for r in runs if r.mean() < 0), default=-math.inf)
-    end = min((r.min() for r in runs if r.mean() > 0), default=math.inf)
-    if not 0.8 * length < end - start < length + GAP_M:
-        return None
-    return middle + np.outer([start, end], along)
-
-
-def _between(stands: Any, ends: np.ndarray, height: float) -> Wall:
-    """The wall from (2,) end to (2,) end of a gap, as thick as the thicker one beside it."""
-    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    across, found = along[::-1] * [-1.0, 1.0], []
-    for end, out in ((ends[0], -along), (ends[1], along)):
-        for at in end + np.outer(BEYOND_M, out):
-            line = shapely.LineString([at - across, at + across])
-            for part in shapely.get_parts(shapely.intersection(line, stands)):
-                if shapely.distance(part, shapely.Point(at)) < BESIDE_M and THICK_M[0] <= part.length <= THICK_M[1]:
-                    middle = shapely.get_coordinates(part).mean(axis=0)
-                    found.append((part.length, float((middle - end) @ across)))
-    thick, off = max(found, default=(INNER_M, 0.0))
-    return Wall(ends + off * across, thick, height)

@@ -1,19 +1,108 @@
-"""The map of a scene in, the rooms of its drawing out: what doorways part."""
+"""Wall boxes and the map of a scene in; walls of its drawing, their gaps, and the rooms that doorways part, out."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 from scipy import ndimage
 
+from converters.structure.walls import cover_rectangles
+from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.schema import SceneMaps
 
 DOORWAY_M = 1.3
 """Floor that is narrower parts two rooms."""
 CORE_M2 = 0.1
 """What is wide enough for a room, and smaller than this, is a bay of one."""
+GAP_M = 0.6
+"""A doorway may be so much wider than its leaf."""
+BESIDE_M = 0.08
+"""A leaf may hang so far beside the middle of its wall."""
+BEYOND_M, THICK_M = (0.01, 0.06, 0.11), (0.04, 0.4)
+"""So far beyond a gap's ends it is seen how thick the wall is, within these bounds; else it is `INNER_M`."""
+INNER_M = 0.1
+SIDE_M = 0.08
+"""What shows a wall's face or a floor lies so near to it."""
+
+
+class Wall(NamedTuple):
+    """A straight wall, m."""
+
+    ends: np.ndarray  # (2, 2) of its middle line
+    thickness: float
+    height: float
+
+    def polygon(self) -> Any:
+        """Its footprint."""
+        return shapely.LineString(self.ends).buffer(self.thickness / 2, cap_style="flat")
+
+    def side(self, out: np.ndarray) -> Any:
+        """In plan what is nearest to the face that looks along (2,) unit `out`."""
+        return shapely.LineString(self.ends + self.thickness / 2 * out).buffer(SIDE_M, cap_style="flat")
+
+
+def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall]:
+    """Walls side by side, of boxes that overlap: (3,) centres, (3,) half sizes, m, and yaws, rad; high ones first."""
+    walls, groups = [], {}
+    for centre, half, yaw in boxes:
+        turn = round(yaw, 3)
+        at, flat = centre[:2] @ yaw_matrix(turn)[:2, :2], half[:2]
+        groups.setdefault(turn, []).append(np.round([*(at - flat), *(at + flat), centre[2] + half[2]], 4))
+    for turn, edges in groups.items():
+        x0, y0, x1, y1, top = np.array(edges).T
+        xs, ys = np.unique([x0, x1]), np.unique([y0, y1])
+        taken = np.zeros((len(ys) - 1, len(xs) - 1), bool)
+        for height in np.unique(top)[::-1]:
+            own = np.zeros_like(taken)
+            for k in np.flatnonzero(top == height):
+                rows, columns = ys.searchsorted([y0[k], y1[k]]), xs.searchsorted([x0[k], x1[k]])
+                own[slice(*rows), slice(*columns)] = True
+            own &= ~taken
+            taken |= own
+            for r0, r1, c0, c1 in cover_rectangles(own, own, disjoint=True):
+                low, high = np.array([xs[c0], ys[r0]]), np.array([xs[c1], ys[r1]])
+                along = int(np.argmax(high - low))
+                ends = np.tile((low + high) / 2, (2, 1))
+                ends[:, along] = low[along], high[along]
+                ends = ends @ yaw_matrix(turn)[:2, :2].T
+                walls.append(Wall(ends, float((high - low)[1 - along]), float(height)))
+    return walls
+
+
+def gap_around(stands: Any, middle: np.ndarray, along: np.ndarray, length: float) -> np.ndarray | None:
+    """(2, 2) ends, in its direction, of the gap between walls in which a shut leaf stands; None where there is none."""
+    reach = along * (length + GAP_M)
+    band = shapely.LineString([middle - reach, middle + reach]).buffer(BESIDE_M, cap_style="flat")
+    parts = shapely.get_parts(shapely.intersection(band, stands))
+    runs = [(shapely.get_coordinates(part) - middle) @ along for part in parts]
+    start = max((r.max() for r in runs if r.mean() < 0), default=-math.inf)
+    end = min((r.min() for r in runs if r.mean() > 0), default=math.inf)
+    if not 0.8 * length < end - start < length + GAP_M:
+        return None
+    return middle + np.outer([start, end], along)
+
+
+def crossed(stands: Any, at: np.ndarray, across: np.ndarray, near_m: float = BESIDE_M) -> list[np.ndarray]:
+    """(2,) m along (2,) unit `across` from (2,) `at`: where each wall begins and ends that the line meets near it."""
+    parts = shapely.get_parts(shapely.intersection(shapely.LineString([at - across, at + across]), stands))
+    ends = [np.sort((shapely.get_coordinates(part)[[0, -1]] - at) @ across) for part in parts]
+    return [end for end in ends if end[0] < near_m and end[1] > -near_m]
+
+
+def wall_between(stands: Any, ends: np.ndarray, height: float) -> Wall:
+    """The wall from (2,) end to (2,) end of a gap, as thick as the thicker one beside it."""
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    across, found = along[::-1] * [-1.0, 1.0], []
+    for end, out in ((ends[0], -along), (ends[1], along)):
+        for at in end + np.outer(BEYOND_M, out):
+            for low, high in crossed(stands, at, across):
+                if THICK_M[0] <= high - low <= THICK_M[1]:
+                    found.append((high - low, float((low + high) / 2 + (at - end) @ across)))
+    thick, off = max(found, default=(INNER_M, 0.0))
+    return Wall(ends + off * across, thick, height)
 
 
 def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: float) -> list[Any]:

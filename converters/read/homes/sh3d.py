@@ -157,7 +157,10 @@ class _Drawing:
         walls = read_walls(list(self._seen("wall")), self.base_m, self.source.note)
         pieces = list(self._pieces())
         check_count(self.source.root, len(walls) + len(pieces), DRAWN, "walls and pieces of furniture")
-        openings = [opening_of(e, self._base(e)) for e in pieces if e.tag == "doorOrWindow"]
+        cutting = [e for e in pieces if e.tag == "doorOrWindow"]
+        openings = [opening_of(e, self._base(e)) for e in cutting]
+        high = [number(e, "elevation", 0.0) / 100 > DOOR_M[0] for e in cutting]
+        windows = tuple(o.window() for o, above in zip(openings, high, strict=True) if above)
         parts = [part for e in pieces for part in self._piece(e)]
         for wall in walls:
             e = wall.element
@@ -198,7 +201,7 @@ class _Drawing:
             raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
         storeys = _storeys(sorted(floors_m))
         lamps = self._brightest(storeys)
-        return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps)
+        return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps, windows=windows)
 
     def _brightest(self, floors_m: tuple[float, ...]) -> tuple[Lamp, ...]:
         """Of each storey the brightest lamps, as many as pictures have room for."""

@@ -20,6 +20,7 @@ from converters.read.homes.sh3d_archive import called, metres, number, outline, 
 from converters.read.homes.sh3d_sheet import WHITE, Look, Sheet, fitted
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M
+from converters.records.raw import Window
 
 HEIGHT_M, LOW_M = 2.5, 1.2
 """Of a wall that says nothing; lower ones are built-in furniture to the map."""
@@ -159,6 +160,12 @@ class Opening:
     top_m: float
     shape: np.ndarray | None
     """(n, 2) in the unit square, y down; None: all of it."""
+
+    def window(self) -> Window:
+        """The box that it fills."""
+        sizes = np.array([self.width_m, shapely.area(self.footprint) / self.width_m, self.top_m - self.bottom_m])
+        middle = np.array([*self.middle, (self.bottom_m + self.top_m) / 2])
+        return Window(middle, sizes / 2, math.atan2(self.along[1], self.along[0]))
 
     def within(self, wall: Wall) -> Any:
         """What it cuts out of a wall, in (along the wall, above its base); None: nothing."""

@@ -16,11 +16,12 @@ from converters.__main__ import main
 from converters.pipeline import ConvertConfig, convert
 from converters.read.homes.sh3d import kind_of, read_sh3d
 from converters.read.homes.sh3d_archive import point
-from converters.write.sh3d import Wall, export_sh3d, merged_walls
-from interactive_nav_common.rotations import matrix_from_quat
+from converters.write.sh3d import export_sh3d
+from converters.write.sh3d_rooms import Wall, merged_walls
+from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
 from scenes_mjcf.schema import CATEGORIES, load_manifest, load_maps
 from tests.converters.read.homes.test_drawn_lamps import PLAIN
-from tests.converters.read.homes.test_sh3d import write_home
+from tests.converters.read.homes.test_sh3d import piece, write_home
 
 HOME = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
 DRAWN = HOME.parent / "drawn" / "flat"
@@ -33,7 +34,7 @@ def drawing(tmp_path_factory) -> Path:
     """A committed home with two doors, drawn."""
     path = tmp_path_factory.mktemp("drawn") / "apartment.sh3d"
     told = export_sh3d(HOME, path)
-    assert told[0] == "36 walls, 4 rooms, 2 doors, 7 other things"
+    assert told[0] == "36 walls, 4 rooms, 2 doors, 0 windows, 7 other things"
     return path
 
 
@@ -180,6 +181,10 @@ def test_the_example_is_what_its_drawing_becomes(tmp_path, hull_cache):
     assert len(rest) == 16 and np.abs(rest - found).max() < 0.01
     walls, same = (np.array([[*g.pos, *g.size] for g in spec.geoms if g.name.startswith("wall_")]) for spec in specs)
     assert walls.shape == same.shape == (23, 6) and np.abs(walls - same).max() < 0.01
+    export_sh3d(made.folder, tmp_path / "again.sh3d")
+    windows, back = ([np.array([*w.middle, *w.half[[0, 2]], w.yaw]) for w in read_sh3d(p).windows]
+                     for p in (DRAWN.with_suffix(".sh3d"), tmp_path / "again.sh3d"))  # fmt: skip
+    assert len(windows) == 3 and np.abs(np.subtract(windows, back)).max() < 0.01
 
 
 def test_overlapping_boxes_become_walls_side_by_side():
@@ -256,6 +261,36 @@ def test_colours_of_floors_and_walls_come_back(tmp_path):
     own = [wall for wall, line in lines[1].items() if stands.contains(line)]
     sides = np.array([rgb(wall.get(f"{side}SideColor")) for wall in own for side in ("left", "right")])
     assert len(sides) == 18 and np.abs(sides - rgb("FFEDEAE4")).max() <= 12  # all of the drawing's are
+
+
+def openings(folder: Path) -> np.ndarray:
+    """(n, 7) middle, half sizes (m) and direction (rad) of the windows of a scene."""
+    sites = [s for s in of_scene(folder).sites if s.name.startswith("window_")]
+    return np.array([[*s.pos, *s.size, yaw_from_quat(s.quat) % np.pi] for s in sites])
+
+
+def test_windows_come_back_where_they_were(tmp_path, hull_cache):
+    words = "angle='1.5707964' elevation='80' cutOutShape='M0,0 v1 h1 v-1 z'"
+    home = [*PLAIN, piece("Side", -5, 150, "80 10 120", words, tag="doorOrWindow")]
+    config = ConvertConfig(structure_texture=64)
+    made = convert(write_home(tmp_path / "two", home), tmp_path / "out", config, cache=hull_cache)
+    assert " 2 windows, " in export_sh3d(made.folder, tmp_path / "again.sh3d")[0]
+    drawn = [[1.0, 0.05, 1.4, 0.6, 0.03, 0.5, 0.0], [-0.05, -1.5, 1.4, 0.4, 0.06, 0.6, np.pi / 2]]
+    assert openings(made.folder) == pytest.approx(np.array(drawn), abs=1e-5)
+    back = convert(tmp_path / "again.sh3d", tmp_path / "back", config, cache=hull_cache)
+    assert {g.name for g in back.gates if not g.passed} == set()
+    off = np.abs(openings(back.folder) - drawn)
+    assert off[:, [0, 1, 2, 3, 5]].max() < 0.01 and np.degrees(off[:, 6]).max() < 1
+    scan = read_sh3d(tmp_path / "again.sh3d").scan
+    solid = trimesh.Trimesh(scan.vertices, scan.faces, process=False)
+    for x, y, z, wide, _, high, yaw in drawn:
+        along, across = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        for out, passes in ((-1.05, False), (-0.85, True), (0.0, True), (0.85, True), (1.05, False)):
+            for side, rise in ((out * wide, 0.0), (0.0, out * high)):
+                start = np.array([x, y, z + rise]) + side * along - 0.5 * across
+                hits = solid.ray.intersects_location([start], [across])[0]
+                depth = np.abs(hits[:, :2] @ across[:2] - np.array([x, y]) @ across[:2])
+                assert (depth.max() < 0.01) == passes, (yaw, out)  # a pane in the middle, and no wall before it
 
 
 def test_each_side_of_a_wall_has_its_own_colour(tmp_path, hull_cache):
