@@ -304,6 +304,7 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows))
         area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
         manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
+        manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3))
         save_manifest(manifest, folder)
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds, decomposed.worker_mib)
 

@@ -31,6 +31,8 @@ CLOSE_CELLS = 2
 """Gaps of up to twice this many cells in seen floor are floor."""
 MAX_HOLE_M2 = 4.0
 """Larger holes inside seen floor are not taken for floor."""
+BRIDGE_M = 1.2
+"""Unseen floor so wide between two pieces of it is floor."""
 MAX_CORNER_M2 = 0.5
 """Of unseen regions between floor and wall."""
 MIN_OBSTACLE_CELLS = 3
@@ -106,6 +108,8 @@ class FloorPlan:
     height_m: np.ndarray | None = None
     """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing is known.
     None: the wall's height everywhere."""
+    unseen_m2: float = 0.0
+    """Traversable floor that the scan does not show."""
 
 
 def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
@@ -184,6 +188,16 @@ def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) ->
     return result
 
 
+def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Adds unseen regions, up to `BRIDGE_M` wide, in which nothing stands and which part two pieces of floor."""
+    line = np.ones((1, round(BRIDGE_M / resolution_m) + 1))
+    between = ndimage.binary_closing(floor, line) | ndimage.binary_closing(floor, line.T)
+    pieces, _ = label_pieces(_drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2)), np.ones((3, 3)))
+    gaps, count = label_pieces(between & ~floor & ~occupied)
+    around = (np.unique(pieces[ndimage.binary_dilation(gaps == k, np.ones((3, 3)))]) for k in range(1, count + 1))
+    return floor | np.isin(gaps, [k for k, beside in enumerate(around, 1) if np.count_nonzero(beside) > 1])
+
+
 def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np.ndarray:
     """The pieces of floor that one may stand on: the largest, and others that are no insides of closed solids.
 
@@ -258,6 +272,8 @@ def make_floor_plan(
     # pose cuts) is no floor: it must connect to floor that was seen.
     floor = np.asarray(ndimage.binary_propagation(floor_seen & ~occupied, mask=closed & ~occupied), bool)
     floor = _fill_holes(floor, occupied, resolution_m)
+    if given is None and not exact:
+        floor = _bridge(floor, occupied, resolution_m)
     traversable = _drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2))
     traversable = _without_insides(traversable, shown, resolution_m)
     if not traversable.any():
@@ -266,7 +282,8 @@ def make_floor_plan(
             "check the floor's labels and height"
         )
     height, leaf = _heights(shown, occupied, 1 if exact else 5), swept & (~traversable if exact else occupied)
-    return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height)
+    unseen_m2 = float((traversable & ~floor_seen).sum()) * resolution_m**2
+    return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height, unseen_m2)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -188,6 +188,23 @@ def test_the_inside_of_a_closed_solid_is_not_free_and_a_room_of_its_own_is(yaw):
     assert free(3.5, 0.0) and free(-4.5, 2.5) and free(1.5, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("gap_m", "wall", "free_m2", "unseen_m2"),
+    [(0.6, False, 2 * 2.0 * 2.0 + 0.6 * 2.0, 1.2), (0.6, True, 8.0, 0.0), (1.6, False, 8.0, 0.0)],
+)
+def test_unseen_floor_between_two_pieces_is_bridged_where_nothing_stands(gap_m, wall, free_m2, unseen_m2):
+    parts = [
+        trimesh.creation.box((1.98, 1.98, 0.02)).apply_translation((s * (1 + gap_m / 2), 0, -0.01)) for s in (-1, 1)
+    ]
+    if wall:
+        parts.append(trimesh.creation.box((0.1, 2.2, 2.4)).apply_translation((0, 0, 1.2)))
+    whole = trimesh.util.concatenate(parts)
+    labels = np.where(np.arange(len(whole.vertices)) < 16, FLOOR, WALL)
+    plan = make_floor_plan(np.asarray(whole.vertices), np.asarray(whole.faces), labels, (), None, 0.0)
+    assert plan.traversable.sum() * 0.05**2 == pytest.approx(free_m2, abs=1e-9)
+    assert plan.unseen_m2 == pytest.approx(unseen_m2, abs=1e-9)
+
+
 def test_the_sources_map_adds_floor_that_the_scan_missed():
     vertices, faces, labels = tiny_raw.scan()
     middle = vertices[faces].mean(axis=1)
