@@ -7,6 +7,7 @@ movable obstacles; Stilman and Kuffner 2005, Interactive Gibson section II-D).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
@@ -120,6 +121,37 @@ class _SceneGrid:
         return int(np.clip(r, 0, self.shape[0] - 1)), int(np.clip(c, 0, self.shape[1] - 1))
 
 
+def grid_graph(
+    free: np.ndarray, cost: np.ndarray, step_m: float, moves: Iterable[tuple[int, int]], corners: bool = True
+) -> scipy.sparse.csr_matrix:
+    """Undirected graph of cells: a move is there where every cell that it crosses is free.
+
+    Args:
+        free: [rows, columns] bool.
+        cost: [rows, columns] of a metre; a move's is the mean of the cells that it crosses.
+        step_m: side of a cell.
+        moves: (row, column), one way each.
+        corners: the two cells beside a diagonal count in its mean.
+    """
+    rows, columns = free.shape
+    index, pad = np.arange(rows * columns).reshape(rows, columns), 3
+    open_, price = np.pad(free, pad), np.pad(cost, pad)
+    first, second, weight = [], [], []
+    for move in moves:
+        ok, mean, cells = np.ones(free.shape, bool), np.zeros(free.shape), crossed_cells(move)
+        priced = cells if corners or abs(move[0]) != abs(move[1]) else ((0, 0), move)
+        for r, c in cells:
+            part = (slice(pad + r, pad + r + rows), slice(pad + c, pad + c + columns))
+            ok &= open_[part]
+            mean += price[part] / len(priced) if (r, c) in priced else 0.0
+        at = np.nonzero(ok)
+        first.append(index[at])
+        second.append(index[at[0] + move[0], at[1] + move[1]])
+        weight.append(step_m * math.hypot(*move) * mean[at])
+    entries = (np.concatenate(weight), (np.concatenate(first), np.concatenate(second)))
+    return scipy.sparse.csr_matrix(entries, shape=(rows * columns,) * 2)
+
+
 class PathGrid:
     """Ways over one grid by Dijkstra over 16 moves; the graph is made once.
 
@@ -134,28 +166,8 @@ class PathGrid:
         if not self._any:
             return
         _, self._nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
-        self._index = index = np.arange(rows * columns).reshape(rows, columns)
-        sources, targets, weights = [], [], []
-        for dr, dc in MOVES:
-            r0, r1, c0, c1 = 0, rows - dr, max(0, -dc), columns - max(0, dc)
-            a = (slice(r0, r1), slice(c0, c1))
-            b = (slice(dr, rows), slice(c0 + dc, c1 + dc))
-            ok = free[a] & free[b]
-            mean = 0.5 * (cost[a] + cost[b])
-            through = np.zeros(mean.shape)
-            # The two cells in the middle of a knight's move, the two beside a diagonal.
-            for mr, mc in set(crossed_cells((dr, dc))) - {(0, 0), (dr, dc)}:
-                m = (slice(mr, mr + r1), slice(c0 + mc, c1 + mc))
-                ok = ok & free[m]
-                through = through + cost[m]
-            if abs(dr) + abs(dc) == 3:
-                mean = 0.5 * mean + 0.25 * through
-            sources.append(index[a][ok])
-            targets.append(index[b][ok])
-            weights.append(CELL_M * math.hypot(dr, dc) * mean[ok])
-        self._graph = scipy.sparse.csr_matrix(
-            (np.concatenate(weights), (np.concatenate(sources), np.concatenate(targets))), shape=(rows * columns,) * 2
-        )
+        self._index = np.arange(rows * columns).reshape(rows, columns)
+        self._graph = grid_graph(free, cost, CELL_M, MOVES, corners=False)
 
     def path(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
         """The cheapest one between two cells.

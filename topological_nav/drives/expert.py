@@ -10,17 +10,15 @@ scan sees, in the middle of its way, the robot stops, because no way round is pl
 
 from __future__ import annotations
 
-import math
-
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
-import scipy.sparse
 from scipy.sparse.csgraph import dijkstra
 
-from interactive_nav.geodesic import STENCIL, crossed_cells
+from interactive_nav.geodesic import STENCIL
+from interactive_nav.navigation.ways import grid_graph
 from interactive_nav_common.rotations import wrap_angle
 from topological_nav.config import ExpertConfig
 from topological_nav.scenes.space import FreeSpace
@@ -73,7 +71,8 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
         xy = np.asarray(space.origin_w) + np.stack([c, r], -1) * space.resolution_m
         return np.linalg.norm(xy - goals_w[:, None, None], axis=-1).astype(np.float32)
     cost = 1.0 + config.near_cost * np.clip(1.0 - room / config.near_m, 0.0, 1.0)
-    graph = _lattice(free, cost, space.resolution_m)
+    moves = [move for move in STENCIL if move > (0, 0)]  # the other way is the same edge
+    graph = grid_graph(free, cost, space.resolution_m, moves)
     _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
     column, row = space.inner_cells(goals_w).T
     source = nearest[0][row, column] * columns + nearest[1][row, column]
@@ -84,30 +83,6 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
         away, at = scipy.ndimage.distance_transform_edt(~known, return_indices=True)  # type: ignore[misc]
         out[i] = field[at[0], at[1]] + 4.0 * space.resolution_m * np.asarray(away)
     return out
-
-
-def _lattice(free: np.ndarray, cost: np.ndarray, step_m: float) -> scipy.sparse.csr_matrix:
-    """Undirected graph of cells: a move is there where every cell that it crosses is free, and costs their mean."""
-    rows, columns = free.shape
-    index = np.arange(rows * columns).reshape(rows, columns)
-    pad = 3
-    open_, price = np.pad(free, pad), np.pad(cost, pad)
-    first, second, weight = [], [], []
-    for dr, dc in STENCIL:
-        if (dr, dc) < (0, 0):
-            continue  # the other way is the same edge
-        ok, mean = np.ones(free.shape, bool), np.zeros(free.shape)
-        cells = crossed_cells((dr, dc))
-        for r, c in cells:
-            part = (slice(pad + r, pad + r + rows), slice(pad + c, pad + c + columns))
-            ok &= open_[part]
-            mean += price[part] / len(cells)
-        at = np.nonzero(ok)
-        first.append(index[at])
-        second.append(index[at[0] + dr, at[1] + dc])
-        weight.append(step_m * math.hypot(dr, dc) * mean[at])
-    entries = (np.concatenate(weight), (np.concatenate(first), np.concatenate(second)))
-    return scipy.sparse.csr_matrix(entries, shape=(rows * columns,) * 2)
 
 
 def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: jax.Array) -> jax.Array:

@@ -25,6 +25,7 @@ import optax
 
 from interactive_nav_common.config import to_dict
 from interactive_nav_common.files import write_text
+from interactive_nav_common.rows import markdown
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
 from topological_nav.drives.frames import Frames
@@ -307,10 +308,7 @@ def train_grid(
 
 def grid_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: a row for every alpha and lambda."""
-    lines = [
-        "| alpha | lambda | linear accuracy | macro F1 | angular accuracy | macro F1 | forward error | of no change |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    lines = []
     for row in rows:
         cells = [f"{row['alpha']:g}", f"{row['lambda']:g}"]
         if "test" in row:
@@ -319,5 +317,6 @@ def grid_table(rows: list[dict[str, Any]]) -> str:
             cells += [f"{test['forward']:.4f}", f"{test['no_change']:.4f}"]
         else:
             cells += ["none held out"] + [""] * 5
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append(cells)
+    scores = ("linear accuracy", "macro F1", "angular accuracy", "macro F1", "forward error", "of no change")
+    return markdown(("alpha", "lambda", *scores), lines)

@@ -8,12 +8,13 @@ A scene's intervals are over its episodes (Wilson's for shares, bootstrap for me
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
 from rich.table import Table
 
+from interactive_nav_common import rows as tables
 from interactive_nav_common.statistics import Contrast, Estimate, estimate, interval, welch
 
 SCORES = {
@@ -151,21 +152,18 @@ def console_table(lines: Sequence[Line]) -> Table:
         made.add_column(heading)
     for heading in SCORES.values():
         made.add_column(heading, justify="right")
-    _fill(lines, made.add_row)
+    for line in lines:
+        made.add_row(*_cells(line))
     return made
 
 
 def markdown(lines: Sequence[Line], compared: Sequence[Difference]) -> str:
     """For a file: the summary and the comparisons."""
-    heads = ["contender", "scene", "episodes", *SCORES.values()]
-    text = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    _fill(lines, lambda *cells: text.append("| " + " | ".join(cells) + " |"))
-    if compared:
-        text += ["", "| Compared | Score | Difference [95 % interval] |", "|---|---|---|"]
-        text += [f"| {d.compared} | {SCORES[d.score]} | {d} |" for d in compared]
-    return "\n".join(text) + "\n"
+    text = tables.markdown(("contender", "scene", "episodes", *SCORES.values()), map(_cells, lines))
+    header = ("Compared", "Score", "Difference [95 % interval]")
+    told = [(d.compared, SCORES[d.score], d) for d in compared]
+    return text + ("\n" + tables.markdown(header, told) if told else "")
 
 
-def _fill(lines: Sequence[Line], add: Callable[..., object]) -> None:
-    for line in lines:
-        add(line.contender, line.group, str(line.episodes), *(str(line.scores[name]) for name in SCORES))
+def _cells(line: Line) -> list[str]:
+    return [line.contender, line.group, str(line.episodes), *(str(line.scores[name]) for name in SCORES)]
