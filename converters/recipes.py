@@ -10,12 +10,12 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from converters.check.preview import preview
 from converters.generate import generate_building
-from converters.generate.design.config import NAMES, BuildingConfig, GenerationError
-from converters.generate.homes.config import OPTIONAL, SHARE_TOLERANCE, TIERS, HomeConfig, home_config, home_fields
+from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.homes.config import SHARE_TOLERANCE, TIERS, HomeConfig, home_config, home_fields
 from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from interactive_nav_common.config import Natural, nearest
@@ -94,24 +94,11 @@ def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> N
             )
 
 
-def _value(key: str, value: Any, default: Any, where: str) -> Any:
+def _value(value: Any, hint: Any, where: str) -> Any:
     """A setting as its field takes it: one number stands for a range of that number."""
-    if key in NAMES:
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            raise GenerationError(f"{where}: {key} is {value!r}, expected a list of names")
-        return tuple(value)
-    if value is None and key in OPTIONAL:
-        return None
-    if isinstance(default, str):
-        return value
-    if isinstance(default, tuple):
-        pair = value if isinstance(value, list) else [value, value]
-        if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
-            raise GenerationError(f"{where}: {key} is {value!r}, expected a number or [lowest, highest]")
-        return tuple(pair)
-    if not isinstance(value, int | float) or isinstance(value, bool) != isinstance(default, bool):
-        raise GenerationError(f"{where}: {key} is {value!r}, expected a {type(default).__name__}")
-    return value
+    ranges = [kind for kind in (hint, *get_args(hint)) if get_origin(kind) is tuple and ... not in get_args(kind)]
+    one = ranges and isinstance(value, int | float) and not isinstance(value, bool)
+    return _RECIPES.typed([value, value] if one else value, hint, where)
 
 
 def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> BuildingConfig | HomeConfig:
@@ -128,10 +115,10 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
     """
     if tier not in (SPARSE, *TIERS):
         raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
-    sparse = {f.name: f.default for f in dataclasses.fields(BuildingConfig) if f.name not in _FIXED}
+    sparse = {name: hint for name, hint in get_type_hints(BuildingConfig).items() if name not in _FIXED}
     fields = sparse if tier == SPARSE else home_fields()
     _refuse_unknown(settings, fields, where)
-    values = {key: _value(key, value, fields[key], where) for key, value in settings.items()}
+    values = {key: _value(value, fields[key], f"{where}: {key}") for key, value in settings.items()}
     try:
         if tier == SPARSE:
             return BuildingConfig(**values, models=MODELS[split]).validate()

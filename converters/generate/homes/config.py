@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.models.cad import HOME_TRAIN_MODELS
@@ -25,8 +25,6 @@ COUNTED = (
 
 ARTEFACTS = ("none", "phone")
 """Of a scan."""
-OPTIONAL = ("must_push_turtlebot", "must_push_fetch")
-"""Settings that may be None."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,10 +94,9 @@ other episodes."""
 
 
 def home_fields() -> dict[str, Any]:
-    """Every setting of a home by name, with its default: its own and those of its shell, but for the CAD models."""
-    own = {f.name: f.default for f in dataclasses.fields(HomeConfig) if f.name not in ("shell", "tier")}
-    shell = {f.name: getattr(SHELL, f.name) for f in dataclasses.fields(BuildingConfig)}
-    return own | {name: value for name, value in shell.items() if name not in ("models", *COUNTED)}
+    """Every setting of a home by name, with its type: its own and those of its shell, but for the CAD models."""
+    every = get_type_hints(BuildingConfig) | get_type_hints(HomeConfig)
+    return {name: hint for name, hint in every.items() if name not in ("shell", "tier", "models", *COUNTED)}
 
 
 def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = HOME_TRAIN_MODELS) -> HomeConfig:
