@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import glob
 import os
 import signal
@@ -47,21 +48,19 @@ def _on_sigterm(signum: int, frame: FrameType | None) -> None:
     raise Interrupted
 
 
+def _words_of(config: type[Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Fields of a dataclass of choices that the command line has."""
+    return {f.name: getattr(arguments, f.name) for f in dataclasses.fields(config) if f.name in arguments}
+
+
 def _convert(arguments: argparse.Namespace, console: Console) -> int:
     from converters.pipeline import ConvertConfig, convert_building
     from converters.recipes import check_conversion
 
     check_conversion(settings := read_words(arguments.settings, "object_faces=3000"), "settings")
-    config = ConvertConfig(
-        **{
-            word: getattr(arguments, word)
-            for word in ("format", "up", "unit", "mirror", "root", "split", "jobs", "library", "strict")
-        },
-        overwrite=arguments.overwrite,
-        auto_align=arguments.auto_align or arguments.segment or bool(arguments.library and not arguments.annotations),
-        timeout_s=arguments.timeout,
-        **{"seed": arguments.seed} | settings,
-    )
+    words = _words_of(ConvertConfig, arguments)
+    words["auto_align"] |= arguments.segment or bool(arguments.library and not arguments.annotations)
+    config = ConvertConfig(**words | settings)
     if arguments.into:
         refuse_unused(arguments, "--annotations", "with --into: a file is of one scan")
         return _convert_many(arguments, config, console)
@@ -114,18 +113,7 @@ def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console:
 def _object(arguments: argparse.Namespace, console: Console) -> int:
     from converters.single_object import ObjectConfig, convert_object
 
-    config = ObjectConfig(
-        category=arguments.category,
-        mass_kg=arguments.mass,
-        friction=arguments.friction,
-        scale=arguments.scale,
-        up=arguments.up,
-        seed=arguments.seed,
-        overwrite=arguments.overwrite,
-        source=arguments.within,
-        strict=arguments.strict,
-        timeout_s=arguments.timeout,
-    )
+    config = ObjectConfig(**_words_of(ObjectConfig, arguments) | {"source": arguments.within})
     warn = warn_once(console)
     made = convert_object(arguments.source, arguments.out, config, warn=warn)
     for warning in made["warnings"]:
