@@ -22,7 +22,7 @@ from rich.console import Console
 from converters.furniture_library import LIBRARY
 from converters.generating import GENERATING
 from converters.records.errors import StageFailed
-from converters.segmenting import SEGMENTING, label_unlabelled
+from converters.segmenting import SEGMENTING, label_unlabelled, propose_unproposed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
@@ -66,6 +66,8 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
         return _convert_many(arguments, config, console)
     if arguments.segment:
         label_unlabelled(arguments, console)
+        arguments.annotations = arguments.annotations or propose_unproposed(arguments, console)
+        config = dataclasses.replace(config, auto_align=arguments.annotations is None)
     warn = warn_once(console)
     with stage_progress(console) as report:
         results = convert_building(

@@ -25,9 +25,7 @@ from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.geometry.boxes import Hull
 from converters.geometry.simplify import simplify_open, simplify_parts
-from converters.propose.proposals import propose_instances
-from converters.propose.report import floor_of
-from converters.propose.retrieval import MIN_CONFIDENCE, as_annotation, auto_align, read_library, without_annotation
+from converters.propose.report import floor_of, with_retrieved
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
 from converters.read.storeys import split_storeys
@@ -102,27 +100,6 @@ class Converted:
     """Most memory that one of the decomposition's processes held."""
 
 
-def with_retrieved(
-    raw: RawScene, library_root: Path | None, progress: Callable[[float], None]
-) -> tuple[RawScene, dict[int, float]]:
-    """Adds what `--auto-align` finds to the annotations.
-
-    Returns:
-        The scene, and index of an added annotation -> its confidence.
-    """
-    proposals = propose_instances(raw.scan)
-    proposals = tuple(proposals[k] for k in without_annotation(proposals, raw.annotations, raw.cads))
-    found = auto_align(proposals, read_library(library_root), floor_of(raw), progress) if proposals else {}
-    sure = [found[k] for k in sorted(found) if found[k].confidence >= MIN_CONFIDENCE]
-    first = len(raw.annotations)
-    added = dataclasses.replace(
-        raw,
-        annotations=raw.annotations + tuple(as_annotation(r) for r in sure),
-        cads=raw.cads | {r.cad.cad_id: r.cad for r in sure},
-    )
-    return added, {first + k: r.confidence for k, r in enumerate(sure)}
-
-
 def _structure_visual(
     raw: RawScene,
     vertices_w: np.ndarray,
@@ -183,19 +160,6 @@ def _object_visuals(
     places = [k for of in models.values() for k in of]
     made = dict(zip(places, [one for some in drawn for one in some], strict=True))
     return [made[k] for k in range(len(annotated))]
-
-
-def _with_alignments(
-    raw: RawScene, config: ConvertConfig, progress: Callable[[float], None]
-) -> tuple[RawScene, list[Alignment], list[dict[str, Any]]]:
-    """The scene with what `--auto-align` adds, and `align_objects` of it."""
-    retrieved: dict[int, float] = {}
-    if config.auto_align:
-        raw, retrieved = with_retrieved(raw, config.library, progress)
-    placements, rows = align_objects(raw)
-    for k, confidence in retrieved.items():
-        rows[k]["retrieved_confidence"] = confidence
-    return raw, placements, rows
 
 
 def _decompose_models(
@@ -262,7 +226,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     """
     stages = StageCache(cache)
     with clock.stage("align") as progress:
-        raw, placements, rows = _with_alignments(raw, config, progress)
+        raw = with_retrieved(raw, config.library, progress) if config.auto_align else raw
+        placements, rows = align_objects(raw)
         floor_height = floor_of(raw)
         vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
         walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
@@ -283,9 +248,11 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         maps = SceneMaps(traversable, plan.grid.resolution_m, origin, floor_height)
     with clock.stage("settle"):
         unsettled = SceneParts(raw.name, annotated, physical, walls)
-        settled = settle(unsettled, bool(raw.picture)) if annotated else Settled(unsettled, (), ())
+        fitted = [k for k, a in enumerate(raw.annotations) if a.confidence is not None]
+        settled = settle(unsettled, bool(raw.picture), fitted) if annotated else Settled(unsettled, (), ())
     if settled.held:
-        return convert_raw(built_in(raw, _beside(settled, annotated)), folder, config, clock, cache)
+        found = dataclasses.replace(config, auto_align=False)
+        return convert_raw(built_in(raw, _beside(settled, annotated)), folder, found, clock, cache)
     with clock.stage("texture") as progress:
         structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
         progress(0.5)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 from rich.console import Console
 
 from converters.records.errors import SceneRejected
-from interactive_nav_common.files import write_arrays
+from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.progress import stage_progress
 
 
@@ -43,6 +44,28 @@ def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
         console.print(f"{target}: is there, kept", soft_wrap=True)
     else:
         _label(arguments, target, None, console)
+
+
+def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path | None:
+    """The next step of it: beside a mesh file, the models that fit, unless they are there; None for a folder."""
+    from converters.propose.proposals import as_scan2cad
+    from converters.propose.report import retrieve_sure
+    from converters.read.source import read_source
+
+    source = arguments.source
+    if not source.is_file():
+        return None
+    target = source.with_name(f"{source.stem}.proposals.json")
+    if target.exists():
+        console.print(f"{target}: is there, kept", soft_wrap=True)
+        return target
+    about = (getattr(arguments, word) for word in ("format", "strict", "up", "unit", "root", "mirror"))
+    with stage_progress(console) as report:
+        found, models = retrieve_sure(read_source(source, *about), arguments.library, lambda x: report("propose", x))
+    text = json.dumps(as_scan2cad(source.stem, found, dict(enumerate(models))), indent=1, allow_nan=False)
+    write_text(target, text + "\n")
+    console.print(f"{target}: {len(models)} models", soft_wrap=True)
+    return target
 
 
 def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, console: Console) -> None:

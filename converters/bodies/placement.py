@@ -62,6 +62,8 @@ def compare(
         "symmetry": annotation.symmetry,
         "tilt_removed_deg": round(math.degrees(tilt_rad), 3),
     }
+    if annotation.confidence is not None:
+        row["retrieved_confidence"] = annotation.confidence
     if tilt_rad > math.radians(LYING_DEG):
         degrees = math.degrees(tilt_rad)
         row["note"] = f"annotated {degrees:.0f} degrees off the vertical; placed upright, yaw is the only rotation"

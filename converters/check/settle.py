@@ -95,7 +95,9 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most
             data.qpos[free[body] : free[body] + 2] = start[body] + way * min(1.0, most_m / max(np.hypot(*way), 1e-9))
 
 
-def push_apart(parts: SceneParts, most_m: float = MAX_PUSH_M, hold: bool = False) -> tuple[SceneParts, dict[int, str]]:
+def push_apart(
+    parts: SceneParts, most_m: float = MAX_PUSH_M, hold: Collection[int] = ()
+) -> tuple[SceneParts, dict[int, str]]:
     """Slides free objects horizontally until neither hulls nor boxes cut walls or each other.
 
     Without dynamics, so that nothing flies.
@@ -103,7 +105,8 @@ def push_apart(parts: SceneParts, most_m: float = MAX_PUSH_M, hold: bool = False
     Args:
         parts: as annotated or drawn.
         most_m: farthest that an object slides.
-        hold: objects that still overlap stay where they were, the worst first, and the others are pushed anew.
+        hold: those of these objects that still overlap stay where they were, the worst first, and the others are
+            pushed anew.
 
     Returns:
         The objects apart, and those that were held: number -> what it overlaps.
@@ -117,9 +120,9 @@ def push_apart(parts: SceneParts, most_m: float = MAX_PUSH_M, hold: bool = False
         if parts.objects[k].hinge is None
     }
     held: dict[int, str] = {}
-    among = set(number)
+    among = {body for body, k in number.items() if k in hold}
     _push(model, data, free, most_m)
-    while hold:
+    while among:
         left = {pair: depth for pair, (depth, _) in _overlaps(model, data, among).items() if depth > OVERLAP_M}
         if not left:
             break
@@ -167,18 +170,20 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
     return _with_poses(parts, model, data)
 
 
-def settle(parts: SceneParts, drawn: bool = False) -> Settled:
+def settle(parts: SceneParts, drawn: bool = False, fitted: Collection[int] = ()) -> Settled:
     """Sets objects on the floor, pushes them apart, then lets boxes and after them hulls come to rest.
 
     Args:
         parts: with the objects where they were annotated.
         drawn: they were drawn there: they slide by `DRAWN_PUSH_M` at most, and what does not part is `held`. If
             anything is, nothing else is done.
+        fitted: numbers of those that no person put there: what of them does not part is `held`, too.
 
     Raises:
         StageFailed: the simulation diverged.
     """
-    result, held = push_apart(_on_floor(parts), DRAWN_PUSH_M if drawn else MAX_PUSH_M, drawn)
+    hold = range(len(parts.objects)) if drawn else fitted
+    result, held = push_apart(_on_floor(parts), DRAWN_PUSH_M if drawn else MAX_PUSH_M, hold)
     if not held:
         result = _simulate(result, "box", SETTLE_S)
         result = _simulate(result, "hull", SETTLE_S)

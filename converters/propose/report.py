@@ -19,11 +19,15 @@ from shapely import MultiPoint
 from converters.bodies.alignment import apply_alignment
 from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_corners, box_iou, propose_instances
 from converters.propose.retrieval import (
+    MIN_CONFIDENCE,
     Comparison,
     Retrieval,
     annotated_vertices,
+    as_annotation,
     auto_align,
     compare_retrieval,
+    read_library,
+    without_annotation,
 )
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, CadModel, RawScene
@@ -49,6 +53,27 @@ def floor_of(raw: RawScene) -> float:
     """Height of the floor in the scan frame, m."""
     given = raw.floor_height_m
     return given if given is not None else fit_floor(raw.scan.vertices, raw.scan.faces, raw.scan.labels).height_m
+
+
+def retrieve_sure(
+    raw: RawScene, library_root: Path | None, progress: Callable[[float], None]
+) -> tuple[tuple[Proposal, ...], tuple[Retrieval, ...]]:
+    """Furniture without an annotation, and the model that a library has for each, as far as that is sure."""
+    found = propose_instances(raw.scan)
+    found = tuple(found[k] for k in without_annotation(found, raw.annotations, raw.cads))
+    retrieved = auto_align(found, read_library(library_root), floor_of(raw), progress) if found else {}
+    sure = [k for k in sorted(retrieved) if retrieved[k].confidence >= MIN_CONFIDENCE]
+    return tuple(found[k] for k in sure), tuple(retrieved[k] for k in sure)
+
+
+def with_retrieved(raw: RawScene, library_root: Path | None, progress: Callable[[float], None]) -> RawScene:
+    """Adds to the annotations what `retrieve_sure` finds."""
+    _, sure = retrieve_sure(raw, library_root, progress)
+    return dataclasses.replace(
+        raw,
+        annotations=raw.annotations + tuple(as_annotation(r) for r in sure),
+        cads=raw.cads | {r.cad.cad_id: r.cad for r in sure},
+    )
 
 
 def _nearest_proposal(raw: RawScene, proposals: tuple[Proposal, ...], k: int) -> int | None:

@@ -285,7 +285,10 @@ def as_annotation(found: Retrieval) -> Annotation:
     matrix = np.eye(4)
     matrix[:3, :3] = yaw_matrix(found.pose.yaw) * found.pose.scale
     matrix[:3, 3] = found.pose.translation
-    return Annotation(found.cad.category, found.cad.cad_id, matrix, "__SYM_NONE", np.zeros((0, 3)), np.zeros((0, 3)))
+    none = np.zeros((0, 3))
+    return Annotation(
+        found.cad.category, found.cad.cad_id, matrix, "__SYM_NONE", none, none, confidence=found.confidence
+    )
 
 
 MIN_CONFIDENCE = 0.2

@@ -62,6 +62,13 @@ def _hinge(model: dict[str, Any], where: str) -> ScannedHinge | None:
     return ScannedHinge(origin, float(np.sign(axis[2])), (low, high))
 
 
+def _confidence(model: dict[str, Any]) -> float | None:
+    value = model.get("proposal", {}).get("retrieval_confidence")
+    if value is not None and not 0 <= float(value) <= 1:
+        raise ValueError(f"retrieval_confidence is {value}, not in [0, 1]")
+    return None if value is None else float(value)
+
+
 def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:
     """Turns the decoded list of one scan into records.
 
@@ -106,6 +113,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
                         keypoints_cad=cad_points[:count],
                         keypoints_scan=scan_points[:count],
                         hinge=_hinge(model, where),
+                        confidence=_confidence(model),
                     ),
                 )
             )

@@ -101,6 +101,8 @@ class Annotation:
     keypoints_scan: np.ndarray
     """(k, 3) scan frame, m."""
     hinge: ScannedHinge | None = None
+    confidence: float | None = None
+    """Of a model that was retrieved and fitted; None: somebody put it there."""
 
 
 @dataclasses.dataclass(frozen=True)

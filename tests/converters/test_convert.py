@@ -20,10 +20,13 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.check.gates import LIMITS
-from converters.check.settle import settle
+from converters.check.settle import push_apart, settle
 from converters.clock import STAGES
+from converters.geometry.boxes import OrientedBox
 from converters.pipeline import ConvertConfig, convert
 from converters.read.files import read_obj
+from converters.read.homes.parts import built_in
+from converters.read.source import read_source
 from converters.records.errors import SceneRejected
 from converters.records.gate import Limit
 from converters.structure.floor import LIFT_M
@@ -198,6 +201,32 @@ def test_settling_parts_two_objects_that_overlap(tiny_scene):
     assert max(settled.displacement_m) < 0.4
     heights = [o.position_w[2] for o in settled.parts.objects]
     np.testing.assert_allclose(heights, 0.0, atol=0.005)
+
+
+def test_a_fitted_model_that_does_not_part_is_held_and_an_annotated_one_is_not(tiny_scene):
+    parts = tiny_scene[1].settled.parts
+    basket = parts.objects[1]  # 0.3 m wide, in a gap of 0.2 m
+    walls = tuple(
+        OrientedBox(np.array([basket.position_w[0] + x, basket.position_w[1], 0.5]), np.eye(3), np.array([0.1, 2, 0.5]))
+        for x in (-0.2, 0.2)
+    )
+    squeezed = dataclasses.replace(parts, objects=(basket,), physical=parts.physical[1:], walls=walls)
+    settled = settle(squeezed, fitted=(0,))
+    assert settled.held == {0: "structure"} and settled.displacement_m == (0.0,)
+    assert push_apart(squeezed)[1] == {}
+    open_side = settle(dataclasses.replace(squeezed, walls=walls[:1]), fitted=(0,))
+    # The wall's face is 0.1 m from the basket's middle, and it was 0.05 m in it.
+    assert not open_side.held and open_side.displacement_m[0] == pytest.approx(0.05, abs=0.005)
+
+
+def test_a_scan_without_a_fitted_model_says_so(gibson_raw):
+    raw = read_source(gibson_raw)
+    rest = built_in(raw, {1: "a wall, or what is built in"})
+    assert rest.annotations == raw.annotations[:1] and set(rest.cads) == {"table-a"}
+    assert rest.warnings[-1] == (
+        "1 pieces cannot be parted from what they stand in, and are built in: basket-a "
+        "(from a wall, or what is built in)"
+    )
 
 
 def test_commands_and_their_exit_codes(tiny_scene, tmp_path, capsys):

@@ -158,12 +158,19 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
 
 
 def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
-    """A home of parts in which some of its pieces are structure, as they stand.
+    """A source in which some of its pieces are structure, as they stand; a scan shows them already.
 
     Args:
-        raw: made by `home`.
+        raw: of `home`, or a scan.
         beside: number of an annotation -> what it cannot be parted from.
     """
+    told = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
+    words = f"{len(told)} pieces cannot be parted from what they stand in, and are built in: {', '.join(told)}"
+    stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)
+    cads = {a.cad_id: raw.cads[a.cad_id] for a in stay}
+    rest = dataclasses.replace(raw, annotations=stay, cads=cads, warnings=(*raw.warnings, words))
+    if not raw.picture:
+        return rest
     texture = raw.scan.texture
     shells = []
     for k in beside:
@@ -173,11 +180,8 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
     mesh = with_own_corners(join_meshes(*shells))
     whole = join_meshes(TexturedMesh(raw.scan.vertices, raw.scan.faces, raw.scan.corner_uv, texture), mesh)
     fresh = len(whole.vertices) - len(raw.scan.vertices)
-    told = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
-    words = f"{len(told)} pieces cannot be parted from what they stand in, and are built in: {', '.join(told)}"
-    stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)
     return dataclasses.replace(
-        raw,
+        rest,
         scan=dataclasses.replace(
             raw.scan,
             vertices=whole.vertices,
@@ -187,10 +191,7 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
             corner_uv=whole.corner_uv,
             texture=whole.texture,
         ),
-        cads={a.cad_id: raw.cads[a.cad_id] for a in stay},
-        annotations=stay,
         picture=raw.picture + tuple((shell.vertices, shell.faces) for shell in shells),
-        warnings=(*raw.warnings, words),
     )
 
 

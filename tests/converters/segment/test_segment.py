@@ -13,6 +13,8 @@ import trimesh
 
 from converters.__main__ import main
 from converters.generate import GenerationError
+from converters.propose.proposals import scan2cad_trs
+from converters.propose.retrieval import read_library
 from converters.read.meshes import labels_beside
 from converters.read.source import read_source
 from converters.records.errors import SceneRejected
@@ -210,6 +212,30 @@ def test_one_command_makes_a_scene_of_an_unlabelled_mesh_by_the_packaged_weights
     before = labels_beside(room).read_bytes()
     main(["convert", str(room), str(tmp_path / "scene"), "--segment", "--overwrite"])
     assert "is there, kept" in capsys.readouterr().out and labels_beside(room).read_bytes() == before
+
+
+def test_models_that_one_command_fitted_are_kept_and_edited(room, tmp_path, capsys):
+    floor_m = float(read_source(room).scan.vertices[:, 2].min())
+    np.savez(labels_beside(room), label=np.where(read_source(room).scan.vertices[:, 2] < floor_m + 0.05, 2, 1))
+    words = ["convert", str(room), str(tmp_path / "scene"), "--segment", "--overwrite"]
+    main(words)
+    kept = room.with_name(f"{room.stem}.proposals.json")
+    (scan,) = json.loads(kept.read_text())
+    assert scan["aligned_models"] == [] and f"{kept.name}: 0 models" in capsys.readouterr().out.replace("\n", "")
+    chair = read_library(None)["Scopia_kids_desk_chair"]
+    trs = scan2cad_trs(np.ones(3), 0.3, np.array([0.2, -0.1, floor_m - chair.vertices[:, 2].min()]))
+    model = {"catid_cad": "03001627", "id_cad": chair.cad_id, "trs": trs, "proposal": {"retrieval_confidence": 0.5}}
+    edited = json.dumps([scan | {"aligned_models": [model]}])
+    kept.write_text(edited)
+    main(words)
+    made = json.loads((tmp_path / "scene" / "scene.json").read_text())
+    assert kept.read_text() == edited and f"{kept.name}: is there, kept" in capsys.readouterr().out.replace("\n", "")
+    (row,) = made["alignment"]
+    assert (row["cad_id"], row["retrieved_confidence"]) == (chair.cad_id, 0.5) and row["settle_shift_m"] < 0.02
+    for wrong in (2.0, float("nan"), "much"):
+        model["proposal"] = {"retrieval_confidence": wrong}
+        kept.write_text(json.dumps([scan | {"aligned_models": [model]}]))
+        assert main(words) == 2 and "aligned_models[0]" in capsys.readouterr().err
 
 
 @pytest.mark.slow
