@@ -286,9 +286,7 @@ def as_annotation(found: Retrieval) -> Annotation:
     matrix[:3, :3] = yaw_matrix(found.pose.yaw) * found.pose.scale
     matrix[:3, 3] = found.pose.translation
     none = np.zeros((0, 3))
-    return Annotation(
-        found.cad.category, found.cad.cad_id, matrix, "__SYM_NONE", none, none, confidence=found.confidence
-    )
+    return Annotation(found.cad.category, found.cad.cad_id, matrix, "__SYM_NONE", none, none, None, found.confidence)
 
 
 MIN_CONFIDENCE = 0.2

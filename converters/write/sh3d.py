@@ -27,16 +27,7 @@ from converters.read.homes.sh3d_models import GLASS, HULLS, PANE
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION
 from converters.records.visual import ColourCloud, TexturedMesh
-from converters.write.sh3d_rooms import (
-    BESIDE_M,
-    SIDE_M,
-    THICK_M,
-    crossed,
-    gap_around,
-    merged_walls,
-    rooms_of,
-    wall_between,
-)
+from converters.write.sh3d_rooms import SIDE_M, gap_around, half_wall, merged_walls, rooms_of, wall_between
 from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
@@ -314,11 +305,9 @@ class _Export:
     def _window(self, site: Any) -> bool:
         """A pane in a frame that is as deep as the wall around it; False where there is no wall."""
         at, (x, deep, up), yaw = np.array(site.pos), np.array(site.size), float(yaw_from_quat(site.quat))
-        across = yaw_matrix(yaw)[:2, 1]
-        walls = crossed(self.stands, at[:2], across, deep + BESIDE_M)
-        if not walls:
+        y, high = half_wall(self.stands, at[:2], yaw_matrix(yaw)[:2, 1], deep), 2 * up
+        if y is None:
             return False
-        y, high = min(float(np.abs(walls).max()), THICK_M[1]), 2 * up
         sides = (-x, BAR_M - x, 0.0, high), (x - BAR_M, x, 0.0, high), (-x, x, 0.0, BAR_M), (-x, x, high - BAR_M, high)
         pane, glass = convex_hull(_bar(-x, x, 0.0, high, IN_M)), io.BytesIO()
         Image.fromarray(GLASS).save(glass, "PNG")

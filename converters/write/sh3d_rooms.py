@@ -85,11 +85,17 @@ def gap_around(stands: Any, middle: np.ndarray, along: np.ndarray, length: float
     return middle + np.outer([start, end], along)
 
 
-def crossed(stands: Any, at: np.ndarray, across: np.ndarray, near_m: float = BESIDE_M) -> list[np.ndarray]:
+def _crossed(stands: Any, at: np.ndarray, across: np.ndarray, near_m: float = BESIDE_M) -> list[np.ndarray]:
     """(2,) m along (2,) unit `across` from (2,) `at`: where each wall begins and ends that the line meets near it."""
     parts = shapely.get_parts(shapely.intersection(shapely.LineString([at - across, at + across]), stands))
     ends = [np.sort((shapely.get_coordinates(part)[[0, -1]] - at) @ across) for part in parts]
     return [end for end in ends if end[0] < near_m and end[1] > -near_m]
+
+
+def half_wall(stands: Any, at: np.ndarray, across: np.ndarray, deep_m: float) -> float | None:
+    """How far the wall about a window, so deep to either side of (2,) `at`, reaches from there; None without one."""
+    ends = _crossed(stands, at, across, deep_m + BESIDE_M)
+    return min(float(np.abs(ends).max()), THICK_M[1]) if ends else None
 
 
 def wall_between(stands: Any, ends: np.ndarray, height: float) -> Wall:
@@ -98,7 +104,7 @@ def wall_between(stands: Any, ends: np.ndarray, height: float) -> Wall:
     across, found = along[::-1] * [-1.0, 1.0], []
     for end, out in ((ends[0], -along), (ends[1], along)):
         for at in end + np.outer(BEYOND_M, out):
-            for low, high in crossed(stands, at, across):
+            for low, high in _crossed(stands, at, across):
                 if THICK_M[0] <= high - low <= THICK_M[1]:
                     found.append((high - low, float((low + high) / 2 + (at - end) @ across)))
     thick, off = max(found, default=(INNER_M, 0.0))

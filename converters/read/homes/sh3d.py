@@ -159,8 +159,8 @@ class _Drawing:
         check_count(self.source.root, len(walls) + len(pieces), DRAWN, "walls and pieces of furniture")
         cutting = [e for e in pieces if e.tag == "doorOrWindow"]
         openings = [opening_of(e, self._base(e)) for e in cutting]
-        high = [number(e, "elevation", 0.0) / 100 > DOOR_M[0] for e in cutting]
-        windows = tuple(o.window() for o, above in zip(openings, high, strict=True) if above)
+        windows = tuple(o.window() for e, o in zip(cutting, openings, strict=True)
+                        if number(e, "elevation", 0.0) / 100 > DOOR_M[0])  # fmt: skip
         parts = [part for e in pieces for part in self._piece(e)]
         for wall in walls:
             e = wall.element
