@@ -13,6 +13,7 @@ import glob
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -181,9 +182,36 @@ def _propose(arguments: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _annotate(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.annotate.browser import Page
+    from converters.annotate.guard import guarded_server
+    from converters.annotate.session import Store, start
+    from converters.propose.proposals import propose_instances
+    from converters.propose.retrieval import read_library
+    from converters.read.source import read_source
+    from interactive_nav_common.locks import alone_in
+
+    with alone_in(arguments.output):
+        raw = read_source(arguments.source, arguments.format, up=arguments.up, unit=arguments.unit)
+        own = arguments.source if (arguments.source / "cad").is_dir() else None
+        store, proposals = Store(arguments.output, read_library(arguments.library or own)), propose_instances(raw.scan)
+        session = store.save(store.open(raw, lambda: start(raw, proposals)))
+        server, address = guarded_server(arguments.host, arguments.port, raw.name)
+        page = Page(server, store, session, raw, proposals)
+        console.print(f"{address} (Ctrl-C ends it; every action is saved)", soft_wrap=True, highlight=False)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+        server.stop()
+    states = [item.state for item in page.session.items]
+    told = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
+    console.print(f"{arguments.output}: {told}", soft_wrap=True)
+    return 0
+
+
 RUNS: dict[str, Any] = {
     "convert": _convert,
     "propose": _propose,
+    "annotate": _annotate,
     "object": _object,
     "check": _check,
     **GENERATING,

@@ -116,8 +116,7 @@ class Session:
         """Adds a point; a second one on a side whose last point has no partner yet takes that one's place."""
         own, other = (self.item.scan, self.item.model)[:: 1 if side == "scan" else -1]
         kept = own[:-1] if len(own) > len(other) else own
-        x, y, z = np.round(np.asarray(point, float), 6).tolist()
-        return self.changed(**{side: (*kept, (x, y, z))}, state="open")
+        return self.changed(**{side: (*kept, _point(point))}, state="open")
 
     def accepted(self) -> Session:
         """Accepts the fit and goes on to the next open object.
@@ -139,10 +138,13 @@ class Session:
         order = [(self.at + k) % len(self.items) for k in range(len(self.items))]
         return dataclasses.replace(self, at=next((k for k in order if self.items[k].state == "open"), self.at))
 
+    def at_object(self, index: int) -> Session:
+        """Goes to an object."""
+        return dataclasses.replace(self, at=index)
+
     def added(self, category: str, centre: np.ndarray) -> Session:
         """Adds an object that nobody proposed, and works on it."""
-        x, y, z = np.round(centre, 4).tolist()
-        item = Item(category, (x, y, z), (1.0, 1.0, 1.0), 0.0, 0)
+        item = Item(category, _point(centre), (1.0, 1.0, 1.0), 0.0, 0)
         undo = (*self.undo, (len(self.items), None))[-MAX_UNDO:]
         return dataclasses.replace(self, items=(*self.items, item), at=len(self.items), undo=undo)
 
@@ -156,6 +158,12 @@ class Session:
         return dataclasses.replace(self, items=tuple(items), at=at, undo=self.undo[:-1])
 
 
+def _point(values: np.ndarray) -> Point:
+    """Rounded to 1 um."""
+    x, y, z = np.round(np.asarray(values, float), 6).tolist()
+    return x, y, z
+
+
 def scan_sha256(raw: RawScene) -> str:
     """Digest of the scan's vertices."""
     return hashlib.sha256(np.ascontiguousarray(raw.scan.vertices, np.float64).tobytes()).hexdigest()
@@ -163,10 +171,7 @@ def scan_sha256(raw: RawScene) -> str:
 
 def start(raw: RawScene, proposals: tuple[Proposal, ...]) -> Session:
     """A session in which nothing has been said yet."""
-    items = [
-        Item(p.category, *(tuple(np.round(v, 4).tolist()) for v in (p.centre, p.extent_m)), round(p.yaw, 6), p.label)
-        for p in proposals
-    ]
+    items = [Item(p.category, _point(p.centre), _point(p.extent_m), round(p.yaw, 6), p.label) for p in proposals]
     return Session(raw.name, scan_sha256(raw), tuple(items))
 
 

@@ -1,0 +1,289 @@
+"""The page in the browser (viser): one scene and one set of words for everybody who has it open.
+
+All that was said is in the `Session`, saved before it is shown: a page that goes away loses nothing.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from converters.annotate.session import Item, Session, Store, step_of
+from converters.annotate.view import THUMBNAIL, View, around, by_size, coloured, hit, painted, thumbnail, view_of
+from converters.bodies.alignment import MIN_POINTS, Alignment, AlignmentError, apply_alignment, gross_outliers
+from converters.propose.proposals import Proposal
+from converters.propose.report import floor_of
+from converters.propose.retrieval import retrieve
+from converters.records.raw import CadModel, RawScene
+from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import yaw_matrix
+
+SYMMETRIES = {
+    "none": "__SYM_NONE",
+    "half turn": "__SYM_ROTATE_UP_2",
+    "quarter turn": "__SYM_ROTATE_UP_4",
+    "round": "__SYM_ROTATE_UP_INF",
+}
+COLOURS = ((230, 60, 60), (40, 130, 230), (250, 170, 20), (30, 160, 80), (160, 70, 200), (0, 180, 190), (240, 100, 180))
+"""Of pairs, in turn."""
+SHOWN = 4
+"""Candidates side by side."""
+MARKS = {"open": "", "accepted": " ✔ accepted", "skipped": " – skipped"}
+
+
+class Page:
+    """What a server shows, and what clicking there does."""
+
+    def __init__(
+        self, server: Any, store: Store, session: Session, raw: RawScene, proposals: tuple[Proposal, ...]
+    ) -> None:
+        """On a running viser server."""
+        self.server, self.store, self.session, self.raw = server, store, session, raw
+        self.library: Mapping[str, CadModel] = store.library
+        self._proposals, self._room = proposals, painted(raw.scan)
+        self._lock, self._pool = threading.RLock(), concurrent.futures.ThreadPoolExecutor(1)
+        self._ranked: dict[int, list[str]] = {}
+        self._drawn: dict[str, Any] = {}
+        self._nodes: dict[str, Any] = {}
+        self._first, self._adding, self._said = 0, False, ""
+        self._pictures: dict[str, np.ndarray] = {}
+        server.gui.configure_theme(control_width="large", show_share_button=False, show_logo=False)
+        self._words()
+        server.scene.on_click()(self._clicked)
+        server.on_client_connect(lambda client: self._look([client]))
+        self._draw()
+
+    def _words(self) -> None:
+        gui, classes = self.server.gui, sorted({cad.category for cad in self.library.values()})
+        self._steps, self._progress = gui.add_markdown(""), gui.add_progress_bar(0)
+        self._object = gui.add_dropdown("Object", ["-"])
+        self._class = gui.add_dropdown("Class", classes)
+        self._symmetry = gui.add_dropdown(
+            "Symmetry", list(SYMMETRIES), hint="turns after which the model looks the same"
+        )
+        self._image = gui.add_image(np.full((THUMBNAIL, SHOWN * THUMBNAIL, 3), 255, np.uint8))
+        self._pick = gui.add_button_group("Model", [*map(str, range(1, SHOWN + 1)), "more"])
+        self._fit = gui.add_markdown("")
+        buttons = {
+            ("Accept (A)", "A", "green"): Session.accepted,
+            ("Skip (S)", "S", "gray"): Session.skipped,
+            ("Undo (U)", "U", "gray"): Session.undone,
+        }
+        for (label, key, colour), action in buttons.items():
+            for control in (gui.add_button(label, color=colour), gui.add_command(label, hotkey=key)):
+                register = getattr(control, "on_click", None) or control.on_trigger
+                register(lambda _, action=action: self.do(action))
+        gui.add_button("Add an object", color="gray").on_click(lambda _: self._add())
+        self._whole = gui.add_checkbox("Show the whole room", False)
+        self._whole.on_update(lambda _: self._draw())
+
+        def choose(handle: Any, action: Callable[[str], Callable[[Session], Session]]) -> None:
+            # What the page itself sets is told too, but comes from nobody.
+            handle.on_update(lambda event: event.client_id is not None and self.do(action(handle.value)))
+
+        choose(self._object, lambda word: lambda s: s.at_object(int(word.split()[0]) - 1))
+        choose(self._class, lambda word: lambda s: s.changed(category=word, cad_id="", model=(), state="open"))
+        choose(self._symmetry, lambda word: lambda s: s.changed(symmetry=SYMMETRIES[word], state="open"))
+        self._pick.on_click(lambda event: self._picked(event.target.value))
+
+    def do(self, action: Callable[[Session], Session]) -> None:
+        """Saves what an action makes of the session, then shows it; what is refused is said and changes nothing."""
+        with self._lock:
+            try:
+                before, self._said = self.session, ""
+                self.session = self.store.save(action(self.session))
+                if before.items and self.session.item.category != before.item.category or self.session.at != before.at:
+                    self._first = 0
+            except UserError as error:
+                self._said = str(error)
+            self._draw()
+
+    def candidates(self) -> list[str]:
+        """Ids of the models of the object's class, the likeliest first."""
+        own = by_size(self.session.item, self.library)
+        ranked = [k for k in self._ranked.get(self.session.at, []) if k in own]
+        return ranked + [k for k in own if k not in ranked]
+
+    def _add(self) -> None:
+        self._adding = not self._adding
+        self._draw()
+
+    def _picked(self, word: str) -> None:
+        with self._lock:
+            found = self.candidates() if self.session.items else []
+            at = self._first + (SHOWN if word == "more" else int(word) - 1)
+            if word == "more":
+                self._first = at if at < len(found) else 0
+                self._draw()
+            elif at < len(found):
+                self.do(lambda s: s.chose(self.library[found[at]]))
+
+    def _clicked(self, event: Any) -> None:
+        """A click: a point of the scan, or of the model that stands beside it, whichever the ray meets first."""
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        with self._lock:
+            found = {
+                side: hit(mesh, origin, direction) for side, mesh in self._drawn.items() if side in ("scan", "model")
+            }
+            side = min(found, key=lambda k: found[k][0], default="scan")
+            if not found or not np.isfinite(found[side][0]):
+                return
+            point = found[side][1]
+            if self._adding:
+                self._adding = False
+                self.do(lambda s: s.added(self._class.value, point))
+            elif side == "scan":
+                self.do(lambda s: s.clicked("scan", point))
+            else:
+                bench = self._drawn["view"].bench
+                self.do(lambda s: s.clicked("model", (point - bench.translation) @ yaw_matrix(bench.yaw) / bench.scale))
+
+    def _rank(self) -> None:
+        """Fits every model of the object's class, on a thread of its own; the pictures then stand in that order."""
+        at, item = self.session.at, self.session.item
+        if at in self._ranked or at >= len(self._proposals):
+            return
+        self._ranked[at] = []
+
+        def work() -> None:
+            if self.session.at != at:
+                del self._ranked[at]  # looked at no longer; later perhaps
+                return
+            own = {k: cad for k, cad in self.library.items() if cad.category == item.category}
+            found = retrieve(self._proposals[at], own, floor_of(self.raw), any_category=True)
+            with self._lock:
+                self._ranked[at] = [k for k, _ in found.ranking] if found else []
+                self._draw()
+
+        self._pool.submit(work)
+
+    def _draw(self) -> None:
+        with self._lock, self.server.atomic():
+            session = self.session
+            done = sum(item.state != "open" for item in session.items)
+            self._progress.value = 100 * done / max(len(session.items), 1)
+            if session.items:
+                names = [f"{k} {item.category}{MARKS[item.state]}" for k, item in enumerate(session.items, 1)]
+                self._object.options = names
+                self._object.value = names[session.at]
+                self._class.value = session.item.category
+                self._symmetry.value = next(k for k, v in SYMMETRIES.items() if v == session.item.symmetry)
+                self._show_candidates()
+                self._rank()
+            self._scene()
+            self._steps.content = self._told(done)
+
+    def _told(self, done: int) -> str:
+        """The steps, the next one in bold; what went wrong last."""
+        if self._adding:
+            return "**Click the middle of the new object in the scan.**"
+        if not self.session.items:
+            return "No object was proposed. Add one, or label the scan first (`segment`)."
+        item = self.session.item
+        steps = [
+            "Choose a model below (its class first, if it is wrong)",
+            f"Click the same spots on scan and model: {item.pairs} of at least {MIN_POINTS} pairs",
+            "Look at the orange model over the scan, then accept",
+        ]
+        if len(item.scan) != len(item.model):
+            steps[1] += f"; now on the **{'model' if len(item.scan) > len(item.model) else 'scan'}**"
+        rows = [f"{'▶' if k == step_of(item) else ''} {k}. {text}" for k, text in enumerate(steps, 1)]
+        rows[step_of(item) - 1] = f"**{rows[step_of(item) - 1].strip().replace('**', '')}**"
+        said = f"\n\n⚠ {self._said}" if self._said else ""
+        return f"{done} of {len(self.session.items)} objects done\n\n" + "\n\n".join(rows) + said
+
+    def _show_candidates(self) -> None:
+        strip = Image.new("RGB", (SHOWN * THUMBNAIL, THUMBNAIL), "white")
+        for k, cad_id in enumerate(self.candidates()[self._first : self._first + SHOWN]):
+            if cad_id not in self._pictures:
+                self._pictures[cad_id] = thumbnail(self.library[cad_id])
+            strip.paste(Image.fromarray(self._pictures[cad_id]), (k * THUMBNAIL, 0))
+            draw = ImageDraw.Draw(strip)
+            draw.text((k * THUMBNAIL + 4, 2), f"{k + 1}", fill="black")
+            if cad_id == self.session.item.cad_id:
+                box = (k * THUMBNAIL + 1, 1, (k + 1) * THUMBNAIL - 2, THUMBNAIL - 2)
+                draw.rectangle(box, outline=(240, 130, 20), width=3)
+        self._image.image = np.asarray(strip)
+
+    def _scene(self) -> None:
+        """Scan, model beside it, points, and the fitted model; sends only what is another than before."""
+        item = self.session.item if self.session.items else None
+        cad = self.library.get(item.cad_id) if item else None
+        whole = self._adding or self._whole.value or item is None
+        key = (self.session.at, len(self.session.items), item and item.cad_id, whole)
+        if self._drawn.get("key") != key:
+            view = view_of(
+                item or Item("", tuple(self._room.centroid), tuple(self._room.extents), 0.0, 0), cad, self.raw
+            )
+            moved = self._drawn.get("key", (None,))[0] != key[0] or self._drawn["key"][3] != whole
+            self._drawn = {
+                "key": key,
+                "view": view,
+                "scan": self._room if whole or item is None else around(self._room, item),
+            }
+            if cad is not None:
+                self._drawn["model"] = coloured(cad, view.bench)
+            for side in ("scan", "model"):
+                mesh = self._drawn.get(side)
+                self._node(f"/{side}", lambda name, mesh=mesh: mesh and self.server.scene.add_mesh_trimesh(name, mesh))
+            if moved:
+                self._look(self.server.get_clients().values())
+        self._points(item, self._drawn["view"])
+        self._fit.content, fit = "", None
+        if item is not None and cad is not None and item.pairs >= MIN_POINTS:
+            try:
+                fit = item.fit()
+                out = (
+                    np.flatnonzero(
+                        gross_outliers(
+                            np.array(item.model[: item.pairs]), np.array(item.scan[: item.pairs]), item.symmetry
+                        )
+                    )
+                    + 1
+                )
+                left = f", without pair {', '.join(map(str, out))}" if len(out) else ""
+                self._fit.content = f"**Residual {100 * fit.rms_m:.1f} cm** over {item.pairs} pairs{left}"
+            except AlignmentError as error:
+                self._fit.content = f"⚠ {error}"
+
+        def over(name: str, fit: Alignment, cad: CadModel) -> Any:
+            points = apply_alignment(fit, cad.vertices)
+            paint = {"color": (255, 140, 30), "opacity": 0.6, "side": "double"}
+            return self.server.scene.add_mesh_simple(name, points, cad.faces, **paint)
+
+        self._node("/fit", lambda name: over(name, fit, cad) if fit and cad else None)
+
+    def _node(self, name: str, add: Callable[[str], Any]) -> None:
+        """Puts what `add` makes in the scene in place of what has the name; None: nothing."""
+        if name in self._nodes:
+            self._nodes.pop(name).remove()
+        if (made := add(name)) is not None:
+            self._nodes[name] = made
+
+    def _points(self, item: Item | None, view: View) -> None:
+        for name in [name for name in self._nodes if name.startswith("/points")]:
+            self._nodes.pop(name).remove()
+        for side, points in (("scan", item.scan), ("model", item.model)) if item else ():
+            at = (
+                np.array(points).reshape(-1, 3)
+                if side == "scan"
+                else apply_alignment(view.bench, np.array(points).reshape(-1, 3))
+            )
+            for k, point in enumerate(at):
+                name, colour = f"/points/{side}{k + 1}", COLOURS[k % len(COLOURS)]
+                self._nodes[name] = self.server.scene.add_icosphere(name, 0.015, color=colour, position=point)
+                label = f"{name}_number"
+                self._nodes[label] = self.server.scene.add_label(label, str(k + 1), position=point)
+
+    def _look(self, clients: Any) -> None:
+        """Turns the cameras to the object and its model."""
+        view = self._drawn["view"]
+        for client in clients:
+            with contextlib.suppress(Exception), client.atomic():  # one that has gone away meanwhile
+                client.camera.position, client.camera.look_at = view.eye, view.middle

@@ -1,0 +1,114 @@
+"""viser's server behind a check: who may connect, on exactly the port that was asked for.
+
+viser 1.1 has neither. It serves pages and websockets through `websockets.asyncio.server.serve`, which asks a function
+about every request before it answers; ours comes first, so that nothing is sent, the page itself included, before it
+has agreed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import http
+import importlib
+import io
+import ipaddress
+import secrets
+import socket
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from interactive_nav_common.errors import ConfigError
+
+
+def is_local(host: str) -> bool:
+    """Whether an address is reached from this machine alone."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def refusal(path: str, headers: Any, token: str | None) -> str | None:
+    """Why a request is not answered; None: it may be.
+
+    Without a token the page must have been asked for under this machine's own name, so that no other site, nor a name
+    that leads here, can reach it through the user's browser; and a websocket must be opened by our own page.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != host:
+        return "the request comes from another site's page; open this address itself"
+    if token is None:
+        local = is_local(urlsplit(f"//{host}").hostname or "")
+        return None if local else f"the page was asked for as '{host}', expected localhost"
+    try:
+        cookie = SimpleCookie(headers.get("Cookie", "")).get("annotate")
+    except CookieError:
+        cookie = None
+    given = [cookie.value] if cookie else []
+    given += parse_qs(urlsplit(path).query).get("token", [])
+    if any(hmac.compare_digest(one.encode(), token.encode()) for one in given):
+        return None
+    return "no token, or a wrong one; open the whole address that the command printed, ?token= included"
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        ConfigError: the port is taken or none, or the address is not this machine's.
+    """
+    try:
+        if not 0 <= port < 65536:  # the system would take its last 16 bits
+            raise OverflowError("no port has this number")
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.create_server(address[:2], family=family)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"{host}:{port}: cannot be listened on ({getattr(error, 'strerror', None) or error}), expected a free port "
+            "of this machine; give another --port (0: any) or --host"
+        ) from None
+    return listening
+
+
+def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
+    """A running viser server, and the address to open; with a token where others can reach it.
+
+    Raises:
+        ConfigError: viser is not installed or works otherwise than 1.1 does, or the port cannot be had.
+    """
+    try:
+        viser, serving = importlib.import_module("viser"), importlib.import_module("websockets.asyncio.server")
+    except ImportError:
+        raise ConfigError("viser is not installed, expected it for annotate; pip install 'viser>=1.1,<1.2'") from None
+    token, listening = None if is_local(host) else secrets.token_urlsafe(24), bind(host, port)
+    original, checked = serving.serve, []
+
+    def serve(handler: Any, _host: str, _port: int, process_request: Any, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            why = refusal(request.path, request.headers, token)
+            if why is not None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
+            if token and "token" in parse_qs(urlsplit(request.path).query):  # from here on the cookie says it
+                answer = connection.respond(http.HTTPStatus.SEE_OTHER, "")
+                answer.headers["Location"] = "/"
+                answer.headers["Set-Cookie"] = f"annotate={token}; HttpOnly; SameSite=Lax; Path=/"
+                return answer
+            return process_request(connection, request)
+
+        checked.append(True)
+        return original(handler, sock=listening, process_request=check, **options)
+
+    setattr(serving, "serve", serve)  # noqa: B010 (viser looks it up when it starts, and takes no other)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # an address without the token
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    finally:
+        setattr(serving, "serve", original)  # noqa: B010
+    if not checked:
+        server.stop()
+        raise ConfigError(f"viser is {viser.__version__}, which cannot be guarded; pip install 'viser>=1.1,<1.2'")
+    own = listening.getsockname()[1]
+    shown = f"[{host}]" if ":" in host else host
+    return server, f"http://{shown}:{own}/" + (f"?token={token}" if token else "")

@@ -1,0 +1,123 @@
+"""Who may connect, asked by hand and of a running server; a port in use; viser absent."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from converters.__main__ import main
+from converters.annotate.guard import bind, guarded_server, is_local, refusal
+from interactive_nav_common.errors import ConfigError
+
+NEEDS = "viser is not installed (pip install 'viser>=1.1,<1.2')"
+
+
+@pytest.mark.parametrize(
+    ("path", "headers", "token", "why"),
+    [
+        ("/", {"Host": "localhost:8080"}, None, None),
+        ("/", {"Host": "[::1]:8080"}, None, None),
+        ("/", {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}, None, None),
+        ("/", {"Host": "rebound.example:8080"}, None, "asked for as 'rebound.example:8080', expected localhost"),
+        ("/", {"Host": "127.0.0.1:8080", "Origin": "http://evil.example"}, None, "another site's page"),
+        ("/", {"Host": "host:1"}, "secret", "no token, or a wrong one"),
+        ("/?token=secreT", {"Host": "host:1"}, "secret", "no token, or a wrong one"),
+        ("/", {"Host": "host:1", "Cookie": "annotate=other"}, "secret", "no token, or a wrong one"),
+        ("/", {"Host": "host:1", "Cookie": 'annotate="\\', "Origin": "http://host:1"}, "secret", "no token"),
+        ("/?token=secret", {"Host": "host:1"}, "secret", None),
+        ("/", {"Host": "host:1", "Cookie": "a=b; annotate=secret", "Origin": "http://host:1"}, "secret", None),
+        ("/?token=secret", {"Host": "host:1", "Origin": "http://evil.example"}, "secret", "another site's page"),
+    ],
+)
+def test_who_may_connect(path, headers, token, why):
+    found = refusal(path, headers, token)
+    assert found is None if why is None else why in (found or "")
+
+
+def test_addresses_of_this_machine():
+    known = (
+        "127.0.0.1",
+        "::1",
+        "localhost",
+        "127.9.9.9",
+        "0.0.0.0",
+        "10.0.0.1",
+        "example.org",
+        "localhost.example.org",
+    )
+    assert [is_local(host) for host in known] == [True] * 4 + [False] * 4
+
+
+def test_nothing_is_sent_before_the_token(capsys):
+    viser = pytest.importorskip("viser", reason=NEEDS)
+    server, address = guarded_server("0.0.0.0", 0, "room")
+    try:
+        port, token = server.get_port(), address.partition("?token=")[2]
+        page, own = f"http://127.0.0.1:{port}/", [Subprotocol(f"viser-v{viser.__version__}")]
+        for wrong in (page, f"{page}?token=x", f"{page}index.html"):
+            with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+                urllib.request.urlopen(wrong)
+            assert refused.value.read().startswith(b"no token, or a wrong one; open the whole address")
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(page.replace("http", "ws"), subprotocols=own)
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        with opener.open(f"{page}?token={token}") as answer:
+            assert answer.url == page and b"<html" in answer.read()
+        cookie = {"Cookie": f"annotate={token}"}
+        with connect(page.replace("http", "ws"), subprotocols=own, additional_headers=cookie, max_size=None) as socket_:
+            assert len(socket_.recv(10)) > 0
+    finally:
+        server.stop()
+
+
+def test_a_port_in_use_is_one_line_and_not_another_port():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(
+            ConfigError, match=f"127.0.0.1:{port}: cannot be listened on .*in use.*; give another --port"
+        ):
+            bind("127.0.0.1", port)
+    for host, number in (("127.0.0.1", 99_999), ("203.0.113.7", 0), ("no such host", 0)):
+        with pytest.raises(ConfigError, match="cannot be listened on"):
+            bind(host, number)
+
+
+def test_without_viser_the_command_names_what_to_install(scan2cad_raw, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["annotate", str(scan2cad_raw), "-o", str(tmp_path / "mine"), "--port", "0"]) == 2
+    assert "viser is not installed, expected it for annotate; pip install 'viser" in capsys.readouterr().err
+
+
+def test_two_people_in_one_folder_and_a_missing_scan_are_one_line(scan2cad_raw, tmp_path, capsys):
+    pytest.importorskip("viser", reason=NEEDS)
+    words = [
+        sys.executable,
+        "-m",
+        "converters",
+        "annotate",
+        str(scan2cad_raw),
+        "-o",
+        str(tmp_path / "mine"),
+        "--port",
+        "0",
+    ]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as first:
+        try:
+            assert first.stdout is not None
+            assert any("Ctrl-C ends it" in line for line in first.stdout)
+            assert main(words[3:]) == 2
+            assert "works there; wait for it or choose another folder (-o)" in capsys.readouterr().err
+        finally:
+            first.terminate()
+    with contextlib.suppress(SystemExit):
+        assert main(["annotate", str(tmp_path / "no.ply"), "-o", str(tmp_path / "other")]) == 2
+    assert "no.ply" in capsys.readouterr().err
