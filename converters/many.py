@@ -27,7 +27,7 @@ from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
 from converters.records.errors import StageFailed
 from converters.sets import run_side_by_side
-from interactive_nav_common.errors import ConfigError, FileError, UserError
+from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
 from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.rows import write_parquet
@@ -154,10 +154,8 @@ def _named(sources: Sequence[Path]) -> dict[str, Path]:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    try:
+    with readable(path, FileError, "remove it to convert all again", " as Parquet"):
         return pq.read_table(path).to_pylist() if path.is_file() else []
-    except (OSError, pa.ArrowInvalid) as error:
-        raise FileError(f"{path}: not readable as Parquet ({error}); remove it to convert all again") from None
 
 
 def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import ParamSpec
 
 Arguments = ParamSpec("Arguments")
@@ -20,6 +22,27 @@ class ConfigError(UserError):
 
 class FileError(UserError):
     """A file or folder that cannot be read, written or locked."""
+
+
+@contextlib.contextmanager
+def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "") -> Iterator[None]:
+    """Whatever goes wrong in the block that reads a file is told as one line.
+
+    Zip, npy, Parquet, msgpack, picture and mesh readers raise many kinds for a damaged file.
+
+    Args:
+        path: of the file.
+        kind: of the error.
+        remedy: what to do about it.
+        what: it should be, such as ` as Parquet`.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        told = " ".join(f"{type(error).__name__}: {error}".replace(str(path), Path(path).name).split())[:300]
+        raise kind(f"{path}: not readable{what} ({told}); {remedy}") from error
 
 
 def reports_errors(program: str) -> Callable[[Callable[Arguments, int]], Callable[Arguments, int]]:

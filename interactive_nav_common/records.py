@@ -12,7 +12,6 @@ import gzip
 import json
 import types
 import typing
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -20,7 +19,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 
 from interactive_nav_common.config import Bounds, nearest
-from interactive_nav_common.errors import FileError, UserError
+from interactive_nav_common.errors import FileError, UserError, readable
 from interactive_nav_common.files import whole_file, write_text
 
 Record = TypeVar("Record")
@@ -213,10 +212,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     Raises:
         FileError: it cannot be read.
     """
-    try:
+    with readable(path, FileError, "expected the metrics of a run"):
         everything = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    except (OSError, EOFError, zlib.error) as error:
-        raise FileError(f"{path}: not readable ({error}); expected the metrics of a run") from None
     lines = []
     for text in everything.decode(errors="replace").splitlines():
         try:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import whole_file
 
 IDENTITY = ("run", "robot", "policy", "evaluation_seed", "scene", "episode")
@@ -65,10 +65,8 @@ def read_rows(paths: Sequence[Path]) -> pa.Table:
     """
     tables = []
     for path in sorted(paths):
-        try:
+        with readable(path, FileError, "evaluate the run again", " as Parquet"):
             tables.append(pq.read_table(path).replace_schema_metadata(None))
-        except (OSError, pa.ArrowInvalid) as error:
-            raise FileError(f"{path}: not readable as Parquet ({error}); evaluate the run again") from None
     try:
         rows = pa.concat_tables(tables, promote_options="permissive")
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:

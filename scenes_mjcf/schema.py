@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from interactive_nav_common.config import Positive
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import UserError, readable
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
 from scenes_mjcf.categories import OBJECT_CATEGORIES
@@ -149,15 +149,10 @@ def load_maps(folder: str | Path) -> SceneMaps:
     path = Path(folder) / "maps.npz"
     if not path.is_file():
         raise SceneError(f"{path}: no such file; convert the scene again")
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            traversable = arrays["traversable"]
-            resolution = float(arrays["resolution"])
-            origin = np.asarray(arrays["origin"], float).reshape(-1)
-            floor_height = float(arrays["floor_height"])
-    except Exception as error:  # a damaged archive fails in zipfile, zlib or NumPy, each in its own way
-        reason = " ".join(str(error).split())
-        raise SceneError(f"{path}: not readable ({type(error).__name__}: {reason}); convert the scene again") from error
+    with readable(path, SceneError, "convert the scene again"), np.load(path, allow_pickle=False) as arrays:
+        traversable = arrays["traversable"]
+        resolution, floor_height = float(arrays["resolution"]), float(arrays["floor_height"])
+        origin = np.asarray(arrays["origin"], float).reshape(-1)
     if traversable.ndim != 2 or traversable.dtype != np.bool_:
         raise SceneError(f"{path}: traversable is {traversable.dtype}{traversable.shape}, expected a 2-D bool array")
     if not 0 < resolution <= 0.05 + 1e-9:

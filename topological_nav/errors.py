@@ -1,8 +1,6 @@
 """What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
 
-import contextlib
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 from interactive_nav_common.errors import UserError
 
@@ -34,23 +32,3 @@ Asked = Callable[[], int]
 def go_on() -> int:
     """An `Asked` that never stops."""
     return 0
-
-
-@contextlib.contextmanager
-def readable(path: Path, kind: type[UserError], remedy: str) -> Iterator[None]:
-    """Whatever goes wrong in the block that reads a file is told as one line.
-
-    Zip, npy, msgpack, WebP and JSON readers raise many kinds for a damaged file.
-
-    Args:
-        path: of the file.
-        kind: of the error.
-        remedy: what to do about it.
-    """
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:  # noqa: BLE001
-        told = " ".join(repr(error).split())[:200]
-        raise kind(f"{path}: not readable ({told}); {remedy}") from None

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from converters.bodies.decompose import cache_folder
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import whole_folder
 
 PACKAGE = "sweethome3d-furniture"
@@ -75,7 +75,7 @@ def _of_folder(folder: Path) -> dict[str, bytes]:
 
 def _of_package(path: Path) -> dict[str, bytes]:
     """The libraries in a Debian package: an `ar` archive with a tar in it."""
-    try:
+    with readable(path, FileError, REMEDY, " as a Debian package"):
         data = path.read_bytes()
         at, tar = 8, b""
         while data.startswith(b"!<arch>\n") and at + 60 <= len(data):
@@ -86,7 +86,3 @@ def _of_package(path: Path) -> dict[str, bytes]:
         with tarfile.open(fileobj=io.BytesIO(tar)) as archive:
             inside = [m for m in archive.getmembers() if m.isfile() and m.name.endswith(".sh3f")]
             return {Path(m.name).stem: file.read() for m in inside if (file := archive.extractfile(m)) is not None}
-    except (OSError, ValueError, tarfile.TarError, EOFError) as error:
-        raise FileError(
-            f"{path}: not readable as a Debian package ({' '.join(str(error).split())}); {REMEDY}"
-        ) from None

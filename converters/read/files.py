@@ -14,6 +14,7 @@ import trimesh
 from PIL import Image
 
 from converters.records.errors import SceneRejected
+from interactive_nav_common.errors import readable
 from interactive_nav_common.records import Reader
 
 MOST_CORNERS = 200
@@ -110,12 +111,8 @@ def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
     Raises:
         SceneRejected: not an NPZ, damaged, or without the array.
     """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return np.asarray(arrays[name])
-    except Exception as error:  # damaged archives fail in zipfile, zlib or NumPy, each in its own way
-        reason = " ".join(str(error).split())
-        raise SceneRejected(f"{path}: not readable ({type(error).__name__}: {reason}); {remedy}") from error
+    with readable(path, SceneRejected, remedy), np.load(path, allow_pickle=False) as arrays:
+        return np.asarray(arrays[name])
 
 
 def read_labels(path: Path) -> np.ndarray:
@@ -136,12 +133,8 @@ def read_image(path: Path, mode: str) -> np.ndarray:
     Raises:
         SceneRejected: not an image, or truncated.
     """
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert(mode))
-    except Exception as error:  # Pillow's decoders raise anything on a broken file
-        reason = str(error).replace(str(path), path.name)
-        raise SceneRejected(f"{path}: not readable as an image ({reason}); fetch the file again") from error
+    with readable(path, SceneRejected, "fetch the file again", " as an image"), Image.open(path) as image:
+        return np.asarray(image.convert(mode))
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
@@ -150,12 +143,8 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     Raises:
         SceneRejected: unreadable, truncated, empty, or with vertices that are not finite.
     """
-    try:
+    with readable(path, SceneRejected, "fetch the file again", " as a mesh"):
         mesh = trimesh.load(path, process=False, force="mesh")
-    except Exception as error:  # trimesh's loaders raise anything on a broken file
-        raise SceneRejected(
-            f"{path}: not readable as a mesh ({type(error).__name__}: {error}); fetch the file again"
-        ) from error
     assert isinstance(mesh, trimesh.Trimesh)
     check_mesh(path, np.asarray(mesh.vertices), np.asarray(mesh.faces))
     return mesh

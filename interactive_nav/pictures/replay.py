@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,7 @@ from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.errors import ConfigError, UserError, readable
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import MaskClasses
 
@@ -255,18 +254,15 @@ def load(path: str | Path) -> Replay:
     path = Path(path)
     if not path.is_file():
         raise ReplayError(f"{path}: no such file, expected a replay (npz)")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            if "policies" in stored.files:
-                raise ReplayError(
-                    f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "
-                    f"bodies; draw the paths (python -m train.figures {path.parent}), or play the episode again "
-                    "(python -m train.replay RUN_DIR)"
-                )
-            header = json.loads(str(stored["header"]))
-            arrays = {name: stored[name] for name in _ARRAYS}
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise ReplayError(f"{path}: is no replay or damaged ({error}); record the episode again") from error
+    with readable(path, ReplayError, "record the episode again"), np.load(path, allow_pickle=False) as stored:
+        if "policies" in stored.files:
+            raise ReplayError(
+                f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "
+                f"bodies; draw the paths (python -m train.figures {path.parent}), or play the episode again "
+                "(python -m train.replay RUN_DIR)"
+            )
+        header = json.loads(str(stored["header"]))
+        arrays = {name: stored[name] for name in _ARRAYS}
     if header.pop("format", None) != FORMAT:
         raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
     for name in ("bodies", "objects"):

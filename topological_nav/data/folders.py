@@ -16,11 +16,12 @@ from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav_common.config import overlay, to_dict
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import CameraConfig
 from topological_nav.data.shards import ShardWriter
-from topological_nav.errors import DatasetError, readable
+from topological_nav.errors import DatasetError
 from topological_nav.scenes.rendering import SceneRenderer, need_engine
 
 Progress = Callable[[str, int, int], None]

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.versions import usable_cores
-from topological_nav.errors import DatasetError, readable
+from topological_nav.errors import DatasetError
 
 COLUMNS = 18
 """Images a row of a sheet."""

@@ -23,6 +23,7 @@ import numpy as np
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import CameraPose
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
@@ -31,7 +32,7 @@ from topological_nav.data.shards import read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
-from topological_nav.errors import DatasetError, SpaceError, readable
+from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import scene_rooms

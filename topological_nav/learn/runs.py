@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.records import Reader, read_metrics
 from interactive_nav_common.versions import versions
-from topological_nav.errors import Asked, RunError, Stopped, readable
+from topological_nav.errors import Asked, RunError, Stopped
 
 CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
 WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"

@@ -24,10 +24,11 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav_common.config import to_dict
+from interactive_nav_common.errors import readable
 from topological_nav.config import PITCHES, NetworkTrainConfig
 from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
-from topological_nav.errors import Asked, RunError, go_on, readable
+from topological_nav.errors import Asked, RunError, go_on
 from topological_nav.learn.learning import (
     Learner,
     in_batches,

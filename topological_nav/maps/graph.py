@@ -20,8 +20,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_arrays
-from topological_nav.errors import MapError, readable
+from topological_nav.errors import MapError
 
 FORMAT = 1
 """Of map files; raised whenever older ones would be read wrongly."""

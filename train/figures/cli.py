@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError, reports_errors
+from interactive_nav_common.errors import FileError, readable, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
@@ -150,12 +149,9 @@ def _by_k_int(by_k_int: dict[float, Path]) -> Figure:
 
 
 def _paths(path: Path) -> dict[str, np.ndarray] | None:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            first = f"{stored['policies'][0]}/goal_xy_w" if "policies" in stored.files else ""
-            return dict(stored) if first and len(stored[first]) else None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FileError(f"{path}: not readable ({error}); evaluate the run again") from None
+    with readable(path, FileError, "evaluate the run again"), np.load(path, allow_pickle=False) as stored:
+        first = f"{stored['policies'][0]}/goal_xy_w" if "policies" in stored.files else ""
+        return dict(stored) if first and len(stored[first]) else None
 
 
 def _name(path: Path) -> str:

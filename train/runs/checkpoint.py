@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav_common.config import Natural
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import writing
 from interactive_nav_common.records import Reader
 from train.errors import CheckpointError
@@ -199,12 +199,9 @@ def load_env_state(folder: Path, template: Any) -> Any | None:
     if not path.is_file():
         return None
     leaves, structure = jax.tree.flatten(template)
-    try:
-        with np.load(path) as stored:
-            arrays = [stored[f"arr_{i}"] for i in range(len(stored.files))]
-    except Exception as error:  # a damaged archive fails in zipfile, zlib or NumPy, each in its own way
-        told = " ".join(str(error).split())
-        raise CheckpointError(f"{path}: not readable ({told}); remove it: the run goes on with new episodes") from None
+    remedy = "remove it: the run goes on with new episodes"
+    with readable(path, CheckpointError, remedy), np.load(path) as stored:
+        arrays = [stored[f"arr_{i}"] for i in range(len(stored.files))]
     like = [_raw(leaf) for leaf in leaves]
     if [(a.shape, a.dtype) for a in arrays] != [(x.shape, x.dtype) for x in like]:
         return None

@@ -16,6 +16,7 @@ import flax.serialization
 import flax.traverse_util
 import numpy as np
 
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import whole_file
 from train.errors import CheckpointError
 
@@ -101,11 +102,8 @@ def read(path: Path, template: Any) -> Any:
     Raises:
         CheckpointError: damaged, or of another learner.
     """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            leaves = unpacked({name: stored[name] for name in stored.files})
-    except Exception as error:  # noqa: BLE001  (zip and npy readers raise many kinds for a damaged file)
-        raise CheckpointError(f"{path}: not readable ({' '.join(str(error).split())[:200]})") from None
+    with readable(path, CheckpointError, "export the run again"), np.load(path, allow_pickle=False) as stored:
+        leaves = unpacked({name: stored[name] for name in stored.files})
     own = flax.serialization.to_state_dict(template)
     flat = flax.traverse_util.flatten_dict(own, sep="/", keep_empty_nodes=True)
     unknown = sorted(set(leaves) - set(flat))

@@ -24,6 +24,7 @@ from converters.read.storeys import label_storeys
 from converters.read.surfaces import floor_level
 from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene, ScanMesh
+from interactive_nav_common.errors import readable
 from interactive_nav_common.records import read_packaged
 
 NYU40 = read_packaged(Path(__file__).with_name("nyu40.yaml"), dict[str, int])
@@ -79,15 +80,12 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
     for path in sorted(p for mark in about.marks for p in root.glob(mark)):
         source.use(source.inside(path), "")
     scene = root.resolve()
-    try:
+    with readable(root, SceneRejected, "fetch it again", f" as {name}"):
         dataset = library.get_dataset(about.name, scene.parents[about.levels - 1])
         mesh = dataset.get_mesh(scene.name)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.triangles, np.int64)
         colours = np.asarray(mesh.vertex_colors, float) if mesh.has_vertex_colors() else None
         found = _labels(source, dataset, scene.name, about)
-    except Exception as error:  # whatever a damaged file raises in scenezoo, Open3D or plyfile
-        reason = " ".join(str(error).split()) or "no reason given"
-        raise SceneRejected(f"{root}: not readable as {name} ({type(error).__name__}: {reason[:300]})") from error
     if not len(faces) or not np.isfinite(vertices).all():
         raise SceneRejected(f"{root}: its mesh has {len(faces)} faces or vertices that are no numbers; fetch it again")
     return _record(source, name, vertices, faces, colours, found)

@@ -116,7 +116,7 @@ def test_files_that_are_no_replays_are_refused(played, tmp_path):
     replay.save(played, tmp_path / "cut.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:-3000])
     for name in ("other", "text", "cut"):
-        with pytest.raises(ReplayError, match=rf"{name}\.npz: is no replay or damaged .*; record the episode again"):
+        with pytest.raises(ReplayError, match=rf"{name}\.npz: not readable .*; record the episode again"):
             replay.load(tmp_path / f"{name}.npz")
 
 
