@@ -27,7 +27,7 @@ from converters.read.homes.sh3d_models import GLASS, HULLS, PANE
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION
 from converters.records.visual import ColourCloud, TexturedMesh
-from converters.write.sh3d_rooms import SIDE_M, gap_around, half_wall, merged_walls, rooms_of, wall_between
+from converters.write.sh3d_rooms import SIDE_M, Wall, gap_around, half_wall, merged_walls, rooms_of, wall_between
 from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
@@ -132,8 +132,8 @@ class _Export:
                 self._piece(body, mesh, category[body.name])
                 told += [f"{body.name}: stands in no gap of a wall; drawn as a piece that does not turn"] * hinge
         sites = [site for site in self.spec.sites if site.name.startswith("window_")]
-        windows = [site.name for site in sites if self._window(site)]
-        told += [f"left out: {site.name}, which lies in no wall" for site in sites if site.name not in windows]
+        for site in sites:
+            self._window(site)
         every = shapely.union_all([w.polygon() for w in self.walls])
         for k, wall in enumerate(self.walls):
             run = np.diff(wall.ends, axis=0)[0] / np.linalg.norm(wall.ends[1] - wall.ends[0])
@@ -162,7 +162,7 @@ class _Export:
         ElementTree.indent(self.root)
         self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
         count = (
-            f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(windows)} windows, {pieces} other things"
+            f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(sites)} windows, {pieces} other things"
         )
         return [count, *told]
 
@@ -302,12 +302,14 @@ class _Export:
         self._add("sash", door, **sash, width=length / width, startAngle=start, endAngle=end)
         return True
 
-    def _window(self, site: Any) -> bool:
-        """A pane in a frame that is as deep as the wall around it; False where there is no wall."""
+    def _window(self, site: Any) -> None:
+        """A pane in a frame as deep as the wall around it, and that wall where a scene has none behind furniture."""
         at, (x, deep, up), yaw = np.array(site.pos), np.array(site.size), float(yaw_from_quat(site.quat))
         y, high = half_wall(self.stands, at[:2], yaw_matrix(yaw)[:2, 1], deep), 2 * up
         if y is None:
-            return False
+            ends = at[:2] + np.outer([-x - BAR_M, x + BAR_M], yaw_matrix(yaw)[:2, 0])
+            y, tall = deep, max((w.height for w in self.high), default=at[2] + up)
+            self.walls.append(Wall(ends, 2 * deep, max(tall, at[2] + up)))
         sides = (-x, BAR_M - x, 0.0, high), (x - BAR_M, x, 0.0, high), (-x, x, 0.0, BAR_M), (-x, x, high - BAR_M, high)
         pane, glass = convex_hull(_bar(-x, x, 0.0, high, IN_M)), io.BytesIO()
         Image.fromarray(GLASS).save(glass, "PNG")
@@ -319,7 +321,6 @@ class _Export:
         self._add(
             "doorOrWindow", movable="false", cutOutShape="M0,0 v1 h1 v-1 z", wallCutOutOnBothSides="true", **words
         )
-        return True
 
 
 def _lines(vertices: np.ndarray) -> str:

@@ -160,7 +160,8 @@ class _Drawing:
         cutting = [e for e in pieces if e.tag == "doorOrWindow"]
         openings = [opening_of(e, self._base(e)) for e in cutting]
         windows = tuple(o.window() for e, o in zip(cutting, openings, strict=True)
-                        if number(e, "elevation", 0.0) / 100 > DOOR_M[0])  # fmt: skip
+                        if number(e, "elevation", 0.0) / 100 > DOOR_M[0]
+                        and any(o.within(wall) is not None for wall in walls))  # fmt: skip
         parts = [part for e in pieces for part in self._piece(e)]
         for wall in walls:
             e = wall.element
