@@ -111,7 +111,9 @@ def click_six_pairs(page: Page, browser: Tab, k: int) -> int:
     browser.press(str(number % 4 + 1))
     until(lambda: page.session.item.cad_id == truth.cad_id, what="the model")
     cad = page.raw.cads[truth.cad_id]
-    pairs = seen_pairs(page, truth.pose, cad, page._drawn["scan"], page._drawn["model"])
+    with page._lock:  # it is drawn once the lock is free
+        shown = dict(page._drawn)
+    pairs = seen_pairs(page, truth.pose, cad, shown["scan"], shown["model"])
     for count, (_, q, b, scan_eye, model_eye) in enumerate(pairs, 1):
         browser.click(*look(page, browser, q, scan_eye))
         until(lambda count=count: len(page.session.item.scan) == count, what=f"point {count} of the scan")
