@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.scenes.layout import Layout
 from interactive_nav.scenes.spec import FEET
 from interactive_nav.scenes.world import World
 from interactive_nav_common.rotations import Array, matrix_from_quat, namespace
@@ -73,7 +72,7 @@ class Nearness:
         self._qpos = layout.slot_qpos[:, None] + np.where(self.hinge[:, None], 0, np.arange(7))
         self._qvel = layout.slot_qvel[:, None] + np.where(self.hinge[:, None], 0, np.arange(6))
         self._robot = layout.robot_qpos + np.arange(2)
-        made = [_rest(model, layout, self.hinge) for model in world.models]
+        made = [_rest(world, s) for s in range(len(world.scenes))]
         tables = (np.stack(t).astype(np.float32) for t in zip(*made, strict=True))
         self._offset_m, self._half_m, self._frame, self._anchor_m, self._sense, *self._walls = tables
 
@@ -175,10 +174,11 @@ class Nearness:
         return {k: max(1, int(np.quantile(c, _SHARE, method="higher"))) for k, c in counts.items()}
 
 
-def _rest(model: mujoco.MjModel, layout: Layout, hinge: np.ndarray) -> tuple[np.ndarray, ...]:
+def _rest(world: World, s: int) -> tuple[np.ndarray, ...]:
     """Of each slot: the box's centre and half sizes in its body's frame; for hinges, from the joint's anchor in the
     world at rest, with the body's matrix, the anchor, and the joint's sense about the world's z. Of each wall: planar
     place, axes and half sizes, and whether it is one."""
+    model, layout = world.models[s], world.layout
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     count = layout.num_slots
@@ -192,15 +192,13 @@ def _rest(model: mujoco.MjModel, layout: Layout, hinge: np.ndarray) -> tuple[np.
             extent = np.einsum("gij,gj->gi", np.abs(turn), model.geom_aabb[geoms, 3:])
             low, high = (middle - extent).min(0), (middle + extent).max(0)
             offset[k], half[k] = (low + high) / 2, (high - low) / 2
-        if hinge[k]:
+        if layout.slot_kind[k] == "hinge":
             joint = model.body_jntadr[body]
             frame[k], anchor[k] = data.xmat[body].reshape(3, 3), data.xanchor[joint]
             offset[k] = frame[k] @ offset[k] + data.xpos[body] - anchor[k]
             sense[k] = np.sign(data.xaxis[joint, 2])
     first = model.body_geomadr[layout.structure_body]
     walls = slice(first, first + model.body_geomnum[layout.structure_body])
-    xpos = data.geom_xpos[walls]
-    # Padding lies below the floor; it never counts as near.
-    used = xpos[:, 2] > -4.0
+    used = np.arange(walls.stop - walls.start) < len(world.scenes[s].walls)
     xmat = data.geom_xmat[walls].reshape(-1, 3, 3)[:, :2, :2]
-    return offset, half, frame, anchor, sense, xpos[:, :2], xmat, model.geom_size[walls, :2], used
+    return offset, half, frame, anchor, sense, data.geom_xpos[walls, :2], xmat, model.geom_size[walls, :2], used

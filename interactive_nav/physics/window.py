@@ -20,6 +20,7 @@ import numpy as np
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.physics.nearness import REACH_M, Nearness
+from interactive_nav.scenes.layout import Layout
 from interactive_nav.scenes.spec import FEET, build_empty_spec
 from interactive_nav.scenes.world import World
 
@@ -36,6 +37,13 @@ _DOF = ("dof_invweight0", "dof_damping", "dof_frictionloss")
 _QPOS = ("qpos0", "qpos_spring")
 FIELDS = (*_BODY, *_GEOM, *_JOINT, *_DOF, *_QPOS)
 """Model fields that differ between environments under one compiled program."""
+_HIDDEN = {
+    "geom_size": np.full(3, 1e-3),
+    "geom_quat": np.array([1.0, 0, 0, 0]),
+    "geom_rbound": np.linalg.norm(np.full(3, 1e-3)),
+    "geom_aabb": np.array([0, 0, 0, 1e-3, 1e-3, 1e-3]),
+}
+"""Padding boxes: too small to be met, at the body's centre of mass."""
 _WALL = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb")
 
 
@@ -52,6 +60,8 @@ class _Group:
     """Field -> [scenes, m, ...] values of the slot's body, boxes, joint or degrees of freedom."""
     rows: dict[str, np.ndarray]
     """Field -> [width, ...] rows of the window's model that they fill."""
+    outer: dict[str, np.ndarray]
+    """Field -> [m, ...] rows of the world's models."""
 
 
 class Window:
@@ -93,34 +103,19 @@ class Window:
         self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
 
     def _group(self, own: np.ndarray, width: int, first: int, boxes: int) -> _Group:
-        world, layout = self.world, self.world.layout
-        bodies = layout.slot_body[own]
-        joints = world.models[0].body_jntadr[bodies]
-        n_v = 1 if layout.slot_kind[own[0]] == "hinge" else 6
-        n_q = 1 if n_v == 1 else 7
         tables: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
-        for model in world.models:
-            for name in _BODY:
-                tables[name].append(getattr(model, name)[bodies])
-            for name in _JOINT:
-                tables[name].append(getattr(model, name)[joints])
-            for name in _DOF:
-                tables[name].append(getattr(model, name)[layout.slot_qvel[own][:, None] + np.arange(n_v)])
-            for name in _QPOS:
-                tables[name].append(getattr(model, name)[layout.slot_qpos[own][:, None] + np.arange(n_q)])
-            filled = [_boxes_of(model, body, boxes) for body in bodies]
-            for name in _GEOM:
-                tables[name].append(np.stack([f[name] for f in filled]))
-        mine = slice(first, first + width)
-        inner = self.layout
-        body = inner.slot_body[mine]
-        rows = {name: body for name in _BODY}
-        rows |= {name: self.model.body_geomadr[body][:, None] + np.arange(boxes + FEET) for name in _GEOM}
-        rows |= {name: self.model.body_jntadr[body] for name in _JOINT}
-        rows |= {name: inner.slot_qvel[mine][:, None] + np.arange(n_v) for name in _DOF}
-        rows |= {name: inner.slot_qpos[mine][:, None] + np.arange(n_q) for name in _QPOS}
+        outer: dict[str, np.ndarray] = {}
+        for model in self.world.models:
+            outer, padding = _rows(model, self.world.layout, own, boxes)
+            hidden = _HIDDEN | {"geom_pos": model.body_ipos[outer["body_ipos"]][:, None]}
+            for name, rows in outer.items():
+                values = getattr(model, name)[rows]
+                if name in hidden:
+                    values = np.where(padding.reshape(padding.shape + (1,) * (values.ndim - 2)), hidden[name], values)
+                tables[name].append(values)
+        rows, _ = _rows(self.model, self.layout, np.arange(first, first + width), boxes)
         stacked = {name: jnp.asarray(np.stack(values), jnp.float32) for name, values in tables.items()}
-        return _Group(own, width, first, stacked, rows)
+        return _Group(own, width, first, stacked, rows, outer)
 
     def _walls(self) -> tuple[dict[str, jax.Array], np.ndarray]:
         world, body = self.world, self.world.layout.structure_body
@@ -195,17 +190,8 @@ class Window:
             (inner.robot_qpos + q, outer.robot_qpos + q, inner.robot_qvel + v, outer.robot_qvel + v)
         ]
         for group, index in zip(self.groups, chosen, strict=True):
-            hinge = outer.slot_kind[group.slots[0]] == "hinge"
-            q, v = np.arange(1 if hinge else 7)[None], np.arange(1 if hinge else 6)[None]
-            mine = slice(group.first, group.first + group.width)
-            found.append(
-                (
-                    inner.slot_qpos[mine][:, None] + q,
-                    jnp.asarray(outer.slot_qpos[group.slots])[index][:, None] + q,
-                    inner.slot_qvel[mine][:, None] + v,
-                    jnp.asarray(outer.slot_qvel[group.slots])[index][:, None] + v,
-                )
-            )
+            (q_in, q_out), (v_in, v_out) = ((group.rows[name], group.outer[name]) for name in ("qpos0", "dof_damping"))
+            found.append((q_in, jnp.asarray(q_out)[index], v_in, jnp.asarray(v_out)[index]))
         return found
 
     def enter(self, state: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
@@ -237,24 +223,20 @@ class Window:
         return out.at[..., slots, :].set(forces[..., -1, :])
 
 
-def _boxes_of(model: mujoco.MjModel, body: int, count: int) -> dict[str, np.ndarray]:
-    """Fields of a body's boxes, padded to `count` with ones too small to be met at its centre of mass, and feet."""
-    start, own = int(model.body_geomadr[body]), int(model.body_geomnum[body]) - FEET
-    tiny = np.full(3, 1e-3)
-    hidden = {
-        "geom_size": tiny,
-        "geom_pos": model.body_ipos[body],
-        "geom_quat": np.array([1.0, 0, 0, 0]),
-        "geom_rbound": np.linalg.norm(tiny),
-        "geom_aabb": np.concatenate([np.zeros(3), tiny]),
-        "geom_friction": model.geom_friction[start],
-    }
-    out = {}
-    for name in _GEOM:
-        values = getattr(model, name)[start : start + own + FEET]
-        padding = np.broadcast_to(hidden[name], (count - own, *values.shape[1:]))
-        out[name] = np.concatenate([values[:own], padding, values[own:]])
-    return out
+def _rows(
+    model: mujoco.MjModel, layout: Layout, slots: np.ndarray, boxes: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Field -> its rows [m, ...] of slots of one kind; of geoms `boxes` and the feet, and where these are padding."""
+    body = layout.slot_body[slots]
+    start, own = model.body_geomadr[body][:, None], model.body_geomnum[body][:, None] - FEET
+    k = np.arange(boxes + FEET)
+    padding = (k >= own) & (k < boxes)
+    geoms = start + np.where(k < own, k, np.where(padding, 0, k - boxes + own))
+    n_q, n_v = (1, 1) if layout.slot_kind[slots[0]] == "hinge" else (7, 6)
+    rows: dict[str, np.ndarray] = {**dict.fromkeys(_BODY, body), **dict.fromkeys(_GEOM, geoms)}
+    rows |= dict.fromkeys(_JOINT, model.body_jntadr[body])
+    rows |= dict.fromkeys(_DOF, layout.slot_qvel[slots][:, None] + np.arange(n_v))
+    return rows | dict.fromkeys(_QPOS, layout.slot_qpos[slots][:, None] + np.arange(n_q)), padding
 
 
 def _static_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

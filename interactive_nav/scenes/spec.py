@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -80,15 +82,25 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
     return np.stack(kept)
 
 
-def sorted_movables(scene: Scene) -> tuple[list[Movable], list[Movable]]:
-    """A scene's free and hinged bodies, in the order of the slots that hold them: most boxes first."""
-    free = sorted((m for m in scene.movables if m.hinge is None), key=lambda m: -len(m.boxes))
-    hinged = sorted((m for m in scene.movables if m.hinge is not None), key=lambda m: -len(m.boxes))
-    return free, hinged
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """A place that all scenes of a batch have for a movable body."""
+
+    name: str
+    kind: str
+    """small, free or hinge."""
+    bodies: tuple[Movable | SmallObject | None, ...]
+    """[S] what each scene has there; None: nothing."""
 
 
-def _slot(lists: list[list[Movable]], index: int) -> list[Movable | None]:
-    return [movables[index] if index < len(movables) else None for movables in lists]
+def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Slot]:
+    """The small objects, then each scene's free bodies and its hinged ones, most boxes first."""
+    slots = [Slot(name, "small", (obj,) * len(scenes)) for name, obj in zip(body_names(small), small, strict=True)]
+    for kind in ("free", "hinge"):
+        own = ([m for m in scene.movables if (m.hinge is None) == (kind == "free")] for scene in scenes)
+        columns = itertools.zip_longest(*(sorted(movables, key=lambda m: -len(m.boxes)) for movables in own))
+        slots += [Slot(f"{kind}_{i}", kind, column) for i, column in enumerate(columns)]
+    return slots
 
 
 def _add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float) -> None:
@@ -258,32 +270,21 @@ def build_empty_spec(
 
 
 def build_spec(
-    robot: RobotSpec,
-    scene_index: int,
-    scenes: tuple[Scene, ...],
-    small: tuple[SmallObject, ...],
-    config: NavConfig,
-) -> tuple[mujoco.MjSpec, list[tuple[str, str]]]:
-    """The padded spec of one scene, and the movable slots as (body name, kind)."""
-    spec = _empty_spec(robot, config)
-    slots: list[tuple[str, str]] = []
-    for name, obj in zip(body_names(small), small, strict=True):
-        _add_small(spec, name, obj, len(slots), config.physics.collision)
-        slots.append((name, "small"))
-    lists = [sorted_movables(s) for s in scenes]
-    for kind, per_scene in (("free", [a for a, _ in lists]), ("hinge", [b for _, b in lists])):
-        for i in range(max(len(x) for x in per_scene)):
-            column = _slot(per_scene, i)
-            n_boxes = max(len(m.boxes) for m in column if m is not None)
-            name = f"{kind}_{i}"
-            _add_movable(
-                spec, name, column[scene_index], n_boxes, kind, len(slots), config.physics.collision, None in column
-            )
-            slots.append((name, kind))
+    robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], slots: Sequence[Slot], config: NavConfig
+) -> mujoco.MjSpec:
+    """The padded spec of one scene."""
+    spec, collision = _empty_spec(robot, config), config.physics.collision
+    for i, slot in enumerate(slots):
+        body = slot.bodies[scene_index]
+        if isinstance(body, SmallObject):
+            _add_small(spec, slot.name, body, i, collision)
+            continue
+        n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
+        _add_movable(spec, slot.name, body, n_boxes, slot.kind, i, collision, None in slot.bodies)
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
-    _add_sensors(spec, robot, slots, config.rules)
+    _add_sensors(spec, robot, [(slot.name, slot.kind) for slot in slots], config.rules)
     _soften(spec, robot, config.physics)
-    return spec, slots
+    return spec
 
 
 def _soften(spec: mujoco.MjSpec, robot: RobotSpec, physics: PhysicsConfig) -> None:

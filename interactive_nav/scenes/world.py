@@ -8,8 +8,10 @@ slot is a body without a place: it waits at its parking spot and never counts.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,8 +21,8 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
-from interactive_nav.scenes.scene import Movable, Scene
-from interactive_nav.scenes.spec import build_spec, parking_spot, sorted_movables
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.scenes.spec import Slot, build_spec, find_slots, parking_spot
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.schema import SceneError
 
@@ -41,14 +43,32 @@ class World:
     rest_qpos: np.ndarray
     """[S, nq]: furniture settled, robot and small objects parked."""
     robot_mass_kg: float
-    mass_kg: np.ndarray
-    """[S, M], 0 for an empty slot."""
-    occupied: np.ndarray
-    """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
-    names: tuple[tuple[str, ...], ...]
-    """[S][M] body names, '' for an empty slot."""
-    categories: tuple[tuple[str, ...], ...]
-    """[S][M] categories of the same."""
+    slots: tuple[Slot, ...]
+    """[M] what may move, by scene."""
+
+    @functools.cached_property
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """[S][M] body names, '' for an empty slot."""
+        return self._told(lambda slot, body: slot.name if slot.kind == "small" else body.name)
+
+    @functools.cached_property
+    def categories(self) -> tuple[tuple[str, ...], ...]:
+        """[S][M] categories of the same."""
+        return self._told(lambda slot, body: body.category)
+
+    def _told(self, of: Callable[[Slot, Any], str]) -> tuple[tuple[str, ...], ...]:
+        every = range(len(self.scenes))
+        return tuple(tuple(of(slot, slot.bodies[s]) if slot.bodies[s] else "" for slot in self.slots) for s in every)
+
+    @functools.cached_property
+    def occupied(self) -> np.ndarray:
+        """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
+        return np.array([[name != "" for name in names] for names in self.names], bool)
+
+    @functools.cached_property
+    def mass_kg(self) -> np.ndarray:
+        """[S, M], 0 for an empty slot."""
+        return self.occupied * np.stack([model.body_mass[self.layout.slot_body] for model in self.models])
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
@@ -75,24 +95,6 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
     return qpos
 
 
-def _names_and_categories(
-    scene: Scene, small: Sequence[SmallObject], slots: list[tuple[str, str]]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """[M] names and categories of what a scene has in each slot; '' where it has nothing."""
-    free, hinged = sorted_movables(scene)
-    movables: dict[str, list[Movable]] = {"free": free, "hinge": hinged}
-    found = []
-    for name, kind in slots:
-        index = int(name.rsplit("_", 1)[1])
-        if kind == "small":
-            found.append((name, small[index].category))
-        else:
-            there = index < len(movables[kind])
-            found.append((movables[kind][index].name, movables[kind][index].category) if there else ("", ""))
-    names, categories = zip(*found, strict=True) if found else ((), ())
-    return names, categories
-
-
 def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) -> World:
     """Compiles one padded model per scene and settles its furniture under the environment's own physics.
 
@@ -114,24 +116,14 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
             "use collision='boxes'"
         )
     small = small_objects(config.rules.num_objects, config.rules.small_objects, config.rules.objects)
-    specs, models, slots = [], [], []
-    for i in range(len(scenes)):
-        spec, slots = build_spec(robot, i, scenes, small, config)
-        specs.append(spec)
-        models.append(spec.compile())
-    layout = find_layout(models[0], robot, slots)
-    occupied, mass, names, categories, rest = [], [], [], [], []
-    for scene, model in zip(scenes, models, strict=True):
-        label, category = _names_and_categories(scene, small, slots)
-        own = np.array([name != "" for name in label], bool)
-        qpos = _settle(model, layout, robot)
+    slots = find_slots(scenes, small)
+    specs = [build_spec(robot, i, scenes, slots, config) for i in range(len(scenes))]
+    models = [spec.compile() for spec in specs]
+    layout = find_layout(models[0], robot, [(slot.name, slot.kind) for slot in slots])
+    rest = [_settle(model, layout, robot) for model in models]
+    for scene, qpos in zip(scenes, rest, strict=True):
         if not np.isfinite(qpos).all():
             raise SceneError(f"{scene.path}: its furniture does not settle (non-finite); convert the scene again")
-        occupied.append(own)
-        names.append(label)
-        categories.append(category)
-        mass.append(np.where(own, model.body_mass[layout.slot_body], 0.0))
-        rest.append(qpos)
     return World(
         robot=robot,
         scenes=scenes,
@@ -141,8 +133,5 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         layout=layout,
         rest_qpos=np.asarray(rest),
         robot_mass_kg=float(models[0].body_mass[layout.robot_bodies].sum()),
-        mass_kg=np.asarray(mass),
-        occupied=np.asarray(occupied),
-        names=tuple(names),
-        categories=tuple(categories),
+        slots=tuple(slots),
     )

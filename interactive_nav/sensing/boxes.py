@@ -15,9 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.scenes.objects import VISUAL_GROUP
-from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.spec import sorted_movables
+from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, body_colours, geom_colour
 from interactive_nav_common.rotations import Array, matrix_from_quat
@@ -152,18 +150,15 @@ class BoxTables:
         return len(self.body)
 
 
-def boxes_of_slots(world: World, scene: Scene, classes: MaskClasses) -> list[tuple[np.ndarray, int]]:
+def boxes_of_slots(world: World, s: int, classes: MaskClasses) -> list[tuple[np.ndarray, int]]:
     """Boxes [n, 10] and class id of what is in each slot of a scene, then of its walls."""
-    free, hinged = sorted_movables(scene)
-    own, out = {"free": iter(free), "hinge": iter(hinged)}, []
-    for i, kind in enumerate(world.layout.slot_kind):
-        if kind == "small":
-            out.append((world.small_objects[i].rows, world.small_objects[i].mask_id(classes)))
-            continue
-        movable = next(own[kind], None)
-        boxes = np.zeros((0, 10)) if movable is None else movable.boxes
-        out.append((boxes, 0 if movable is None else class_id(movable.category, classes)))
-    return [*out, (scene.walls, 0)]
+    out = []
+    for body in (slot.bodies[s] for slot in world.slots):
+        if isinstance(body, SmallObject):
+            out.append((body.rows, body.mask_id(classes)))
+        else:
+            out.append((body.boxes, class_id(body.category, classes)) if body else (np.zeros((0, 10)), 0))
+    return [*out, (world.scenes[s].walls, 0)]
 
 
 def _colours_of_slots(world: World, s: int, ids: list[int], classes: MaskClasses) -> np.ndarray:
@@ -187,7 +182,7 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, r
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
-    columns = [boxes_of_slots(world, scene, classes) for scene in scenes]
+    columns = [boxes_of_slots(world, s, classes) for s in range(len(scenes))]
     if robot:
         model, number = world.models[0], class_id("robot", classes)
         boxes = [np.reshape([geom_box(model, geom) for geom in own], (-1, 10)) for own in robot_geoms(world)]

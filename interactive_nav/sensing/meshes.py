@@ -108,7 +108,7 @@ def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _
 def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[int]]:
     """What there is to see of a scene, bodies without visual meshes as their boxes; and the class of each slot."""
     model = mujoco.MjModel.from_xml_path(str(world.scenes[s].path / "scene.xml"))
-    column = boxes_of_slots(world, world.scenes[s], tables.classes)
+    column = boxes_of_slots(world, s, tables.classes)
     visual: dict[str, list[int]] = {}
     for geom in np.flatnonzero((model.geom_group == VISUAL_GROUP) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)):
         visual.setdefault(model.body(int(model.geom_bodyid[geom])).name, []).append(int(geom))
