@@ -142,11 +142,11 @@ def test_what_would_change_nothing_is_refused(words, unused, capsys):
 @pytest.mark.parametrize(
     ("words", "unused"),
     [
-        (["all", "S", "--map", "M"], "--map"),
+        (["navigator", "--map", "M"], "--map"),
         (["navigator", "--goal", "G"], "--goal"),
         (["navigator", "--policy", "passage"], "--policy"),
         (["check", "seed=1"], "seed"),
-        (["record", "B", "width=1"], "width"),
+        (["all", "width=1"], "width"),
     ],
 )
 def test_what_a_node_would_not_look_at_is_refused(words, unused, capsys):

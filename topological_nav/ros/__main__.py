@@ -1,4 +1,4 @@
-"""`python -m topological_nav.ros all|sim|navigator|record|check`: the simulator and the navigator as ROS nodes.
+"""`python -m topological_nav.ros all|sim|navigator|check`: the simulator and the navigator as ROS nodes.
 
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import json
+import os
 import re
 import sys
 import time
@@ -22,7 +22,7 @@ from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import add_words, read_commands
 from scenes_mjcf.schema import SceneError
 from topological_nav.config import RUNS, NavigatorConfig
-from topological_nav.ros import debian, launch
+from topological_nav.ros import debian
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
@@ -47,23 +47,15 @@ def parser() -> argparse.ArgumentParser:
 
     sim, heading = ("the simulator", SimulatorConfig()), ("driver heading", HeadingConfig())
     topological = ("driver topological", NavigatorConfig())
-    everything = command(
-        "all", "One episode: master where none is, simulator, navigator, recorder.", sim, heading, topological
-    )
-    alone = command("sim", "The simulator's node, and a master where none is.", sim)
+    everything = command("all", "One episode by roslaunch: simulator, navigator, recorder, master where none is.")
+    everything.add_argument("words", nargs=argparse.REMAINDER, metavar="name:=value", help="see episode.launch")
+    alone = command("sim", "The simulator's node.", sim)
     navigator = command("navigator", "The navigator's node, for a robot or a simulator.", heading, topological)
     sets = read_commands(Path(__file__).with_name("words.yaml"))
-    for sub in (everything, alone):
-        add_words(sub, sets["scene"].words)
-        add_words(sub.add_mutually_exclusive_group(), sets["pace"].words)
-        add_words(sub, sets["limit"].words)
     add_words(alone, sets["sim"].words)
-    add_words(everything, sets["all"].words)
-    for sub in (everything, navigator):
-        add_words(sub, sets["driver"].words, drivers=tuple(DRIVERS))
-        add_words(sub.add_argument_group("driver topological"), sets["topological"].words, runs=RUNS)
-    record = command("record", "Writes all topics into a bag until it is stopped.")
-    record.add_argument("bag", type=Path)
+    add_words(alone.add_mutually_exclusive_group(), sets["pace"].words)
+    add_words(navigator, sets["navigator"].words, drivers=tuple(DRIVERS))
+    add_words(navigator.add_argument_group("driver topological"), sets["topological"].words, runs=RUNS)
     command("check", "Says whether ROS can be used here.")
     return made
 
@@ -71,10 +63,12 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] != ["all"]:
+        words = [word for word in words if ":=" not in word]  # of roslaunch to rospy
     settings = [word for word in words if re.match(r"\w+=", word)]
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
-    run = {"all": _all, "sim": _sim, "navigator": _navigator, "record": _record, "check": _check}
+    run = {"all": _all, "sim": _sim, "navigator": _navigator, "check": _check}
     with stop_signals() as stops:
         try:
             _refuse_unused(arguments)
@@ -82,15 +76,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         except (UserError, SceneError) as error:
             print(f"topological_nav.ros: {error}", file=sys.stderr)
             return 2
-        return 128 + stops[0] if stops and arguments.command != "record" else 0
+        return 128 + stops[0] if stops else 0
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:
     """Refuses what the chosen driver, or the command, does not look at."""
-    if arguments.command in ("record", "check"):
+    if arguments.command in ("all", "check"):
         named = " ".join(word.partition("=")[0] for word in arguments.settings)
         refuse_unused(arguments, named, f"in '{arguments.command}', which has no settings")
-    elif arguments.command != "sim" and arguments.driver == "heading":
+    elif arguments.command == "navigator" and arguments.driver == "heading":
         options = "--map --localiser --detector --policy --goal --goal-heading"
         refuse_unused(arguments, options, "with --driver heading, only with --driver topological")
 
@@ -115,35 +109,12 @@ def _journey(arguments: argparse.Namespace) -> Any:
 
 
 def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
-    ros = debian.load()
-    steers = DRIVERS[arguments.driver]
-    mine = {f.name for f in dataclasses.fields(steers)}
-    steering = [word for word in arguments.settings if word.partition("=")[0] in mine]
-    simulating = [word for word in arguments.settings if word not in steering]
-    # Mistakes are told here, before anything starts.
-    overridden(SimulatorConfig(), simulating)
-    overridden(steers(), steering)
-    journey: list[str] = []
-    if arguments.driver == "topological":
-        from topological_nav.ros.pilot import goal_words
-
-        journey = list(goal_words(_journey(arguments)))
-    pace = ["--lockstep"] if arguments.lockstep else ["--factor", str(arguments.factor)]
-    pace += ["--limit", str(arguments.limit), *(["--recorded"] if arguments.bag else [])]
-    heading = ["--heading-from", arguments.heading_from, "--heading-offset", str(arguments.heading_offset)]
-    with launch.some_master(ros, arguments.port) as uri, launch.Nodes() as nodes:
-        print(f"master: {uri}", file=sys.stderr, flush=True)
-        recorder = nodes.start(["record", str(arguments.bag)]) if arguments.bag else None
-        simulator = nodes.start(["sim", str(arguments.scene), *pace, *simulating])
-        nodes.start(["navigator", "--driver", arguments.driver, *heading, *journey, *steering])
-        if not nodes.wait(simulator, lambda: bool(stops)):
-            return
-        assert simulator.stdout is not None
-        print(simulator.stdout.read().strip(), flush=True)
-        if recorder is not None:
-            launch.end(recorder)
-            assert recorder.stdout is not None
-            print(recorder.stdout.read().strip(), flush=True)
+    del stops
+    debian.load()
+    here = Path(__file__).parent
+    words = ("roslaunch", str(here / "episode.launch"), f"python:={sys.executable}", *arguments.words)
+    path = os.pathsep.join((str(here), os.environ.get("ROS_PACKAGE_PATH") or "/usr/share"))
+    os.execvpe(words[0], words, {**os.environ, "ROS_PACKAGE_PATH": path, "PWD": os.getcwd()})
 
 
 def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
@@ -152,7 +123,8 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
     from topological_nav.ros.nodes import Pace, SimulatorNode
     from topological_nav.ros.simulator import RosSimulator
 
-    with launch.some_master(ros, arguments.port), _ended(ros):
+    debian.need_master(ros)
+    with _ended(ros):
         with contextlib.redirect_stdout(sys.stderr):  # Warp tells of its kernels there
             simulator = RosSimulator(arguments.scene, config)
             pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.recorded)
@@ -167,7 +139,7 @@ def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
     from topological_nav.ros import drivers
     from topological_nav.ros.nodes import NavigatorNode
 
-    launch.need_master(ros)
+    debian.need_master(ros)
     with _ended(ros):
         if journey is None:
             driver: drivers.Driver = drivers.HeadingDriver(config)
@@ -178,17 +150,6 @@ def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
         node = NavigatorNode(ros, driver, arguments.heading_from, arguments.heading_offset, _tell)
         done = node.run(lambda: bool(stops))
         _tell(f"navigator: {'done' if done else 'stopped'}")
-
-
-def _record(arguments: argparse.Namespace, stops: list[int]) -> None:
-    ros = debian.load()
-    from topological_nav.ros.recorder import RecorderNode
-
-    launch.need_master(ros)
-    arguments.bag.parent.mkdir(parents=True, exist_ok=True)
-    with _ended(ros):
-        count = RecorderNode(ros, arguments.bag).run(lambda: bool(stops))
-        print(f"{arguments.bag}: {count:,} messages", flush=True)
 
 
 def _check(arguments: argparse.Namespace, stops: list[int]) -> None:

@@ -9,21 +9,23 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import sys
 import types
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from interactive_nav_common.errors import UserError
 
 DIST_PACKAGES = Path("/usr/lib/python3/dist-packages")
 PACKAGES = (
-    "ros-core python3-rospy python3-rosbag python3-rosmaster python3-std-msgs python3-sensor-msgs "
+    "ros-core python3-rospy python3-std-msgs python3-sensor-msgs "
     "python3-geometry-msgs python3-nav-msgs python3-rosgraph-msgs python3-tf2-msgs"
 )
 """Of Debian 12 and later."""
 _MODULES = (
-    *("rospy", "rosbag", "rosmaster.master", "rosgraph"),
+    *("rospy", "rosgraph"),
     *(f"{name}.msg" for name in ("std_msgs", "sensor_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "tf2_msgs")),
 )
 
@@ -50,3 +52,12 @@ def load() -> types.SimpleNamespace:
             ) from None
         found[name.split(".")[0]] = module
     return types.SimpleNamespace(**found)
+
+
+def need_master(ros: Any) -> None:
+    """Raises RosError unless a master is there; where it is on loopback, this process's node stays there too."""
+    uri = os.environ.get("ROS_MASTER_URI") or "http://localhost:11311"
+    if urlsplit(uri).hostname in ("localhost", "127.0.0.1", "::1") and "ROS_HOSTNAME" not in os.environ:
+        os.environ.setdefault("ROS_IP", "127.0.0.1")
+    if not ros.rosgraph.is_master_online():
+        raise RosError(f"no master answers at {uri}; start one (roscore), or set ROS_MASTER_URI")

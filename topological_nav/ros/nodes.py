@@ -153,6 +153,8 @@ class SimulatorNode:
         listeners[topics.IMAGE] = 2 if self._pace.recorded else 1
 
         def lacking() -> list[str]:
+            if self._pace.recorded:  # rosbag waits for a time
+                self._out[topics.CLOCK].publish(self._ros.rosgraph_msgs.Clock(self._stamp(0.0)))
             out = [name for name, least in listeners.items() if self._out[name].get_num_connections() < least]
             return out if self._in.get_num_connections() else [*out, topics.COMMAND]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,16 +55,6 @@ def topological_driver(journey: Journey, config: NavigatorConfig) -> PilotDriver
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in journey.goals])
     around = journey.goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
     return PilotDriver(Pilot(Navigator(made, sight, policy, config), pictures[None], around), lens)
-
-
-def goal_words(journey: Journey) -> Sequence[str]:
-    """The command line's words for a journey: what the navigator's own process is started with."""
-    goals = [word for goal in journey.goals for word in ("--goal", str(goal))]
-    return [
-        *goals,
-        *("--goal-heading", str(journey.goal_heading_rad), "--map", str(journey.map), "--policy", journey.policy),
-        *("--localiser", str(journey.localiser), "--detector", str(journey.detector)),
-    ]
 
 
 def _picture(path: Path) -> np.ndarray:

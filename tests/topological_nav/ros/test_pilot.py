@@ -11,9 +11,8 @@ from topological_nav.config import NavigatorConfig
 from topological_nav.data.dataset import load_rooms
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
-from topological_nav.ros.__main__ import DRIVERS, main
-from topological_nav.ros.config import SimulatorConfig
-from topological_nav.ros.pilot import Journey, goal_words, topological_driver
+from topological_nav.ros.__main__ import main
+from topological_nav.ros.pilot import Journey, topological_driver
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +44,13 @@ def test_out_of_time_it_is_done(made, goal):
     assert driver.step(goal[1], 0.5, 11.0).done
 
 
-def test_words_for_the_navigators_process_say_all_of_it(made, goal):
+def test_a_journey_is_read_from_words(made, goal):
     journey = Journey(made.map, made.rooms, made.passages, (goal[0], goal[0]), 0.5)
     from topological_nav.ros.__main__ import _journey, parser
 
-    assert _journey(parser().parse_args(["navigator", "--driver", "topological", *goal_words(journey)])) == journey
+    words = ["--goal", str(goal[0])] * 2 + ["--goal-heading", "0.5", "--map", str(made.map), "--policy", journey.policy]
+    words += ["--localiser", str(made.rooms), "--detector", str(made.passages)]
+    assert _journey(parser().parse_args(["navigator", "--driver", "topological", *words])) == journey
 
 
 def test_what_is_missing_is_told(made, tmp_path, capsys):
@@ -61,8 +62,3 @@ def test_what_is_missing_is_told(made, tmp_path, capsys):
         topological_driver(journey, NavigatorConfig())
     assert main(["navigator", "--driver", "topological"]) == 2
     assert "needs a map: --map PATH" in capsys.readouterr().err
-
-
-def test_no_drivers_settings_are_the_simulators():
-    for config in DRIVERS.values():
-        assert not set(vars(config())) & set(vars(SimulatorConfig()))
