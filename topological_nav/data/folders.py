@@ -20,7 +20,7 @@ from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import CameraConfig
-from topological_nav.data.shards import ShardWriter
+from topological_nav.data.shards import THREADS, in_order, write_shard
 from topological_nav.errors import DatasetError
 from topological_nav.scenes.rendering import SceneRenderer, need_engine
 
@@ -130,31 +130,37 @@ def draw_missing(
         config: how they are drawn and stored.
         progress: told after every file.
     """
-    lens, done = lens_of(config, get_robot(config.robot)), 0
-    with ShardWriter(config.quality) as writer:
+    lens = lens_of(config, get_robot(config.robot))
+
+    def missing() -> Iterator[Callable[[], tuple[str, int]]]:
         for name, load, files in scenes:
             renderer: SceneRenderer | None = None
             for path, poses in files:
-                done += sum(len(pose.pos_w) for pose in poses)
-                told = functools.partial(progress, name, done, total)
-                if path.is_file():
-                    writer.skip(told)
-                    continue
-                renderer = renderer or SceneRenderer(load(), lens, config.supersample, config.engine)
-                writer.put(path, _draw_sheets(renderer, poses), told)
+                sheets = []
+                if not path.is_file():
+                    renderer = renderer or SceneRenderer(load(), lens, config.supersample, config.engine)
+                    sheets = _draw_sheets(renderer, poses)
+                told = name, sum(len(pose.pos_w) for pose in poses)
+                yield functools.partial(_written, path, sheets, config.quality, told)
+
+    done = 0
+    with contextlib.closing(in_order(missing(), 2 * THREADS)) as written:
+        for name, count in written:
+            done += count
+            progress(name, done, total)
+
+
+def _written(path: Path, sheets: list[np.ndarray], quality: int, told: tuple[str, int]) -> tuple[str, int]:
+    if sheets:
+        write_shard(path, sheets, quality)
+    return told
 
 
 def _draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
     """Images [n_i, H, W, 3] of groups of cameras, drawn together: full batches."""
-    pos, axes = (
-        np.concatenate([np.asarray(leaf) for leaf in column]) for column in zip(*map(_leaves, poses), strict=True)
-    )
-    images = renderer.draw(CameraPose(pos, axes))  # type: ignore[arg-type]
+    together = CameraPose(*(np.concatenate([getattr(pose, name) for pose in poses]) for name in ("pos_w", "axes_w")))
+    images = renderer.draw(together)
     return np.split(images, np.cumsum([len(pose.pos_w) for pose in poses])[:-1])
-
-
-def _leaves(pose: CameraPose) -> tuple[Any, Any]:
-    return pose.pos_w, pose.axes_w
 
 
 def folder_bytes(folder: Path) -> int:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from PIL import Image
@@ -20,8 +21,7 @@ from topological_nav.errors import DatasetError
 
 COLUMNS = 18
 """Images a row of a sheet."""
-
-
+Result = TypeVar("Result")
 THREADS = min(usable_cores(), 16)
 """That encode and decode: WebP's library runs outside of Python's lock."""
 
@@ -76,62 +76,26 @@ def read_shard(path: Path) -> np.ndarray:
         )
 
 
-class ShardWriter:
-    """Writes files in threads while the caller draws the next; `with` waits for all of them.
+def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Iterator[Result]:
+    """Results of tasks that threads run, in the tasks' order.
 
-    Files end in any order, but are told in theirs. Where the block raises, files that are being written are finished
-    and the others left out.
+    Where a task or the caller raises, tasks that have begun are finished and the others left out.
+
+    Args:
+        tasks: taken one by one, in the caller's thread.
+        ahead: at most so many have been taken beyond the one whose result is told.
     """
-
-    def __init__(self, quality: int):
-        """Starts nothing yet.
-
-        Args:
-            quality: of WebP; 100 is without loss.
-        """
-        self._quality = quality
-        self._pool = ThreadPoolExecutor(THREADS)
-        self._waiting: deque[tuple[Future[Any] | None, Callable[[], None]]] = deque()
-
-    def __enter__(self) -> ShardWriter:
-        """Itself."""
-        return self
-
-    def put(self, path: Path, sheets: list[np.ndarray], told: Callable[[], None]) -> None:
-        """Has a file written; see `write_shard`.
-
-        Args:
-            path: the file.
-            sheets: groups of images.
-            told: called in this thread once it and all before it are there; may raise.
-        """
-        self._waiting.append((self._pool.submit(write_shard, path, sheets, self._quality), told))
-        self._tell(2 * THREADS)
-
-    def skip(self, told: Callable[[], None]) -> None:
-        """A file that is there already: `told` as in `put`."""
-        self._waiting.append((None, told))
-        self._tell(2 * THREADS)
-
-    def _tell(self, most: int) -> None:
-        """Tells of what is done, and waits until at most so many files are not."""
-        while self._waiting and (len(self._waiting) > most or _done(self._waiting[0][0])):
-            future, told = self._waiting.popleft()
-            if future is not None:
-                future.result()
-            told()
-
-    def __exit__(self, kind: Any, *_: Any) -> None:
-        """Waits for what is being written, and tells of the rest."""
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(THREADS) as pool:
         try:
-            if kind is None:
-                self._tell(0)
+            for task in tasks:
+                waiting.append(pool.submit(task))
+                while waiting and (len(waiting) > ahead or waiting[0].done()):
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
         finally:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _done(future: Future[Any] | None) -> bool:
-    return future is None or future.done()
+            pool.shutdown(cancel_futures=True)
 
 
 def read_shards(paths: Sequence[Path]) -> Iterator[np.ndarray]:
@@ -140,15 +104,4 @@ def read_shards(paths: Sequence[Path]) -> Iterator[np.ndarray]:
     Raises:
         DatasetError: see `read_shard`.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
-        ahead: deque[Future[np.ndarray]] = deque()
-        try:
-            for path in paths:
-                ahead.append(pool.submit(read_shard, path))
-                if len(ahead) > THREADS:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
-        finally:
-            for future in ahead:
-                future.cancel()
+    return in_order((functools.partial(read_shard, path) for path in paths), THREADS)

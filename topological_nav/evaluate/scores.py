@@ -8,10 +8,13 @@ A scene's intervals are over its episodes (Wilson's for shares, bootstrap for me
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from rich.table import Table
 
 from interactive_nav_common import rows as tables
@@ -26,6 +29,8 @@ SCORES = {
     "within": "within 1.5 m",
 }
 """Name -> heading; `within` is the share of episodes that ended near the goal, whatever the navigator believed."""
+HEADER = ("contender", "scene", "episodes", *SCORES.values())
+EPISODE = ["scene", "episode"]
 OF_SUCCESSES = {"rc": "contact", "aadc_s": "aadc_s", "duration_s": "duration_s"}
 
 
@@ -59,10 +64,7 @@ def score(rows: pa.Table, name: str) -> Score:
 
 def where(rows: pa.Table, **wanted: str) -> pa.Table:
     """Rows whose columns have these values."""
-    kept = np.ones(len(rows), bool)
-    for name, value in wanted.items():
-        kept &= np.array([x == value for x in rows[name].to_pylist()], bool)
-    return rows.filter(pa.array(kept))
+    return rows.filter(functools.reduce(operator.and_, (pc.field(name) == value for name, value in wanted.items())))
 
 
 def over_scenes(rows: pa.Table, name: str) -> Score:
@@ -100,7 +102,7 @@ def summary(rows: pa.Table) -> list[Line]:
 
 
 def _in_order(rows: pa.Table, name: str) -> list[str]:
-    return list(dict.fromkeys(rows[name].to_pylist()))
+    return rows[name].unique().to_pylist()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,16 +122,14 @@ class Difference:
 def differences(rows: pa.Table) -> list[Difference]:
     """Dense minus sparse map on the same episodes, scene by scene; unseen minus seen scenes, Welch's test."""
     found = []
-    scenes, contenders = _in_order(rows, "scene"), _in_order(rows, "contender")
+    contenders = _in_order(rows, "contender")
     for name in ("success", "spl"):
         if {"dense", "sparse"} <= set(contenders):
-            gaps = []
-            for scene in scenes:
-                sides = [_by_episode(where(rows, scene=scene, contender=c), name) for c in ("dense", "sparse")]
-                both = sorted(set(sides[0]) & set(sides[1]))
-                if both:
-                    gaps.append(float(np.mean([sides[0][e] - sides[1][e] for e in both])))
-            found.append(Difference("dense minus sparse map", name, estimate(gaps)))
+            dense, sparse = (where(rows, contender=c).select([*EPISODE, name]) for c in ("dense", "sparse"))
+            both = dense.join(sparse, EPISODE, join_type="inner", right_suffix="_sparse")
+            both = both.append_column("gap", pc.subtract(both[name], both[f"{name}_sparse"]))
+            gaps = both.group_by("scene").aggregate([("gap", "mean")])["gap_mean"]
+            found.append(Difference("dense minus sparse map", name, estimate(gaps.to_pylist())))
         for contender in contenders:
             mine = where(rows, contender=contender)
             sides = [
@@ -141,17 +141,11 @@ def differences(rows: pa.Table) -> list[Difference]:
     return found
 
 
-def _by_episode(rows: pa.Table, name: str) -> dict[int, float]:
-    return dict(zip(rows["episode"].to_pylist(), rows[name].to_pylist(), strict=True))
-
-
 def console_table(lines: Sequence[Line]) -> Table:
     """For a terminal."""
     made = Table(caption="mean [95 % interval]; RC, AADC and duration of successes")
-    for heading in ("contender", "scene", "episodes"):
-        made.add_column(heading)
-    for heading in SCORES.values():
-        made.add_column(heading, justify="right")
+    for heading in HEADER:
+        made.add_column(heading, justify="right" if heading in SCORES.values() else "left")
     for line in lines:
         made.add_row(*_cells(line))
     return made
@@ -159,7 +153,7 @@ def console_table(lines: Sequence[Line]) -> Table:
 
 def markdown(lines: Sequence[Line], compared: Sequence[Difference]) -> str:
     """For a file: the summary and the comparisons."""
-    text = tables.markdown(("contender", "scene", "episodes", *SCORES.values()), map(_cells, lines))
+    text = tables.markdown(HEADER, map(_cells, lines))
     header = ("Compared", "Score", "Difference [95 % interval]")
     told = [(d.compared, SCORES[d.score], d) for d in compared]
     return text + ("\n" + tables.markdown(header, told) if told else "")

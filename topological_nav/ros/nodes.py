@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -321,30 +322,26 @@ class NavigatorNode:
         return lens.fov_deg if isinstance(lens, Lens) else math.nan
 
     def _on_image(self, message: Any) -> None:
-        with self._news:
+        with self._reading(topics.IMAGE):
             self._image = message
-            self._news.notify_all()
 
     def _on_heading(self, message: Any) -> None:
         quat = message.orientation if self._heading_topic == topics.HEADING else message.pose.pose.orientation
-        try:
-            yaw = messages.quat_yaw(quat)
-        except messages.MessageError as error:
-            self._tell(f"navigator: {self._heading_topic}: {error}")
-            return
-        with self._news:
-            self._headings.add(message.header.stamp.to_sec(), yaw)
-            self._news.notify_all()
+        with self._reading(self._heading_topic):
+            self._headings.add(message.header.stamp.to_sec(), messages.quat_yaw(quat))
 
     def _on_info(self, message: Any) -> None:
-        try:
-            lens = messages.info_lens(message)
-        except messages.MessageError as error:
-            self._tell(f"navigator: {topics.INFO}: {error}")
-            return
+        with self._reading(topics.INFO):
+            self._lens = messages.info_lens(message)
+
+    @contextlib.contextmanager
+    def _reading(self, topic: str) -> Iterator[None]:
         with self._news:
-            self._lens = lens
-            self._news.notify_all()
+            try:
+                yield
+                self._news.notify_all()
+            except messages.MessageError as error:
+                self._tell(f"navigator: {topic}: {error}")
 
 
 def _told(news: threading.Condition, ready: Callable[[], bool]) -> Callable[[], bool]:

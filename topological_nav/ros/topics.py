@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import bisect
 import math
+from collections import deque
 from typing import Any
+
+import numpy as np
 
 CLOCK, COMMAND, DONE = "/clock", "/cmd_vel", "/navigator/done"
 IMAGE, INFO = "/camera/image_raw", "/camera/camera_info"
@@ -56,23 +58,18 @@ class Headings:
     """Headings of the last while, asked by time; not safe for several threads at once."""
 
     def __init__(self, kept: int = 256):
-        self._kept = kept
-        self._times: list[float] = []
-        self._yaws: list[float] = []
+        self._told: deque[tuple[float, float]] = deque(maxlen=kept)
 
     def add(self, time_s: float, yaw_rad: float) -> None:
         """Tells a heading; one that is older than the newest begins anew (a clock that was set back)."""
-        if self._times and time_s < self._times[-1]:
-            self._times.clear()
-            self._yaws.clear()
-        self._times.append(time_s)
-        self._yaws.append(yaw_rad)
-        del self._times[: -self._kept], self._yaws[: -self._kept]
+        if time_s < self.newest_s:
+            self._told.clear()
+        self._told.append((time_s, yaw_rad))
 
     @property
     def newest_s(self) -> float:
         """Time of the last heading; minus infinity before the first."""
-        return self._times[-1] if self._times else -math.inf
+        return self._told[-1][0] if self._told else -math.inf
 
     def at(self, time_s: float) -> float:
         """Heading, rad in [-pi, pi]: turned evenly between two tellings, else the nearest one.
@@ -80,12 +77,7 @@ class Headings:
         Raises:
             ValueError: none was told yet.
         """
-        if not self._times:
+        if not self._told:
             raise ValueError("no heading was told yet")
-        i = bisect.bisect_left(self._times, time_s)
-        if i == len(self._times) or i == 0:
-            return math.remainder(self._yaws[min(i, len(self._yaws) - 1)], math.tau)
-        before, after = self._times[i - 1], self._times[i]
-        share = (time_s - before) / (after - before)
-        turn = math.remainder(self._yaws[i] - self._yaws[i - 1], math.tau)
-        return math.remainder(self._yaws[i - 1] + share * turn, math.tau)
+        times, yaws = np.array(self._told).T
+        return math.remainder(np.interp(time_s, times, np.unwrap(yaws)), math.tau)

@@ -1,5 +1,7 @@
 """Images through files and back."""
 
+import contextlib
+import functools
 import threading
 
 import numpy as np
@@ -47,44 +49,35 @@ def test_a_damaged_file_is_refused_by_name(tmp_path):
         shards.read_shard(path)
 
 
-def test_files_are_written_in_threads_and_told_in_order(tmp_path, monkeypatch):
-    write, told = shards.write_shard, []
-
-    def slow_first(path, sheets, quality):
-        if path.name == "0.npz":
-            second_done.wait(10)
-        size = write(path, sheets, quality)
-        if path.name == "1.npz":
-            second_done.set()
-        return size
-
-    second_done = threading.Event()
-    monkeypatch.setattr(shards, "write_shard", slow_first)
+def test_tasks_run_in_threads_and_are_told_in_order(tmp_path, monkeypatch):
     monkeypatch.setattr(shards, "THREADS", 2)
-    with shards.ShardWriter(100) as writer:
-        for k in range(4):
-            writer.put(tmp_path / f"{k}.npz", [smooth(k + 1)], lambda k=k: told.append(k))
-        writer.skip(lambda: told.append(4))
-    assert told == [0, 1, 2, 3, 4]
+    second_done = threading.Event()
+
+    def write(k):
+        if k == 0:
+            assert second_done.wait(10)
+        shards.write_shard(tmp_path / f"{k}.npz", [smooth(k + 1)], 100)
+        if k == 1:
+            second_done.set()
+        return k
+
+    assert list(shards.in_order((functools.partial(write, k) for k in range(4)), 4)) == [0, 1, 2, 3]
     back = list(shards.read_shards([tmp_path / f"{k}.npz" for k in range(4)]))
     assert all((images == smooth(k + 1)).all() for k, images in enumerate(back)) and len(back) == 4
 
 
 def test_a_stop_leaves_whole_files_only(tmp_path, monkeypatch):
     monkeypatch.setattr(shards, "THREADS", 1)
-
-    def stop():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), shards.ShardWriter(100) as writer:
-        for k in range(50):
-            writer.put(tmp_path / f"{k}.npz", [smooth(20)], stop if k == 2 else lambda: None)
+    tasks = (functools.partial(shards.write_shard, tmp_path / f"{k}.npz", [smooth(20)], 100) for k in range(50))
+    with contextlib.closing(shards.in_order(tasks, 2)) as written:
+        assert next(written) and next(written)
     there = sorted(tmp_path.iterdir())
-    assert 3 <= len(there) < 50
+    assert 2 <= len(there) < 10
     assert all(len(images) == 20 for images in shards.read_shards(there))
 
 
 def test_what_a_thread_could_not_write_is_said(tmp_path):
     (tmp_path / "taken").write_text("")
-    with pytest.raises(UserError, match="cannot be written"), shards.ShardWriter(100) as writer:
-        writer.put(tmp_path / "taken" / "0.npz", [smooth(2)], lambda: None)
+    write = functools.partial(shards.write_shard, tmp_path / "taken" / "0.npz", [smooth(2)], 100)
+    with pytest.raises(UserError, match="cannot be written"):
+        list(shards.in_order([write], 1))
