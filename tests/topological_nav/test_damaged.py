@@ -6,8 +6,8 @@ import pytest
 from interactive_nav_common.errors import UserError
 from topological_nav.__main__ import main
 from topological_nav.data.dataset import load_plan
+from topological_nav.data.shards import read_arrays as read_batch
 from topological_nav.data.shards import read_shard
-from topological_nav.drives.dataset import _read as read_batch
 from topological_nav.drives.driving import load_policy
 from topological_nav.learn.runs import claimed
 from topological_nav.learn.training import load_trained

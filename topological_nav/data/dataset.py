@@ -26,7 +26,7 @@ from interactive_nav_common.files import write_arrays
 from topological_nav.config import DataConfig
 from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
 from topological_nav.data.passages import Passages, draw_passages, held_out
-from topological_nav.data.shards import read_shards
+from topological_nav.data.shards import read_arrays, read_shards
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
@@ -219,7 +219,8 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
         DatasetError: missing or damaged.
     """
     path = Path(folder) / scene / "plan.npz"
-    with readable(path, DatasetError, "run 'data' again"), np.load(path, allow_pickle=False) as arrays:
+    arrays = read_arrays(path)
+    with readable(path, DatasetError, "run 'data' again"):
         rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
         passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
         return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
@@ -257,9 +258,6 @@ def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
 def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.ndarray:
     sheets = math.ceil(count / (3 * config.headings))
     files = [folder / f"{kind}-{i:03d}.npz" for i in range(math.ceil(sheets / config.shard))]
-    missing = [path.name for path in files if not path.is_file()]
-    if missing:
-        raise DatasetError(f"{folder}: {missing[0]} is missing; the same 'data' command goes on where it stopped")
     images = list(read_shards(files))
     shape = (config.height, config.width, 3)
     joined = np.concatenate(images) if images else np.zeros((0, *shape), np.uint8)

@@ -6,7 +6,7 @@ import functools
 import io
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
@@ -60,23 +60,40 @@ def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
     return path.stat().st_size
 
 
+def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:
+    """The arrays of an npz file that a command wrote.
+
+    Raises:
+        DatasetError: it is missing or damaged.
+    """
+    need_files([path], command)
+    remedy = f"delete it and run '{command}' again"
+    with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def need_files(paths: Iterable[Path], command: str = "data") -> None:
+    """Raises DatasetError where one is missing."""
+    missing = next((path for path in paths if not path.is_file()), None)
+    if missing:
+        raise DatasetError(f"{missing} is missing; the same '{command}' command goes on where it stopped")
+
+
 def read_shard(path: Path) -> np.ndarray:
     """All images [N, H, W, 3] u8 of a file, in the order they were written.
 
     Raises:
         DatasetError: it is missing or damaged.
     """
+    stored = read_arrays(path)
     with readable(path, DatasetError, "delete it and run 'data' again"):
-        with np.load(path, allow_pickle=False) as arrays:
-            data, ends, counts = arrays["data"], arrays["ends"], arrays["counts"]
-            height, width = (int(v) for v in arrays["size"])
-        starts = np.concatenate([[0], ends[:-1]])
-        return np.concatenate(
-            [decode(data[a:b].tobytes(), int(n), height, width) for a, b, n in zip(starts, ends, counts, strict=True)]
-        )
+        height, width = (int(v) for v in stored["size"])
+        sheets = np.split(stored["data"], stored["ends"][:-1])
+        pairs = zip(sheets, stored["counts"], strict=True)
+        return np.concatenate([decode(sheet.tobytes(), int(count), height, width) for sheet, count in pairs])
 
 
-def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Iterator[Result]:
+def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Result, None, None]:
     """Results of tasks that threads run, in the tasks' order.
 
     Where a task or the caller raises, tasks that have begun are finished and the others left out.
@@ -98,10 +115,11 @@ def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Iterator[Resu
             pool.shutdown(cancel_futures=True)
 
 
-def read_shards(paths: Sequence[Path]) -> Iterator[np.ndarray]:
-    """`read_shard` of each file, in order, some files ahead in threads.
+def read_shards(paths: Sequence[Path], command: str = "data") -> Iterator[np.ndarray]:
+    """`read_shard` of each file that a command wrote, in order, some files ahead in threads.
 
     Raises:
-        DatasetError: see `read_shard`.
+        DatasetError: one is missing, which is told before the first is read; or see `read_shard`.
     """
+    need_files(paths, command)
     return in_order((functools.partial(read_shard, path) for path in paths), THREADS)

@@ -23,12 +23,11 @@ import numpy as np
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import CameraPose
-from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
-from topological_nav.data.shards import read_shards
+from topological_nav.data.shards import read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
@@ -46,6 +45,7 @@ DRIVES = Folder(
     again="drive again",
 )
 read_drives_header = DRIVES.read
+AGAIN = "data --drives"
 LIMIT_M = 8.0
 """Fields of the way left reach so far; beyond they rise with the distance."""
 
@@ -58,11 +58,6 @@ class DrivePlan:
     test: np.ndarray
     """[n] bool."""
     terrain: Terrain
-    spaces: tuple[FreeSpace, ...]
-    nodes_w: tuple[np.ndarray, ...]
-    """[N, 2] m, a scene."""
-    edges: tuple[np.ndarray, ...]
-    """[E, 2] i32 driven along, a scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,8 +120,7 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
         SpaceError: a scene in which no two nodes are joined.
     """
     robot = get_robot(config.robot)
-    spaces, fields, nodes, edges, parts, tests = [], [], [], [], [], []
-    fields_before = 0
+    spaces, fields, parts, tests = [], [], [], []
     for index, scene in enumerate(scenes):
         space = free_space(scene, robot.height_m)
         rooms = scene_rooms(scene, space, DataConfig(seed=config.seed))
@@ -138,25 +132,13 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
             routes = draw_routes(space, xy, joined, config, rng)
         except SpaceError as error:
             raise SpaceError(f"{scene.path}: {error}") from None
-        ahead = routes.nodes[:, 1:]
-        parts.append(
-            Tasks(
-                np.full(config.drives, index, np.int32),
-                ahead + fields_before,
-                xy[ahead],
-                routes.legs,
-                routes.start_xy_w,
-                routes.start_yaw_rad,
-            )
-        )
+        ahead, where = routes.nodes[:, 1:], np.full(config.drives, index, np.int32)
+        goals = ahead + sum(map(len, fields))
+        parts.append(Tasks(where, goals, xy[ahead], routes.legs, routes.start_xy_w, routes.start_yaw_rad))
         tests.append(routes.test)
         spaces.append(space)
         fields.append(field)
-        nodes.append(xy)
-        edges.append(joined)
-        fields_before += len(xy)
-    terrain = _terrain(spaces, fields)
-    return DrivePlan(Tasks.joined(parts), np.concatenate(tests), terrain, tuple(spaces), tuple(nodes), tuple(edges))
+    return DrivePlan(Tasks.joined(parts), np.concatenate(tests), _terrain(spaces, fields))
 
 
 def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terrain:
@@ -195,7 +177,7 @@ def simulate_drives(
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
         total = len(scenes) * config.drives
-        files = [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
+        files = _batch_files(out, total, config)
         if all(path.is_file() for path in (*files, out / "plan.npz")):
             progress("drives", total, total)
             return load_drives(out)
@@ -253,6 +235,10 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
         draw_missing(drawn, int(drives.steps[drives.kept].sum()), config, progress)
 
 
+def _batch_files(out: Path, total: int, config: DriveConfig) -> list[Path]:
+    return [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
+
+
 def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig):
     """Yields each file of a scene's images and the drives [k] in it."""
     mine = np.flatnonzero(drives.kept & (drives.scene == index))
@@ -273,10 +259,7 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for index, about in enumerate(header["scenes"])
         for part in _image_files(Path(folder), about["name"], index, drives, config)
     ]
-    for path, _ in files:
-        if not path.is_file():
-            raise DatasetError(f"{path} is missing; the same 'data --drives' command goes on where it stopped")
-    for (path, rows), images in zip(files, read_shards([path for path, _ in files]), strict=True):
+    for (path, rows), images in zip(files, read_shards([path for path, _ in files], AGAIN), strict=True):
         shape = (int(drives.steps[rows].sum()), config.height, config.width, 3)
         if images.shape != shape:
             raise DatasetError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
@@ -292,22 +275,11 @@ def load_drives(folder: Path) -> Drives:
     folder = Path(folder)
     header, config = read_drives_header(folder)
     total = len(header["scenes"]) * config.drives
-    parts = []
-    for i in range(-(-total // config.batch)):
-        path = folder / f"batch-{i:03d}.npz"
-        if not path.is_file():
-            raise DatasetError(f"{path} is missing; the same 'data --drives' command goes on where it stopped")
-        parts.append(_read(path))
-    plan = _read(folder / "plan.npz")
+    parts = [read_arrays(path, AGAIN) for path in _batch_files(folder, total, config)]
+    plan = read_arrays(folder / "plan.npz", AGAIN)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     first = np.concatenate([[0], np.cumsum(joined.pop("steps"))])
     return Drives(scene=plan["scene"], test=plan["test"], goal_w=plan["goal_w"], first=first, **joined)
-
-
-def _read(path: Path) -> dict[str, np.ndarray]:
-    remedy = "delete it and run 'data --drives' again"
-    with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
 
 
 def _write_batch(path: Path, driven: Driven, count: int) -> None:
