@@ -25,7 +25,7 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from tests.train.learners.test_offpolicy import tiny
 from tests.train.learners.test_ppo import make_config
 from tests.train.toy_env import batched
-from train.learners import ddpg, offpolicy, ppo, sac
+from train.learners.algorithms import ALGORITHMS
 
 PROMOTES = "import jax.numpy as jnp; jnp.zeros((2, 3)) + jnp.zeros(3)"
 
@@ -132,13 +132,10 @@ def test_an_environment_and_its_new_episodes(env):
 @pytest.mark.parametrize("algorithm", ["ppo", *(pytest.param(a, marks=pytest.mark.heavy) for a in ("sac", "ddpg"))])
 def test_an_update_of_a_learner(algorithm):
     env = batched()
-    if algorithm == "ppo":
-        parts = ppo.parts_of(env, make_config(1))
-        start, update = functools.partial(ppo.start, parts, env, 0), functools.partial(ppo.update, parts, env)
-    else:
-        agent = {"sac": sac, "ddpg": ddpg}[algorithm].make_agent(env, tiny(algorithm, 1, min_replay_size=1))
-        start = functools.partial(offpolicy.start, agent, env, algorithm, 0)
-        update = functools.partial(offpolicy.update, agent, env)
+    config = make_config(1) if algorithm == "ppo" else tiny(algorithm, 1, min_replay_size=1)
+    learned = ALGORITHMS[algorithm]
+    agent = learned.make_agent(env, config)
+    start, update = functools.partial(learned.start, agent, env, 0), functools.partial(learned.update, agent, env)
 
     def begun():
         begin = start()

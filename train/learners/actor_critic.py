@@ -35,6 +35,11 @@ class ActorCritic(abc.ABC):
     """The policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
 
     @property
+    def steps_per_update(self) -> int:
+        """Environment steps collected for one update."""
+        return (self.config.num_envs or 0) * (self.config.steps_per_update or 0)
+
+    @property
     @abc.abstractmethod
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
         """Of policy, of critics, and of what else the algorithm learns."""

@@ -11,7 +11,6 @@ not known (the environment shows a new episode's observation).
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import flax.struct
@@ -24,7 +23,6 @@ from brax.training.acme import running_statistics
 from brax.training.networks import FeedForwardNetwork
 
 from train.config import DDPGConfig, TrainConfig
-from train.learners import offpolicy
 from train.learners.actor_critic import ActorCritic, make_networks, shares_encoder, soft_update
 
 
@@ -171,8 +169,3 @@ def make_agent(env: Env, config: TrainConfig) -> DDPG:
     )
     made = DDPGNetworks(policy_network, q_network)  # type: ignore[call-arg]
     return DDPG(config.ddpg, made, size, env.action_size, shares_encoder(config.network, size))
-
-
-train = functools.partial(offpolicy.train, make_agent)
-template = functools.partial(offpolicy.template, make_agent)
-policy = functools.partial(offpolicy.policy, make_agent)

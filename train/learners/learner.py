@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs import Env
 
 from train.config import RunConfig
 from train.errors import DivergedError
@@ -98,13 +99,9 @@ def whole_updates(steps: int, steps_per_update: int) -> int:
     return max(1, math.ceil(steps / steps_per_update))
 
 
-def resumed(begin: Snapshot, callbacks: Callbacks, seed: int, reset: Callable[[jax.Array, PyTree], PyTree]) -> Snapshot:
-    """A run's first state, or its checkpoint; `reset` (key, first `env_state`) begins the episodes that it lacks."""
-    restored = callbacks.restore(begin)
-    if restored is None or restored.env_state is not None:
-        return restored or begin
-    key = jax.random.fold_in(jax.random.PRNGKey(seed), restored.env_steps)
-    return dataclasses.replace(restored, env_state=reset(key, begin.env_state))
+def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
+    """New episodes in every environment."""
+    return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
 
 
 def run_loop(

@@ -14,7 +14,7 @@ count like any others.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import flax.struct
@@ -24,10 +24,10 @@ from brax.envs import Env
 from brax.training import types
 
 from interactive_nav_common.errors import ConfigError
-from train.config import OffPolicyConfig, TrainConfig
+from train.config import OffPolicyConfig
 from train.learners import networks, replay_buffer
 from train.learners.actor_critic import ActorCritic
-from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums, resumed, run_loop
+from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
 from train.learners.replay_buffer import Replay
 
 
@@ -49,9 +49,6 @@ class OffPolicyData:
     def note(self) -> str:
         """What a user should know before training starts, in one line."""
         return replay_buffer.describe(self.replay)
-
-
-MakeAgent = Callable[[Env, TrainConfig], ActorCritic]
 
 
 def collect(
@@ -144,13 +141,12 @@ def update(agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData) -> t
     return learner, data, Update(losses, sums, finite, {"collected": seen, "learned": batch})
 
 
-def start(agent: ActorCritic, env: Env, section: str, seed: int) -> Snapshot:
+def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
     """The first state of learner, environments and replay, derived from the seed.
 
     Args:
         agent: see `ActorCritic`.
         env: natively batched and resetting itself.
-        section: of the config, for messages.
         seed: of the run.
 
     Raises:
@@ -160,53 +156,17 @@ def start(agent: ActorCritic, env: Env, section: str, seed: int) -> Snapshot:
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)
     make_replay = functools.partial(replay_buffer.init, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
-    check_memory(c, jax.eval_shape(make_replay), section)
+    check_memory(c, jax.eval_shape(make_replay))
     data = OffPolicyData(env_state, make_replay(), agent.init_noise())
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
 
 
-def reset_envs(agent: ActorCritic, env: Env, key: jax.Array) -> Any:
-    """New episodes in every environment."""
-    return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
-
-
-def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
+def check_memory(config: OffPolicyConfig, replay: Replay) -> None:
     """Raises `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
     if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
-        images = isinstance(replay.observation, Mapping)
+        images, section = isinstance(replay.observation, Mapping), config.SECTION
         smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"
         raise ConfigError(
             f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {replay_buffer.describe(replay)}; lower "
             f"{section}.max_replay_size, choose {smaller} if it is not chosen yet, or raise the limit"
         )
-
-
-def train(make_agent: MakeAgent, env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-    """Trains a policy.
-
-    Args:
-        make_agent: of the algorithm.
-        env: natively batched and resetting itself (`interactive_nav.task.wrappers.AutoResetEnv`).
-        config: resolved, see `train.config.resolve`.
-        callbacks: progress, files and signals.
-
-    Raises:
-        ConfigError: the replay would take more memory than allowed.
-        DivergedError: see `train.learners.learner.run_loop`.
-    """
-    agent = make_agent(env, config)
-    begin, seed = start(agent, env, config.algorithm, config.run.seed), config.run.seed
-    begin = resumed(begin, callbacks, seed, lambda key, old: old.replace(env_state=reset_envs(agent, env, key)))
-    steps_per_update = (agent.config.num_envs or 0) * (agent.config.steps_per_update or 0)
-    return run_loop(functools.partial(update, agent, env), begin, steps_per_update, config.run, callbacks)
-
-
-def template(make_agent: MakeAgent, env: Env, config: TrainConfig) -> Any:
-    """A learner in the shape of this config's checkpoints."""
-    key = jax.random.PRNGKey(0)
-    return make_agent(env, config).init(key, key)
-
-
-def policy(make_agent: MakeAgent, env: Env, config: TrainConfig, learner: Any, deterministic: bool) -> types.Policy:
-    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-    return make_agent(env, config).policy(learner, deterministic)

@@ -30,10 +30,9 @@ from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import optimizer as ppo_optimizer
 
-from train.config import NetworkConfig, PPOConfig, TrainConfig
-from train.learners import learner as loop
+from train.config import PPOConfig, TrainConfig
 from train.learners import networks as nets
-from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, all_finite, episode_sums
+from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
 
 
 @flax.struct.dataclass
@@ -80,55 +79,48 @@ class PPOParts:
         assert c.batch_size and c.num_minibatches and c.unroll_length, "the config must be resolved"
         return c.batch_size * c.num_minibatches * c.unroll_length
 
+    def init(self, key_networks: jax.Array, key: jax.Array) -> PPOState:
+        """A learner that has learned nothing; `key` is what its updates will draw from."""
+        key_policy, key_value = jax.random.split(key_networks)
+        policy = self.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
+        value = self.networks.value_network.init(key_value)  # type: ignore[call-arg]
+        if self.shared:
+            params: Any = SharedParams(encoder=policy["encoder"], policy=policy["head"], value=value["head"])
+        else:
+            params = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
+        return PPOState(
+            optimizer_state=self.optimizer.init(params),
+            params=params,
+            normalizer_params=nets.init_normalizer(self.observation_size),
+            key=key,
+        )
 
-def make_parts(
-    config: PPOConfig,
-    observation_size: nets.ObservationSize,
-    action_size: int,
-    network: NetworkConfig | None = None,
-) -> PPOParts:
-    """Networks and optimiser for observations of the given size.
+    def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
+        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+        make = ppo_networks.make_inference_fn(self.networks)
+        return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
 
-    Args:
-        config: resolved or not; sizes of batches are not read.
-        observation_size: length of the vector, or with images the shape under each key.
-        action_size: number of actions.
-        network: encoders of images.
+
+def make_agent(env: Any, config: TrainConfig) -> PPOParts:
+    """Networks and optimiser for an environment's observations and actions.
 
     Raises:
         ConfigError: the encoders do not fit the images.
     """
-    network = network or NetworkConfig()
+    network, size, c = config.network, env.observation_size, config.ppo
     made = nets.make_ppo_networks(
         network,
-        observation_size,
-        action_size,
-        config.policy_hidden_layer_sizes,
-        config.value_hidden_layer_sizes,
-        config.normalize_observations,
+        size,
+        env.action_size,
+        c.policy_hidden_layer_sizes,
+        c.value_hidden_layer_sizes,
+        c.normalize_observations,
     )
-    adam = optax.adam(config.learning_rate)
-    if config.learning_rate_schedule == "adaptive_kl":
-        adam = optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate)
-    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
-    return PPOParts(config, made, optimizer, observation_size, network.share_encoder and made.policy is not None)
-
-
-def init(parts: PPOParts, key_networks: jax.Array, key: jax.Array) -> PPOState:
-    """A learner that has learned nothing; `key` is what its updates will draw from."""
-    key_policy, key_value = jax.random.split(key_networks)
-    policy = parts.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
-    value = parts.networks.value_network.init(key_value)  # type: ignore[call-arg]
-    if parts.shared:
-        params: Any = SharedParams(encoder=policy["encoder"], policy=policy["head"], value=value["head"])
-    else:
-        params = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
-    return PPOState(
-        optimizer_state=parts.optimizer.init(params),
-        params=params,
-        normalizer_params=nets.init_normalizer(parts.observation_size),
-        key=key,
-    )
+    adam = optax.adam(c.learning_rate)
+    if c.learning_rate_schedule == "adaptive_kl":
+        adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
+    optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), adam)
+    return PPOParts(c, made, optimizer, size, network.share_encoder and made.policy is not None)
 
 
 def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[Any, Any]:
@@ -141,12 +133,6 @@ def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[An
     return params.policy, params.value
 
 
-def make_policy(parts: PPOParts, state: PPOState, deterministic: bool) -> types.Policy:
-    """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-    make = ppo_networks.make_inference_fn(parts.networks)
-    return make((state.normalizer_params, *whole_params(state.params)), deterministic)
-
-
 def collect(
     parts: PPOParts, env: Env, state: PPOState, env_state: Any, key: jax.Array
 ) -> tuple[Any, types.Transition, dict[str, jax.Array]]:
@@ -155,7 +141,7 @@ def collect(
     Returns:
         The environments' new state; transitions with leaves [sequences, time, ...]; sums over ended episodes.
     """
-    act, config = make_policy(parts, state, deterministic=False), parts.config
+    act, config = parts.policy(state, deterministic=False), parts.config
     assert config.batch_size and config.num_minibatches and config.num_envs
 
     def unroll(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], Any]:
@@ -293,40 +279,4 @@ def start(parts: PPOParts, env: Env, seed: int) -> Snapshot:
     key_networks, key_local = jax.random.split(jax.random.PRNGKey(seed))
     key_local, key_env, _ = jax.random.split(jax.random.fold_in(key_local, 0), 3)
     key_updates = jax.random.split(jax.random.split(key_local)[0], 1)[0]
-    return Snapshot(0, init(parts, key_networks, key_updates), reset_envs(parts, env, key_env))
-
-
-def reset_envs(parts: PPOParts, env: Env, key: jax.Array) -> Any:
-    """New episodes in every environment."""
-    return jax.jit(env.reset)(jax.random.split(key, parts.config.num_envs or 1))
-
-
-def parts_of(env: Any, config: TrainConfig) -> PPOParts:
-    """`make_parts` for an environment and a whole config."""
-    return make_parts(config.ppo, env.observation_size, env.action_size, config.network)
-
-
-def template(env: Any, config: TrainConfig) -> PPOState:
-    """A learner in the shapes that its checkpoints have."""
-    key = jax.random.PRNGKey(0)
-    return init(parts_of(env, config), key, key)
-
-
-def policy(env: Any, config: TrainConfig, learner: PPOState, deterministic: bool) -> types.Policy:
-    """What a learner has learned: see `make_policy`."""
-    return make_policy(parts_of(env, config), learner, deterministic)
-
-
-def train(env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-    """Trains a policy.
-
-    Args:
-        env: natively batched and resetting itself (`interactive_nav.task.wrappers.AutoResetEnv`).
-        config: resolved, see `train.config.resolve`.
-        callbacks: progress, files and signals.
-    """
-    parts = parts_of(env, config)
-    begin = start(parts, env, config.run.seed)
-    begin = loop.resumed(begin, callbacks, config.run.seed, lambda key, _: reset_envs(parts, env, key))
-    update_fn = functools.partial(update, parts, env)
-    return loop.run_loop(update_fn, begin, parts.steps_per_update, config.run, callbacks)
+    return Snapshot(0, parts.init(key_networks, key_updates), reset_envs(parts, env, key_env))

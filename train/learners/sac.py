@@ -11,7 +11,6 @@ environment shows a new episode's observation); it says nothing about the step's
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import flax.struct
@@ -25,7 +24,6 @@ from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
 from train.config import SACConfig, TrainConfig
-from train.learners import offpolicy
 from train.learners.actor_critic import (
     ActorCritic,
     descend,
@@ -141,8 +139,3 @@ def make_agent(env: Env, config: TrainConfig) -> SAC:
     policy_network, q_network = make_networks(env, config.network, config.sac, actions.param_size, 2)
     made = sac_networks.SACNetworks(policy_network, q_network, actions)  # type: ignore[call-arg]
     return SAC(config.sac, made, size, env.action_size, shares_encoder(config.network, size))
-
-
-train = functools.partial(offpolicy.train, make_agent)
-template = functools.partial(offpolicy.template, make_agent)
-policy = functools.partial(offpolicy.policy, make_agent)

@@ -18,6 +18,7 @@ from tests.train.toy_env import ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import DDPGConfig, EnvConfig, NetworkConfig, RunConfig, TrainConfig
 from train.learners import ddpg
+from train.learners.algorithms import ALGORITHMS
 
 
 def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> ddpg.DDPG:
@@ -130,8 +131,8 @@ def test_number_of_critics_and_the_same_policy_either_way():
         q = agent.networks.q_network.apply(learner.normalizer_params, learner.q_params, data.observation, data.action)
         assert q.shape == (12, critics)
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="ddpg", ddpg=DDPGConfig(**SIZES))
-    template = ddpg.template(batched(), config)
-    drawn = [ddpg.policy(batched(), config, template, d)(data.observation, KEY)[0] for d in (True, False)]
+    template = ALGORITHMS["ddpg"].template(batched(), config)
+    drawn = [ALGORITHMS["ddpg"].policy(batched(), config, template, d)(data.observation, KEY)[0] for d in (True, False)]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert drawn[0].shape == (12, 2) and (np.abs(drawn[0]) < 1).all()
 
@@ -152,6 +153,6 @@ def test_learns_the_toy(env, share):
         run=RunConfig(num_timesteps=14_336, log_every_steps=2_048, checkpoint_every_steps=14_336),
     )
     seen = Recorder()
-    result = ddpg.train(batched(env), config, seen)
+    result = ALGORITHMS["ddpg"].train(batched(env), config, seen)
     assert seen.logs[0][1]["episode/success"] < 0.3
     assert result.metrics["episode/success"] >= 0.9

@@ -17,6 +17,7 @@ from tests.train.toy_env import ToyConfig, batched
 from tests.train.toy_pixels import SIDE, SMALL, ToyPixels
 from train.config import EnvConfig, NetworkConfig, PPOConfig, RunConfig, TrainConfig
 from train.learners import networks, ppo
+from train.learners.algorithms import ALGORITHMS
 
 FULL = {"state": (29,), "pixels/depth": (68, 68, 1), "pixels/segmentation": (68, 68, 1)}
 TINY = {"state": (6,), "pixels/depth": (SIDE, SIDE, 1), "pixels/segmentation": (SIDE, SIDE, 1)}
@@ -148,11 +149,11 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
         num_envs=4, unroll_length=3, batch_size=4, num_minibatches=1, num_updates_per_batch=1, learning_rate=1.0
     )
     config = dataclasses.replace(config, policy_hidden_layer_sizes=(8,), value_hidden_layer_sizes=(8,))
-    apart = ppo.make_parts(config, TINY, 2, SMALL)
-    shared = ppo.make_parts(config, TINY, 2, dataclasses.replace(SMALL, share_encoder=True))
-    one = ppo.init(shared, KEY, KEY)
-    policy, value = ppo.whole_params(one.params)
     env = batched(ToyPixels())
+    apart = ppo.make_agent(env, TrainConfig(ppo=config, network=SMALL))
+    shared = ppo.make_agent(env, TrainConfig(ppo=config, network=dataclasses.replace(SMALL, share_encoder=True)))
+    one = shared.init(KEY, KEY)
+    policy, value = ppo.whole_params(one.params)
     state = jax.jit(env.reset)(jax.random.split(KEY, 4))
     _, data, _ = jax.jit(lambda s, e: ppo.collect(shared, env, s, e, KEY))(one, state)
     settings = {"entropy_cost": 0.01, "normalize_advantage": False, "discounting": 0.9}
@@ -201,6 +202,6 @@ def test_ppo_learns_from_a_picture():
         run=RunConfig(num_timesteps=65_536, log_every_steps=8_192, checkpoint_every_steps=65_536),
     )
     seen = Recorder()
-    result = ppo.train(batched(ToyPixels(ToyConfig())), config, seen)
+    result = ALGORITHMS["ppo"].train(batched(ToyPixels(ToyConfig())), config, seen)
     assert seen.logs[0][1]["episode/success"] < 0.6
     assert result.metrics["episode/success"] >= 0.9

@@ -139,7 +139,7 @@ def test_collect_writes_what_happened_and_restarts_noise_with_the_episode():
     config = tiny("ddpg", 1, steps_per_update=7)
     env = batched(ToyEnv(ToyConfig(episode_steps=3)))
     agent = make_ddpg(env, config)
-    begin = offpolicy.start(agent, env, "ddpg", 0)
+    begin = offpolicy.start(agent, env, 0)
     collect = jax.jit(lambda s, d: offpolicy.collect(agent, env, s, d, s.key))
     data, seen = collect(begin.learner, begin.env_state)
     replay = data.replay
@@ -163,7 +163,7 @@ def test_the_compiled_update_writes_the_replay_in_place_and_normalises_no_image(
     config = dataclasses.replace(tiny("sac", 1, max_replay_size=16 * 16384), network=SMALL)
     env = batched(ToyPixels())
     agent = make_sac(env, config)
-    begin = offpolicy.start(agent, env, "sac", 0)
+    begin = offpolicy.start(agent, env, 0)
     data: Any = begin.env_state
     size = replay_buffer.nbytes(data.replay)
     assert size == 16 * 16384 * (2 * 144 + 6 * 4 + 2 * 4 + 4 + 2) + 8
@@ -191,10 +191,10 @@ def test_a_replay_beyond_its_limit_is_refused():
     assert "sac.replay_limit_gb is 6e-05, but the replay of 512 transitions" in told
     assert "of 130 bytes each" in told and "sac.max_replay_size" in told and "float16" in told
     replay = replay_buffer.init(32, jnp.zeros((16, 29)), 2)
-    offpolicy.check_memory(dataclasses.replace(config.sac, replay_limit_gb=6.7e-5), replay, "sac")
+    offpolicy.check_memory(dataclasses.replace(config.sac, replay_limit_gb=6.7e-5), replay)
     images = replay_buffer.init(32, {"pixels/depth": jnp.zeros((16, 12, 12, 1))}, 2)
     with pytest.raises(ConfigError, match="choose env.image_dtype=uint8"):
-        offpolicy.check_memory(config.sac, images, "sac")
+        offpolicy.check_memory(config.sac, images)
 
 
 def test_a_reward_that_is_no_number_stops_the_run_and_is_in_the_saved_batch(straight):

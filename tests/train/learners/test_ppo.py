@@ -17,6 +17,7 @@ from tests.train import brax_compat
 from tests.train.toy_env import ToyConfig, ToyEnv, batched
 from train.config import EnvConfig, PPOConfig, RunConfig, TrainConfig
 from train.learners import ppo
+from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, Update, episode_sums
 
 SMALL = PPOConfig(
@@ -74,7 +75,7 @@ def test_updates_equal_those_of_brax(schedule):
     """Two updates from one seed end at the parameters that Brax's own loop ends at."""
     brax_compat.install()
     config = make_config(2, learning_rate_schedule=schedule)
-    ours = ppo.train(batched(), config, Recorder()).snapshot.learner
+    ours = ALGORITHMS["ppo"].train(batched(), config, Recorder()).snapshot.learner
     c = config.ppo
     with jax.numpy_rank_promotion("allow"):  # Brax's statistics promote
         _, params, _ = brax_ppo.train(
@@ -130,7 +131,7 @@ def test_time_limit_bootstraps_once():
 def test_collect_keeps_sequences_of_one_environment():
     config = make_config(1)
     env = batched(ToyEnv(ToyConfig(episode_steps=5)))
-    parts = ppo.make_parts(config.ppo, 29, 2)
+    parts = ppo.make_agent(env, config)
     start = ppo.start(parts, env, seed=0)
     _, data, sums = jax.jit(lambda s, e: ppo.collect(parts, env, s, e, jax.random.PRNGKey(3)))(
         start.learner, start.env_state
@@ -161,10 +162,10 @@ def test_episode_sums_count_ended_episodes_only():
 def test_resumed_run_equals_uninterrupted_one():
     """Four updates, against two, a snapshot, and two more from it: the same numbers to the last bit."""
     straight, half = Recorder(), Recorder()
-    whole = ppo.train(batched(), make_config(4), straight).snapshot
-    ppo.train(batched(), make_config(2), half)
+    whole = ALGORITHMS["ppo"].train(batched(), make_config(4), straight).snapshot
+    ALGORITHMS["ppo"].train(batched(), make_config(2), half)
     rest = Recorder(resume=half.saved[-1])
-    resumed = ppo.train(batched(), make_config(4), rest).snapshot
+    resumed = ALGORITHMS["ppo"].train(batched(), make_config(4), rest).snapshot
     assert whole.env_steps == resumed.env_steps == 4 * 256
     jax.tree.map(np.testing.assert_array_equal, whole.learner, resumed.learner)
     jax.tree.map(np.testing.assert_array_equal, whole.env_state, resumed.env_state)
@@ -176,9 +177,9 @@ def test_resumed_run_equals_uninterrupted_one():
 
 def test_resume_without_environments_begins_new_episodes():
     half = Recorder()
-    ppo.train(batched(), make_config(2), half)
+    ALGORITHMS["ppo"].train(batched(), make_config(2), half)
     rest = Recorder(resume=dataclasses.replace(half.saved[-1], env_state=None))
-    result = ppo.train(batched(), make_config(3), rest)
+    result = ALGORITHMS["ppo"].train(batched(), make_config(3), rest)
     assert result.snapshot.env_steps == 3 * 256 and result.completed
     # The first update restarts 16 episodes at step 0: after 16 steps none has run longer than that.
     env_state: Any = result.snapshot.env_state
@@ -203,7 +204,7 @@ def test_learns_the_toy():
         run=RunConfig(num_timesteps=120_000, log_every_steps=8_192, checkpoint_every_steps=120_000),
     )
     seen = Recorder()
-    result = ppo.train(batched(), config, seen)
+    result = ALGORITHMS["ppo"].train(batched(), config, seen)
     assert seen.logs[0][1]["episode/success"] < 0.6
     assert result.metrics["episode/success"] >= 0.95
     assert result.metrics["episode/ins_0.5"] >= 0.95

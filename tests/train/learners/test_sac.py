@@ -18,6 +18,7 @@ from tests.train.toy_env import ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import EnvConfig, NetworkConfig, RunConfig, SACConfig, TrainConfig
 from train.learners import networks, sac
+from train.learners.algorithms import ALGORITHMS
 
 SIZES: dict[str, Any] = {"policy_hidden_layer_sizes": (16,), "q_hidden_layer_sizes": (16,)}
 KEY = jax.random.PRNGKey(5)
@@ -222,11 +223,15 @@ def test_layer_normalisation_is_the_critics_alone(env):
 def test_policy_and_template_are_those_of_the_config():
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="sac", sac=SACConfig(**SIZES, initial_alpha=0.25))
     env = batched()
-    learner = sac.template(env, config)
+    learner = ALGORITHMS["sac"].template(env, config)
     assert float(jnp.exp(learner.alpha_params)) == pytest.approx(0.25)
     observation = transitions(29).observation
-    drawn = [sac.policy(env, config, learner, False)(observation, jax.random.PRNGKey(i))[0] for i in (0, 1)]
-    modes = [sac.policy(env, config, learner, True)(observation, jax.random.PRNGKey(i))[0] for i in (0, 1)]
+    drawn = [
+        ALGORITHMS["sac"].policy(env, config, learner, False)(observation, jax.random.PRNGKey(i))[0] for i in (0, 1)
+    ]
+    modes = [
+        ALGORITHMS["sac"].policy(env, config, learner, True)(observation, jax.random.PRNGKey(i))[0] for i in (0, 1)
+    ]
     assert drawn[0].shape == (12, 2) and not np.array_equal(drawn[0], drawn[1])
     np.testing.assert_array_equal(modes[0], modes[1])
 
@@ -269,7 +274,7 @@ def test_learns_the_toy(env, steps, settings):
         run=RunConfig(num_timesteps=steps, log_every_steps=2_048, checkpoint_every_steps=steps),
     )
     seen = Recorder()
-    result = sac.train(batched(env), config, seen)
+    result = ALGORITHMS["sac"].train(batched(env), config, seen)
     assert seen.logs[0][1]["episode/success"] < 0.3
     assert result.metrics["episode/success"] >= 0.9
     assert result.snapshot.env_steps == steps
