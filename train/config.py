@@ -8,22 +8,16 @@ from typing import Annotated, Any, Literal
 
 import yaml
 
-from interactive_nav.config import IMAGES, PhysicsConfig, SensorConfig, TaskRules
-from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, flat, replace
+from interactive_nav.config import IMAGES, NavConfig
+from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
 
 
 @dataclasses.dataclass(frozen=True)
-class EnvConfig(Settings):
+class EnvConfig(NavConfig):
     """The task: every setting of the environment, and which robot and scenes to make it from."""
 
-    rules: TaskRules = flat(TaskRules)
-    """What the task is."""
-    physics: PhysicsConfig = flat(PhysicsConfig)
-    """How it is simulated."""
-    sensors: SensorConfig = flat(SensorConfig)
-    """What the robot perceives."""
     robot: str = "turtlebot"
     """Robot to drive."""
     scenes: tuple[str, ...] = ()

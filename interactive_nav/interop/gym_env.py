@@ -136,7 +136,7 @@ class InteractiveNavEnv(gymnasium.Env):
         self.env = interactive_nav.make(robot, scenes, **settings)
         kept = _checked_slot(self.env, slot)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
-        self.render_mode = _checked_render_mode(render_mode)
+        self.render_mode, self._camera = _checked_render_mode(render_mode), ThirdPerson(self.env)
         self.observation_space = observation_space_of(self.env)
         self.action_space = action_space_of(self.env)
         self._reset = jax.jit(lambda key: self.env.reset(key, kept))
@@ -166,15 +166,8 @@ class InteractiveNavEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """(rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
-        if self.render_mode is None or self._state is None:
-            return None
-        state: Any = self._state
-        nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
-        return self._camera.frame(int(nav.scene_index), qpos, np.asarray(nav.goal_xy_w))
-
-    @functools.cached_property
-    def _camera(self) -> ThirdPerson:
-        return ThirdPerson(self.env)
+        seen = self.render_mode is not None and self._state is not None
+        return self._camera.frames(self._state)[0] if seen else None
 
 
 class InteractiveNavVectorEnv(VectorEnv):
@@ -221,7 +214,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.env = interactive_nav.make(robot, scenes, **settings)
         self.num_envs, self.arrays = num_envs, arrays
-        self.render_mode = _checked_render_mode(render_mode)
+        self.render_mode, self._camera = _checked_render_mode(render_mode), ThirdPerson(self.env)
         self.metadata = {
             **InteractiveNavEnv.metadata,
             "render_fps": round(1.0 / self.env.dt),
@@ -287,15 +280,8 @@ class InteractiveNavVectorEnv(VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A third-person view of each environment; None without a render mode."""
-        if self.render_mode is None or self._state is None:
-            return None
-        nav, qpos = self._state.info["nav"], np.asarray(self._state.pipeline_state.qpos)
-        each = zip(np.asarray(nav.scene_index), qpos, np.asarray(nav.goal_xy_w), strict=True)
-        return tuple(self._camera.frame(int(scene), row, goal) for scene, row, goal in each)
-
-    @functools.cached_property
-    def _camera(self) -> ThirdPerson:
-        return ThirdPerson(self.env)
+        seen = self.render_mode is not None and self._state is not None
+        return self._camera.frames(self._state) if seen else None
 
     def _keys(self, seed: int | Sequence[int | None] | None) -> jax.Array:
         n = self.num_envs

@@ -7,7 +7,7 @@ import importlib.util
 import jax
 
 from interactive_nav.config import NavConfig
-from interactive_nav.physics.base import ForceOptions, Physics, PhysicsState, StepSignals
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals
 from interactive_nav.scenes.world import World
 from interactive_nav_common.errors import ConfigError
 
@@ -38,20 +38,19 @@ def make_physics(world: World, config: NavConfig) -> Physics:
     Raises:
         ConfigError: hull collision on an MJX backend, or a backend that is not installed.
     """
-    rules, physics = config.rules, config.physics
+    physics = config.physics
     backend = resolve_backend(physics.backend)
     if physics.collision == "hulls" and backend != "native":
         raise ConfigError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
     if physics.cone == "elliptic" and backend != "native":
         raise ConfigError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
-    forces = ForceOptions(rules.force_part, rules.force_sum, rules.needs_contacts)
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics
 
-        return NativePhysics(world, physics.substeps, sleep=physics.sleep, threads=physics.threads, forces=forces)
+        return NativePhysics(world, config)
     from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
-    return (WarpPhysics if backend == "warp" else JaxPhysics)(world, config, forces)
+    return (WarpPhysics if backend == "warp" else JaxPhysics)(world, config)
 
 
 __all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

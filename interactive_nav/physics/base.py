@@ -7,7 +7,6 @@ so resets are `jnp.where`, checkpoints are portable and nothing engine-specific 
 from __future__ import annotations
 
 import abc
-import dataclasses
 from typing import Any
 
 import flax.struct
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.batching import one_of_batch
+from interactive_nav.config import TaskRules
 from interactive_nav.scenes.contacts import combine
 
 TOUCH_FORCE_N = 1e-4
@@ -97,21 +97,12 @@ def uncommitted(tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)) if isinstance(x, jax.Array) else x, tree)
 
 
-@dataclasses.dataclass(frozen=True)
-class ForceOptions:
-    """What counts as the force of a control step (`NavConfig` has the same names)."""
-
-    force_part: str = "full"
-    force_sum: str = "vector"
-    needs_contacts: bool = False
-
-
-PAPER_FORCE = ForceOptions()
+PAPER_FORCE = TaskRules()
 """The paper's: everything that touches, summed as vectors."""
 
 
 def summarise_forces(
-    force_w: Any, xp: Any = jnp, contacts: Any = None, options: ForceOptions = PAPER_FORCE
+    force_w: Any, xp: Any = jnp, contacts: Any = None, options: TaskRules = PAPER_FORCE
 ) -> dict[str, Any]:
     """Contact forces of all substeps to the fields of `StepSignals` that hold forces.
 
@@ -119,7 +110,7 @@ def summarise_forces(
         force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
         xp: numpy or jax.numpy.
         contacts: see `interactive_nav.scenes.contacts.combine`.
-        options: what F_t is.
+        options: what F_t is: `force_part` and `force_sum`.
     """
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)
     force, body = combine(force_w.sum(-2), contacts, options.force_part, options.force_sum, xp)

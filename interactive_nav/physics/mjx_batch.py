@@ -19,15 +19,7 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.config import NavConfig
-from interactive_nav.physics.base import (
-    PAPER_FORCE,
-    ForceOptions,
-    Physics,
-    PhysicsState,
-    StepSignals,
-    summarise_forces,
-    uncommitted,
-)
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces, uncommitted
 from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
@@ -46,7 +38,7 @@ CCD_PER_ENV = 32
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap; what the two implementations do apart is theirs."""
 
-    def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
+    def __init__(self, world: World, config: NavConfig):
         self.window = Window(world, config)
         physics = config.physics
         self._world, self._substeps = world, physics.substeps
@@ -56,7 +48,7 @@ class MjxPhysics(Physics):
         self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
-        self._forces = forces
+        self._forces = config.rules
 
     def _host_model(self) -> mujoco.MjModel:
         return self.window.model
@@ -131,16 +123,16 @@ class WarpPhysics(MjxPhysics):
 
     name = "warp"
 
-    def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
+    def __init__(self, world: World, config: NavConfig):
         keep_collector_out()
-        super().__init__(world, config, forces)
+        super().__init__(world, config)
         if not (self.contacts_per_env and self.constraints_per_env):
             measured = measure_buffers(world, self.window)
             self.contacts_per_env = self.contacts_per_env or measured[0]
             self.constraints_per_env = self.constraints_per_env or measured[1]
         # Warp prints a line per overflow or unconverged solve: ours are counted instead.
         self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
-        self._contacts = sensor_addresses(self._host) if forces.needs_contacts else None
+        self._contacts = sensor_addresses(self._host) if config.rules.needs_contacts else None
 
     def _template(self, n):
         return mjx.make_data(
@@ -176,8 +168,8 @@ class JaxPhysics(MjxPhysics):
     name = "jax"
     tells_convergence = False
 
-    def __init__(self, world: World, config: NavConfig, forces: ForceOptions = PAPER_FORCE):
-        super().__init__(world, config, forces)
+    def __init__(self, world: World, config: NavConfig):
+        super().__init__(world, config)
         layout = self.window.layout
         self._slot_of_geom = _slot_of_geom(layout, self._host)
         self._rolls = rolling_geoms(self._host, world.robot, layout.robot_bodies)

@@ -18,7 +18,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from interactive_nav.physics.base import PAPER_FORCE, ForceOptions, Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.config import NavConfig
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
 from interactive_nav.scenes.world import World
@@ -49,28 +50,20 @@ class NativePhysics(Physics):
 
     name = "native"
 
-    def __init__(
-        self,
-        world: World,
-        substeps: int,
-        sleep: bool = True,
-        threads: int = 0,
-        forces: ForceOptions = PAPER_FORCE,
-    ):
+    def __init__(self, world: World, config: NavConfig):
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
-        self._substeps = substeps
+        self._physics = config.physics
         self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
-        self._forces = forces
-        self._contacts = sensor_addresses(world.models[0]) if forces.needs_contacts else None
+        self._forces = config.rules
+        self._contacts = sensor_addresses(world.models[0]) if config.rules.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
-        self._threads, self._sleep = threads, sleep
         self._models = tuple(copy.copy(m) for m in world.models)
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must be seen, not silently replaced by the model's default.
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-            if sleep:
+            if self._physics.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         self._pools: dict[int, list[_Pool]] = {}
         self._lock = threading.Lock()
@@ -108,7 +101,7 @@ class NativePhysics(Physics):
             if free:
                 known = [np.equal(p.qpos, qpos).all(1).sum() for p in free]
                 return free.pop(int(np.argmax(known)))
-        return _Pool(self._models, size, self._threads, self._sleep)
+        return _Pool(self._models, size, self._physics.threads, self._physics.sleep)
 
     def _step_pool(self, pool: _Pool, size: int, scene, state: PhysicsState, qpos, qvel, command, time_s):
         batch = pool.batch
@@ -149,7 +142,7 @@ class NativePhysics(Physics):
 
     def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[Any, Any]:
         """Runs the substeps; sensor readings [N, substeps, ...] and the most solver iterations [N]."""
-        rounds = self._substeps if self._robot.control_every_substep else 1
+        rounds = self._physics.substeps if self._robot.control_every_substep else 1
         sensed, layout = [], self._layout
         iterations = np.zeros(len(command), np.int64)
         for k in range(rounds):
@@ -159,7 +152,9 @@ class NativePhysics(Physics):
                 time_s + k * self._models[0].opt.timestep,
             )
             pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
-            record = pool.batch.rollout(self._substeps // rounds, record=("sensordata", "solver_niter", "nisland"))
+            record = pool.batch.rollout(
+                self._physics.substeps // rounds, record=("sensordata", "solver_niter", "nisland")
+            )
             sensed.append(record["sensordata"])
             niter = record["solver_niter"]
             # Without islands the engine reports one solve; what lies beyond the last island is stale.

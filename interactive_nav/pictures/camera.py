@@ -10,6 +10,7 @@ on a CPU too, after a compilation of ten seconds a size, so there it is used onl
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +21,7 @@ from interactive_nav.physics import resolve_backend
 from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
 from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
-from interactive_nav.sensing.shading import SKY_COLOUR, geom_colour, lambert
+from interactive_nav.sensing.shading import SKY_COLOUR, lambert
 from interactive_nav_common.errors import ConfigError, UserError
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
@@ -104,7 +105,10 @@ class Camera:
             ConfigError: unknown engine.
         """
         self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
-        self._models: dict[int, _PictureModel] = {}
+        world, classes = env.world, env.sensors.boxes.classes
+        self._model = functools.cache(
+            lambda scene: SceneModel(world.robot, world.scenes[scene], world.small_objects, classes)
+        )
 
     @property
     def engine(self) -> str:
@@ -148,9 +152,7 @@ class Camera:
                 "index it first: jax.tree.map(lambda x: x[0], state)"
             )
         scene = int(state.info["nav"].scene_index)
-        if scene not in self._models:
-            self._models[scene] = _PictureModel(self._env, scene)
-        model = self._models[scene]
+        model = self._model(scene)
         model.pose(self._env.world, scene, qpos)
         pose, fov = self._pose(model, qpos, scene, view, width / height)
         lens, groups = Lens(width, height, fov), SCENE if view == "robot" else (*SCENE, ROBOT, ROBOT_SOLIDS)
@@ -182,18 +184,8 @@ class Camera:
         return look_along(eye, target - eye), 70.0
 
 
-class _PictureModel(SceneModel):
-    """A scene's model with the colours that rays give it."""
-
-    def __init__(self, env: Any, scene: int):
-        world = env.world
-        super().__init__(world.robot, world.scenes[scene], world.small_objects, env.sensors.boxes.classes)
-        self.colour = np.array([geom_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
-        """[ngeom, 3] in [0, 1]: of the geom, or its texture's mean."""
-
-
 def _by_rays(
-    model: _PictureModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...], streams: set[str]
+    model: SceneModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...], streams: set[str]
 ) -> dict[str, np.ndarray]:
     ray, geom, depth, faces = trace(model.model, model.data, pose, lens, groups)
     met = (geom >= 0) & (depth > 0) & (depth < FAR_M)

@@ -6,6 +6,7 @@ where a caller wants them, and rays are cast into it.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import mujoco
@@ -16,7 +17,7 @@ from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes,
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
@@ -135,6 +136,11 @@ class SceneModel:
         """[ngeom] segmentation ids."""
         self.category = [category for _, category in rows]
         """[ngeom]"""
+
+    @functools.cached_property
+    def colour(self) -> np.ndarray:
+        """[ngeom, 3] in [0, 1]: of the geom, or its texture's mean."""
+        return np.array([geom_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
 
     def pose(self, world: World, scene: int, qpos: np.ndarray) -> None:
         """Puts all bodies where an environment's `qpos` [nq] has them.

@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -167,19 +168,19 @@ class ThirdPerson:
             lambda scene: SceneView(env.robot, env.scenes[scene], small, config.sensors.segmentation_classes)
         )
 
-    def frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
-        """[rows, columns, 3] u8.
+    def frames(self, state: Any) -> tuple[np.ndarray, ...]:
+        """[rows, columns, 3] u8 of each environment of a batch, or of one that is alone."""
+        nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
+        told = np.asarray(nav.scene_index).reshape(-1), np.asarray(nav.goal_xy_w).reshape(-1, 2)
+        each = zip(told[0], qpos.reshape(-1, qpos.shape[-1]), told[1], strict=True)
+        return tuple(self._frame(int(scene), *row) for scene, *row in each)
 
-        Args:
-            scene: index of the scene.
-            qpos: [nq] of the environment's physics.
-            goal_xy_w: (2,) m.
-        """
+    def _frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
         view = self._view(scene)
         view.pose(self.env.world, scene, qpos)
         base = view.data.body(self.env.robot.base_body)
         camera = chase_camera(base.xpos, yaw_from_quat(base.xquat), self.rows, self.columns)
-        paint = FloorPaint(np.asarray(goal_xy_w), self.env.success_distance_m)
+        paint = FloorPaint(goal_xy_w, self.env.success_distance_m)
         return view.look(*camera, OUTSIDE, paint).colour
 
 

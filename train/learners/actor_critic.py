@@ -7,24 +7,36 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
 from brax.envs import Env
 from brax.training import gradients, types
 from brax.training import networks as brax_networks
+from brax.training.acme import running_statistics
 
 from train.config import NetworkConfig, OffPolicyConfig
 from train.learners import networks
 
 
+@flax.struct.dataclass
+class ActorCriticState:
+    """All that learning changes."""
+
+    policy_optimizer_state: optax.OptState
+    policy_params: Any
+    q_optimizer_state: optax.OptState
+    q_params: Any
+    target_q_params: Any
+    normalizer_params: running_statistics.RunningStatisticsState
+    gradient_steps: jax.Array
+    key: jax.Array
+
+
 @dataclasses.dataclass(frozen=True)
 class ActorCritic(abc.ABC):
-    """All that learning does not change; SAC and DDPG add what makes them SAC and DDPG.
-
-    Its learner has `policy_params`, `policy_optimizer_state`, `q_params`, `q_optimizer_state`, `target_q_params`,
-    `normalizer_params` and `gradient_steps`.
-    """
+    """All that learning does not change; SAC and DDPG add what makes them SAC and DDPG."""
 
     config: OffPolicyConfig
     networks: Any

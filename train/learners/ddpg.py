@@ -19,11 +19,10 @@ import jax.numpy as jnp
 import optax
 from brax.envs import Env
 from brax.training import types
-from brax.training.acme import running_statistics
 from brax.training.networks import FeedForwardNetwork
 
 from train.config import DDPGConfig, TrainConfig
-from train.learners.actor_critic import ActorCritic, make_networks, shares_encoder, soft_update
+from train.learners.actor_critic import ActorCritic, ActorCriticState, make_networks, shares_encoder, soft_update
 
 
 @flax.struct.dataclass
@@ -41,18 +40,10 @@ class DDPGNetworks:
 
 
 @flax.struct.dataclass
-class DDPGState:
-    """All that learning changes."""
+class DDPGState(ActorCriticState):
+    """With a target of the policy too."""
 
-    policy_optimizer_state: optax.OptState
-    policy_params: Any
     target_policy_params: Any
-    q_optimizer_state: optax.OptState
-    q_params: Any
-    target_q_params: Any
-    normalizer_params: running_statistics.RunningStatisticsState
-    gradient_steps: jax.Array
-    key: jax.Array
 
 
 def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: float) -> tuple[Any, Any]:

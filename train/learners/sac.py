@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import optax
 from brax.envs import Env
 from brax.training import distribution, types
-from brax.training.acme import running_statistics
 from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
 from train.config import SACConfig, TrainConfig
 from train.learners.actor_critic import (
     ActorCritic,
+    ActorCriticState,
     descend,
     make_networks,
     shares_encoder,
@@ -34,20 +34,12 @@ from train.learners.actor_critic import (
 
 
 @flax.struct.dataclass
-class SACState:
-    """All that learning changes."""
+class SACState(ActorCriticState):
+    """With the temperature."""
 
-    policy_optimizer_state: optax.OptState
-    policy_params: Any
-    q_optimizer_state: optax.OptState
-    q_params: Any
-    target_q_params: Any
     alpha_optimizer_state: optax.OptState
     alpha_params: jax.Array
     """() logarithm of the temperature."""
-    normalizer_params: running_statistics.RunningStatisticsState
-    gradient_steps: jax.Array
-    key: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
