@@ -139,7 +139,7 @@ class Window:
             Per group [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something
             within reach had to be left out.
         """
-        near, moving, walls = self._near(scene, state)
+        near, moving, walls = self._nearness.measure(scene, state, self._reach_m)
         chosen, missed = [], jnp.zeros((), bool)
         for group in self.groups:
             if group.width == len(group.slots):
@@ -158,14 +158,10 @@ class Window:
 
     def needs(self, scene: jax.Array, state: PhysicsState) -> dict[str, jax.Array]:
         """How many of each kind can be met, or move, in one environment: [] i32 by kind of slot, and of walls."""
-        near, moving, walls = self._near(scene, state)
+        near, moving, walls = self._nearness.measure(scene, state, self._reach_m)
         needed = (near < 0) | moving
         counts = {kind: needed[jnp.asarray(slots)].sum() for kind, slots in self._slots.items()}
         return {**counts, "walls": (walls < 0).sum()}
-
-    def _near(self, scene: jax.Array, state: PhysicsState) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """[slots] m to where each can be met, [slots] whether it moves, [walls] m likewise; see `Nearness.measure`."""
-        return self._nearness.measure(scene, state, self._reach_m)
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
         """Values of all `FIELDS` of the window's model, in MuJoCo's shapes."""

@@ -22,7 +22,7 @@ from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
-from interactive_nav_common.errors import ConfigError, UserError, readable
+from interactive_nav_common.errors import UserError, readable
 from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import MaskClasses
 
@@ -115,10 +115,9 @@ class EpisodePlayer:
     def __init__(
         self,
         env: InteractiveNav,
-        policy: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
+        policy: Callable[[jax.Array, jax.Array], jax.Array],
         name: str = "policy",
         label: str = "",
-        planner: Callable[[Any, int, int], Any] | None = None,
     ):
         """Wires it.
 
@@ -127,18 +126,10 @@ class EpisodePlayer:
             policy: pure (observation, key) -> action (A,) in [-1, 1].
             name: of the policy, for captions.
             label: where the policy comes from, for captions.
-            planner: in place of a policy, (state with leaves [1, ...], episode, step) -> actions [1, A], on the
-                host: something that looks at the whole state or keeps a plan.
-
-        Raises:
-            ConfigError: both a policy and a planner, or neither.
         """
-        if (policy is None) == (planner is None):
-            raise ConfigError("Player got policy and planner, expected exactly one of them")
         self.env, self.name, self.label = env, name, label
         self._reset = jax.jit(jax.vmap(env.reset))
-        self._planner = planner
-        self._policy = jax.jit(functools.partial(_action, policy)) if policy else None
+        self._policy = jax.jit(functools.partial(_action, policy))
         self._step = jax.jit(functools.partial(_play_step, env))
 
     def play(self, key: jax.Array, episode: int = 0, on_progress: Callable[[int], None] = lambda step: None) -> Replay:
@@ -154,12 +145,7 @@ class EpisodePlayer:
         first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
         start_qpos, told = np.asarray(state.pipeline_state.qpos), []
         while not told or not told[-1]["done"]:
-            if self._policy is not None:
-                action = self._policy(state.obs, policy_key, len(told))
-            else:
-                assert self._planner is not None
-                action = jnp.asarray(self._planner(state, episode, len(told)), jnp.float32)
-            state, out = self._step(state, action)
+            state, out = self._step(state, self._policy(state.obs, policy_key, len(told)))
             told.append(jax.tree.map(np.asarray, out))
             on_progress(len(told))
         joined = {name: np.stack([out[name] for out in told]) for name in told[0]}

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -103,17 +104,14 @@ def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Sl
     return slots
 
 
+def _solid(friction: float, group: int = 3) -> dict[str, Any]:
+    """What geoms that collide and weigh nothing are alike in."""
+    return {"mass": 0.0, "friction": [friction, 0.005, 0.0001], "group": group}
+
+
 def _add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float) -> None:
-    body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=row[:3],
-        quat=row[3:7],
-        size=row[7:10],
-        mass=0.0,
-        friction=[friction, 0.005, 0.0001],
-        group=3,
-    )
+    box, solid = mujoco.mjtGeom.mjGEOM_BOX, _solid(friction)
+    body.add_geom(name=name, type=box, pos=row[:3], quat=row[3:7], size=row[7:10], **solid)
 
 
 def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.ndarray, friction: float) -> None:
@@ -128,11 +126,9 @@ def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.n
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             pos=points[i] if i < len(points) else hidden_m,
             size=[_FOOT_RADIUS_M, 0, 0],
-            mass=0.0,
-            friction=[friction, 0.005, 0.0001],
-            group=4,
             contype=_FLOOR,
             conaffinity=0,
+            **_solid(friction, 4),
         )
 
 
@@ -183,10 +179,8 @@ def _add_movable(
                 name=f"{name}_hull_{i}",
                 type=mujoco.mjtGeom.mjGEOM_MESH,
                 meshname=f"{name}_mesh_{i}",
-                mass=0.0,
-                friction=[friction, 0.005, 0.0001],
-                group=3,
                 contype=_SOLID | _FLOOR,
+                **_solid(friction),
             )
         return
     # A padding box hides at the centre of mass, inside the body, and is too small to be met first.

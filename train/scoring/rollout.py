@@ -161,14 +161,13 @@ class BatchPlayer:
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
         if not isinstance(policy, jax.tree_util.Partial):
             act = None if isinstance(policy, HostPolicy) else jax.tree_util.Partial(policy)
-        step = 0
+        step, carry = 0, _carry(state, jnp.asarray(finished))
         while not finished.all():
-            ended_here = jnp.asarray(finished[episode_of])
             if act is None:
-                played = _play_planned(self._step, planner, state, first_episode + episode_of, ended_here, step)
+                carry, track = _play_planned(self._step, planner, carry, first_episode + episode_of, step)
             else:
-                played = self._chunk(act, state, policy_keys[episode_of], ended_here, step)
-            state, ended, final, moved, track = played
+                carry, track = self._chunk(act, carry, policy_keys[episode_of], step)
+            _, ended, final, moved = carry
             step += CHUNK_STEPS
             new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
             for name, values in final.items():
@@ -183,7 +182,7 @@ class BatchPlayer:
             on_progress(int(finished[:count].sum()), step)
             running = np.flatnonzero(~finished[episode_of])
             if self.env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
-                state = jax.tree.map(operator.itemgetter(running), state)
+                carry = jax.tree.map(operator.itemgetter(running), carry)
                 episode_of = episode_of[running]
         paths = _paths(first, ends.pop("object_pos_w"), tracks, record)
         metrics, ends = ({name: x[:count] for name, x in values.items()} for values in (metrics, ends))
@@ -252,9 +251,8 @@ def _carry(state: Any, ended: jax.Array) -> Any:
     return state, ended, dict(state.metrics), {name: getattr(nav, name) for name in ("object_pos_w", *OF_OBJECTS)}
 
 
-def _play_planned(one_step: Any, planner: Any, state: Any, episode_of: np.ndarray, ended: jax.Array, step: int) -> Any:
+def _play_planned(one_step: Any, planner: Any, carry: Any, episode_of: np.ndarray, step: int) -> tuple[Any, np.ndarray]:
     """`_play_chunk` for a planner on the host."""
-    carry = _carry(state, ended)
     tracks = []
     for t in range(CHUNK_STEPS):
         running = ~np.asarray(carry[1])
@@ -262,22 +260,15 @@ def _play_planned(one_step: Any, planner: Any, state: Any, episode_of: np.ndarra
             break
         carry, track = one_step(carry, planner.act(carry[0], episode_of, running, step + t))
         tracks.append(np.asarray(track))
-    state, ended, final, moved = carry
     tracks += [np.full_like(tracks[0], np.nan)] * (CHUNK_STEPS - len(tracks))
-    return state, ended, final, moved, np.stack(tracks)
+    return carry, np.stack(tracks)
 
 
-def _play_chunk(env: Any, policy: PolicyFn, state: Any, keys: jax.Array, ended: jax.Array, step: int) -> Any:
-    """Steps all environments by `CHUNK_STEPS`.
-
-    Returns:
-        state, ended [N], metrics at the end {name: [N]}, what is told of objects at the end {name: [N, M, ...]},
-        robot positions [T, N, 2] (NaN after the end).
-    """
+def _play_chunk(env: Any, policy: PolicyFn, carry: Any, keys: jax.Array, step: int) -> tuple[Any, jax.Array]:
+    """`CHUNK_STEPS` of all environments: what `_carry` holds, and robots' positions [T, N, 2] (NaN after the end)."""
 
     def one_step(carry: Any, t: jax.Array) -> tuple[Any, jax.Array]:
         action = jax.vmap(policy)(carry[0].obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
         return _play_step(env, carry, action)
 
-    (state, ended, final, moved), track = jax.lax.scan(one_step, _carry(state, ended), jnp.arange(CHUNK_STEPS))
-    return state, ended, final, moved, track
+    return jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))

@@ -17,7 +17,7 @@ from interactive_nav_common.words import program
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
-from train.sweep.devices import Machine, MachineLauncher, find_gpus
+from train.sweep.devices import Machine, find_gpus
 from train.sweep.folder import SweepFolder
 from train.sweep.scheduler import STAGES, Programs, Scheduler
 from train.sweep.spec import Sweep
@@ -44,7 +44,7 @@ def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
         from interactive_nav_common.jobs.on_ray import RayLauncher
 
         return RayLauncher(address)
-    return MachineLauncher(Machine(find_gpus(), sweep.config.launch.slots))
+    return Machine(find_gpus(), sweep.config.launch.slots)
 
 
 @reports_errors("train.sweep")

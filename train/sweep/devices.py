@@ -65,10 +65,11 @@ def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
     return [found[name] for name in names if name in found]
 
 
-class Machine:
-    """Gives out shares of one machine, and takes them back."""
+class Machine(Launcher):
+    """Processes on this machine, each with its share of a GPU or of the cores."""
 
     def __init__(self, gpus: list[Gpu], slots: int):
+        super().__init__()
         self._gpus, self._slots = gpus, slots
         self._given: list[Share] = []
 
@@ -95,6 +96,13 @@ class Machine:
     def give_back(self, share: Share) -> None:
         """A run is over."""
         self._given.remove(share)
+
+    def _begin(self, job: Job) -> Begun | None:
+        assert isinstance(job, RunJob)
+        share = self.take(job.launch, job.factor)
+        if share is None:
+            return None
+        return Child(job, share_env(share, job.launch)), share.label, lambda: self.give_back(share)
 
 
 def fraction_of(gpu: Gpu, launch: LaunchConfig) -> float:
@@ -132,18 +140,3 @@ class RunJob(Job):
     def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
         """Variables that keep it within its part."""
         return share_env(Share(Gpu(gpu, 0.0) if gpu else None, part), self.launch)
-
-
-class MachineLauncher(Launcher):
-    """Processes on this machine, each with its share of a GPU or of the cores."""
-
-    def __init__(self, machine: Machine):
-        super().__init__()
-        self._machine = machine
-
-    def _begin(self, job: Job) -> Begun | None:
-        assert isinstance(job, RunJob)
-        share = self._machine.take(job.launch, job.factor)
-        if share is None:
-            return None
-        return Child(job, share_env(share, job.launch)), share.label, lambda: self._machine.give_back(share)

@@ -84,21 +84,6 @@ def test_a_replay_is_what_the_environment_kept_account_of(env, played):
     np.testing.assert_allclose(np.linalg.norm(played.body_quat_w, axis=-1), 1, atol=1e-5)
 
 
-def test_a_planner_on_the_host_sees_the_state_and_the_step(env):
-    asked = []
-
-    def ahead(state, episode, step):
-        asked.append((episode, step, state.info["nav"].step_count.tolist()))
-        return np.full((1, 2), 0.4)
-
-    run = EpisodePlayer(env, planner=ahead).play(jax.random.PRNGKey(3), episode=2)
-    assert asked == [(2, t, [t]) for t in range(run.num_steps)]
-    np.testing.assert_allclose(run.action, 0.4)
-    assert np.linalg.norm(run.robot_xy_w[10] - run.robot_xy_w[0]) > 0.1
-    with pytest.raises(UserError, match="expected exactly one of them"):
-        EpisodePlayer(env)
-
-
 def test_a_replay_survives_its_file(played, tmp_path):
     path = tmp_path / "deep" / "a.npz"
     replay.save(played, path)

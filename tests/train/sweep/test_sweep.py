@@ -22,7 +22,7 @@ from interactive_nav_common.jobs import processes as jobs
 from interactive_nav_common.locks import is_locked, take_lock
 from train.sweep import spec
 from train.sweep.__main__ import main
-from train.sweep.devices import Gpu, Machine, MachineLauncher, find_gpus, parse_gpus, share_env
+from train.sweep.devices import Gpu, Machine, find_gpus, parse_gpus, share_env
 from train.sweep.folder import RunState, SweepFolder, last_line
 from train.sweep.scheduler import Outcome, Programs, Scheduler
 from train.sweep.spec import LaunchConfig
@@ -51,7 +51,7 @@ def sweep(path: Path, machine: Machine | None = None, limit_s: float | None = No
     console = Console(file=io.StringIO(), width=400)
     folder = SweepFolder(spec.load(str(path)))
     folder.prepare()
-    launcher = MachineLauncher(machine or Machine([], 2))
+    launcher = machine or Machine([], 2)
     with SweepDisplay(console) as display:
         scheduler = Scheduler(folder, launcher, display, programs=FAKE, **keywords)  # type: ignore[arg-type]
         outcome = scheduler.run([], limit_s, poll_s=0.05)
@@ -365,14 +365,14 @@ def test_two_identical_sweeps_share_the_work(tmp_path):
 def test_a_run_whose_next_stage_another_sweep_has_begun_did_not_fail(tmp_path, monkeypatch):
     """Its lock is held again before the first sweep looks: it was trained all the same."""
     held = []
-    usual = MachineLauncher.ended
+    usual = Machine.ended
 
     def ended(self):
         over = usual(self)
         held.extend(take_lock(job.locks[0]) for job, _ in over if job.kind == "train")
         return over
 
-    monkeypatch.setattr(MachineLauncher, "ended", ended)
+    monkeypatch.setattr(Machine, "ended", ended)
     outcome, printed, _ = sweep(write_sweep(tmp_path))
     assert printed.count(": done") == 4 and "tried again" not in printed
     assert outcome.elsewhere == 4 and outcome.exit_code("done") == 0
