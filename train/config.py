@@ -111,8 +111,6 @@ class PPOConfig(Settings):
 class OffPolicyConfig(Settings):
     """What SAC and DDPG share: many environments, a replay on the device, a few large gradient steps an update."""
 
-    SECTION = ""
-
     num_envs: AtLeastOne | None = None
     """Environments stepped together."""
     steps_per_update: AtLeastOne | None = None
@@ -155,8 +153,6 @@ class OffPolicyConfig(Settings):
 class SACConfig(OffPolicyConfig):
     """Soft actor-critic; names as in Brax's `sac.train` where it has them."""
 
-    SECTION = "sac"
-
     actor_learning_rate: Positive = 3e-4
     """Adam's step size for the policy."""
     critic_learning_rate: Positive = 3e-4
@@ -174,8 +170,6 @@ class SACConfig(OffPolicyConfig):
 @dataclasses.dataclass(frozen=True)
 class DDPGConfig(OffPolicyConfig):
     """Deep deterministic policy gradient; defaults are the original benchmark's."""
-
-    SECTION = "ddpg"
 
     actor_learning_rate: Positive = 1e-4
     """Adam's step size for the policy."""

@@ -26,7 +26,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 import interactive_nav
-from interactive_nav.interop.gym_steps import STEPS, reset_where
+from interactive_nav.interop.gym_steps import reset_where, step
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.views import ThirdPerson
 from interactive_nav.robots import robot_names
@@ -227,7 +227,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         self._reset = jax.jit(functools.partial(reset_all, self.env))
         self._reset_to = jax.jit(jax.vmap(self.env.reset_to))
         self._reset_where = jax.jit(functools.partial(reset_where, self.env))
-        self._step = jax.jit(functools.partial(STEPS[self.autoreset_mode], self.env))
+        self._step = jax.jit(functools.partial(step, self.env, self.autoreset_mode))
         self._state: Any = None
         self._ended = jnp.zeros(num_envs, bool)
 

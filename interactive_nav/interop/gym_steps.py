@@ -27,32 +27,17 @@ def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Arra
     return new.replace(obs=_where(mask, jax.vmap(env.observe)(new).obs, state.obs))
 
 
-def _outcome(state: Any) -> tuple[Any, ...]:
-    truncated = state.info["truncation"] > 0
-    return state.obs, state.reward, (state.done > 0) & ~truncated, truncated, dict(state.metrics)
-
-
-def _step_same(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
-    stepped = jax.vmap(env.step)(state, actions)
-    done = stepped.done > 0
-    new = jax.lax.cond(done.any(), lambda s: reset_where(env, s, s.info["rng"], done), lambda s: s, stepped)
-    return new, jnp.zeros_like(done), _outcome(stepped)
-
-
-def _step_next(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
-    stepped = jax.vmap(env.step)(state, actions)
-    new = jax.lax.cond(ended.any(), lambda s: reset_where(env, s, state.info["rng"], ended), lambda s: s, stepped)
-    return new, ended, _outcome(new)
-
-
-def _step_only(env: InteractiveNav, state: Any, actions: jax.Array, ended: jax.Array) -> tuple[Any, ...]:
-    stepped = jax.vmap(env.step)(state, actions)
-    return stepped, jnp.zeros_like(ended), _outcome(stepped)
-
-
-STEPS = {
-    AutoresetMode.SAME_STEP: _step_same,
-    AutoresetMode.NEXT_STEP: _step_next,
-    AutoresetMode.DISABLED: _step_only,
-}
-"""What follows an episode's end: (env, state, actions, ended) -> (state, was over, outcome)."""
+def step(
+    env: InteractiveNav, mode: AutoresetMode, state: Any, actions: jax.Array, ended: jax.Array
+) -> tuple[Any, jax.Array, tuple[Any, ...]]:
+    """The state after a step and, where the mode has it, a new beginning; which episodes were over before, so that
+    nothing but a reset was done; and observation, reward, terminated, truncated and metrics."""
+    stepped = new = jax.vmap(env.step)(state, actions)
+    same = mode is AutoresetMode.SAME_STEP
+    if mode is not AutoresetMode.DISABLED:
+        due, keys = (stepped.done > 0, stepped.info["rng"]) if same else (ended, state.info["rng"])
+        new = jax.lax.cond(due.any(), lambda s: reset_where(env, s, keys, due), lambda s: s, stepped)
+    told = new if mode is AutoresetMode.NEXT_STEP else stepped
+    truncated = told.info["truncation"] > 0
+    over = ended if mode is AutoresetMode.NEXT_STEP else jnp.zeros_like(ended)
+    return new, over, (told.obs, told.reward, (told.done > 0) & ~truncated, truncated, dict(told.metrics))

@@ -23,7 +23,7 @@ from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
 from interactive_nav_common.errors import UserError, readable
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_arrays
 from scenes_mjcf.categories import MaskClasses
 
 FORMAT = 1
@@ -227,8 +227,7 @@ def save(replay: Replay, path: str | Path) -> None:
     """
     fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
     header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
+    write_arrays(path, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
 
 
 def load(path: str | Path) -> Replay:

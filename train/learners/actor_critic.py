@@ -5,18 +5,18 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
-from brax.envs import Env
 from brax.training import gradients, types
 from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics
+from brax.training.agents.sac import networks as sac_networks
 
-from train.config import NetworkConfig, OffPolicyConfig
+from train.config import OffPolicyConfig, TrainConfig
 from train.learners import networks
 
 
@@ -38,13 +38,49 @@ class ActorCriticState:
 class ActorCritic(abc.ABC):
     """All that learning does not change; SAC and DDPG add what makes them SAC and DDPG."""
 
+    SECTION: ClassVar[str]
+    """Of the config."""
+
     config: OffPolicyConfig
-    networks: Any
-    """With `policy_network` and `q_network`, as Brax's `SACNetworks`."""
+    networks: sac_networks.SACNetworks
+    """[..., outputs] and [..., critics] of observations, and actions."""
     size: networks.ObservationSize
     action_size: int
     shared: bool
     """The policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
+
+    @classmethod
+    def of(cls, env: Any, config: TrainConfig) -> Self:
+        """The networks and settings for an environment's observations and actions; with images the critics look
+        through one encoder.
+
+        Raises:
+            ConfigError: images too small for the convolutions, or nothing for the critics to see.
+        """
+        c, network, size = getattr(config, cls.SECTION), config.network, env.observation_size
+        distribution = cls.distribution(env.action_size)
+        outputs, critics = distribution.param_size if distribution else env.action_size, getattr(c, "num_critics", 2)
+        prepare: Any = networks.preprocess(c.normalize_observations)
+        layers, q_layers, norm = c.policy_hidden_layer_sizes, c.q_hidden_layer_sizes, c.q_layer_norm
+        if isinstance(size, Mapping):
+            images, head = network.critic_inputs == "all", networks.Head(layers, outputs)
+            q_head = networks.TwinHead(q_layers, network.action_features, critics, norm)
+            policy = networks.make_split(network, size, True, prepare, head).whole()
+            q = networks.make_split(network, size, images, prepare, q_head, env.action_size).whole()
+        else:
+            policy = brax_networks.make_policy_network(
+                outputs, size, preprocess_observations_fn=prepare, hidden_layer_sizes=layers
+            )
+            q = brax_networks.make_q_network(
+                size, env.action_size, prepare, hidden_layer_sizes=q_layers, n_critics=critics, layer_norm=norm
+            )
+        made = sac_networks.SACNetworks(policy, q, distribution)  # type: ignore[call-arg]
+        return cls(c, made, size, env.action_size, network.share_encoder and isinstance(size, Mapping))
+
+    @staticmethod
+    def distribution(action_size: int) -> Any:
+        """Of actions, as the policy's outputs parametrise it; None: they are actions before tanh."""
+        return None
 
     @property
     def steps_per_update(self) -> int:
@@ -160,44 +196,3 @@ def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformat
 def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
     """Targets moved by `tau` towards the networks they follow, written as Brax writes it."""
     return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)
-
-
-def make_networks(
-    env: Env, network: NetworkConfig, config: OffPolicyConfig, outputs: int, critics: int
-) -> tuple[brax_networks.FeedForwardNetwork, brax_networks.FeedForwardNetwork]:
-    """A policy and critics; with images the critics look through one encoder.
-
-    Args:
-        env: its observations and actions.
-        network: encoders; read where observations have images.
-        config: layers.
-        outputs: numbers that parametrise an action.
-        critics: how many.
-
-    Returns:
-        Observations to what parametrises actions [..., outputs]; observations and actions to values [..., critics].
-
-    Raises:
-        ConfigError: images too small for the convolutions, or nothing for the critics to see.
-    """
-    size: Any = env.observation_size
-    prepare: Any = networks.preprocess(config.normalize_observations)
-    layers, q_layers = config.policy_hidden_layer_sizes, config.q_hidden_layer_sizes
-    if isinstance(size, Mapping):
-        images, head = network.critic_inputs == "all", networks.Head(layers, outputs)
-        q_head = networks.TwinHead(q_layers, network.action_features, critics, config.q_layer_norm)
-        policy = networks.make_split(network, size, True, prepare, head)
-        q = networks.make_split(network, size, images, prepare, q_head, env.action_size)
-        return policy.whole(), q.whole()
-    norm = config.q_layer_norm
-    return (
-        brax_networks.make_policy_network(outputs, size, preprocess_observations_fn=prepare, hidden_layer_sizes=layers),
-        brax_networks.make_q_network(
-            size, env.action_size, prepare, hidden_layer_sizes=q_layers, n_critics=critics, layer_norm=norm
-        ),
-    )
-
-
-def shares_encoder(network: NetworkConfig, size: networks.ObservationSize) -> bool:
-    """Whether the policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
-    return network.share_encoder and isinstance(size, Mapping)

@@ -17,26 +17,16 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
-from brax.envs import Env
 from brax.training import types
-from brax.training.networks import FeedForwardNetwork
+from brax.training.agents.sac.networks import SACNetworks
 
-from train.config import DDPGConfig, TrainConfig
-from train.learners.actor_critic import ActorCritic, ActorCriticState, make_networks, shares_encoder, soft_update
+from train.config import DDPGConfig
+from train.learners.actor_critic import ActorCritic, ActorCriticState, soft_update
 
 
-@flax.struct.dataclass
-class DDPGNetworks:
-    """As Brax's `SACNetworks`, without a distribution."""
-
-    policy_network: FeedForwardNetwork
-    """apply(normalizer, params, observation) -> [..., A] before tanh."""
-    q_network: FeedForwardNetwork
-    """apply(normalizer, params, observation, action) -> [..., critics]."""
-
-    def action(self, normalizer_params: Any, policy_params: Any, observation: Any) -> jax.Array:
-        """The policy's actions [..., A] in [-1, 1]."""
-        return jnp.tanh(self.policy_network.apply(normalizer_params, policy_params, observation))
+def action_of(networks: SACNetworks, normalizer_params: Any, policy_params: Any, observation: Any) -> jax.Array:
+    """The policy's actions [..., A] in [-1, 1]."""
+    return jnp.tanh(networks.policy_network.apply(normalizer_params, policy_params, observation))
 
 
 @flax.struct.dataclass
@@ -46,7 +36,7 @@ class DDPGState(ActorCriticState):
     target_policy_params: Any
 
 
-def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: float) -> tuple[Any, Any]:
+def make_losses(ddpg_network: SACNetworks, reward_scaling: float, discounting: float) -> tuple[Any, Any]:
     """The losses of critic and policy, with arguments in Brax's order."""
 
     def critic_loss(
@@ -59,7 +49,7 @@ def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: 
         q_old_action = ddpg_network.q_network.apply(
             normalizer_params, q_params, transitions.observation, transitions.action
         )
-        next_action = ddpg_network.action(normalizer_params, target_policy_params, transitions.next_observation)
+        next_action = action_of(ddpg_network, normalizer_params, target_policy_params, transitions.next_observation)
         next_q = ddpg_network.q_network.apply(
             normalizer_params, target_q_params, transitions.next_observation, next_action
         )
@@ -74,7 +64,7 @@ def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: 
     def actor_loss(
         policy_params: Any, normalizer_params: Any, q_params: Any, transitions: types.Transition
     ) -> jax.Array:
-        action = ddpg_network.action(normalizer_params, policy_params, transitions.observation)
+        action = action_of(ddpg_network, normalizer_params, policy_params, transitions.observation)
         q = ddpg_network.q_network.apply(normalizer_params, q_params, transitions.observation, action)
         return -jnp.mean(q[..., 0])
 
@@ -85,8 +75,8 @@ def make_losses(ddpg_network: DDPGNetworks, reward_scaling: float, discounting: 
 class DDPG(ActorCritic):
     """All that learning does not change."""
 
+    SECTION = "ddpg"
     config: DDPGConfig
-    networks: DDPGNetworks
 
     @property
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
@@ -105,7 +95,7 @@ class DDPG(ActorCritic):
 
         def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
             del key
-            return self.networks.action(learner.normalizer_params, params, observation), {}
+            return action_of(self.networks, learner.normalizer_params, params, observation), {}
 
         return act
 
@@ -148,15 +138,4 @@ class DDPG(ActorCritic):
         ), metrics
 
 
-def make_agent(env: Env, config: TrainConfig) -> DDPG:
-    """The networks and settings for an environment's observations and actions.
-
-    Raises:
-        ConfigError: images too small for the convolutions, or nothing for the critic to see.
-    """
-    size: Any = env.observation_size
-    policy_network, q_network = make_networks(
-        env, config.network, config.ddpg, env.action_size, config.ddpg.num_critics
-    )
-    made = DDPGNetworks(policy_network, q_network)  # type: ignore[call-arg]
-    return DDPG(config.ddpg, made, size, env.action_size, shares_encoder(config.network, size))
+make_agent = DDPG.of

@@ -156,15 +156,15 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)
     make_replay = functools.partial(replay_buffer.init, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
-    check_memory(c, jax.eval_shape(make_replay))
+    check_memory(c, jax.eval_shape(make_replay), agent.SECTION)
     data = OffPolicyData(env_state, make_replay(), agent.init_noise())
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
 
 
-def check_memory(config: OffPolicyConfig, replay: Replay) -> None:
+def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
     """Raises `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
     if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
-        images, section = isinstance(replay.observation, Mapping), config.SECTION
+        images = isinstance(replay.observation, Mapping)
         smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"
         raise ConfigError(
             f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {replay_buffer.describe(replay)}; lower "

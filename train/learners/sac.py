@@ -17,20 +17,12 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
-from brax.envs import Env
 from brax.training import distribution, types
 from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
-from train.config import SACConfig, TrainConfig
-from train.learners.actor_critic import (
-    ActorCritic,
-    ActorCriticState,
-    descend,
-    make_networks,
-    shares_encoder,
-    soft_update,
-)
+from train.config import SACConfig
+from train.learners.actor_critic import ActorCritic, ActorCriticState, descend, soft_update
 
 
 @flax.struct.dataclass
@@ -46,8 +38,12 @@ class SACState(ActorCriticState):
 class SAC(ActorCritic):
     """All that learning does not change."""
 
+    SECTION = "sac"
     config: SACConfig
-    networks: sac_networks.SACNetworks
+
+    @staticmethod
+    def distribution(action_size: int) -> Any:
+        return distribution.NormalTanhDistribution(event_size=action_size)
 
     @property
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
@@ -120,14 +116,4 @@ def make_losses(agent: SAC) -> tuple[Any, Any, Any]:
     return sac_losses.make_losses(agent.networks, c.reward_scaling, c.discounting, action_size=stand_in)
 
 
-def make_agent(env: Env, config: TrainConfig) -> SAC:
-    """The networks and settings for an environment's observations and actions.
-
-    Raises:
-        ConfigError: images too small for the convolutions, or nothing for the critics to see.
-    """
-    size: Any = env.observation_size
-    actions = distribution.NormalTanhDistribution(event_size=env.action_size)
-    policy_network, q_network = make_networks(env, config.network, config.sac, actions.param_size, 2)
-    made = sac_networks.SACNetworks(policy_network, q_network, actions)  # type: ignore[call-arg]
-    return SAC(config.sac, made, size, env.action_size, shares_encoder(config.network, size))
+make_agent = SAC.of

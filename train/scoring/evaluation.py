@@ -15,7 +15,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, starts_of
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_arrays
 from interactive_nav_common.progress import progress_bar
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
@@ -193,8 +193,7 @@ def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None
         arrays[f"scene/{i}/resolution_m"] = np.array(scene.maps.resolution_m)
         arrays[f"scene/{i}/origin_w"] = np.array(scene.maps.origin_w)
         arrays[f"scene/{i}/object_names"] = np.array(env.world.names[i], dtype=str)
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, **arrays)
+    write_arrays(path, **arrays)
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.training import types
+from brax.training.agents.sac.networks import SACNetworks
 from brax.training.networks import FeedForwardNetwork
 
 from tests.train.learners.test_ppo import Recorder
@@ -28,11 +29,13 @@ def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> ddpg.D
 
 
 # One number each: policy p * o before tanh, critics (q * o + a, q * o - a).
-BY_HAND = ddpg.DDPGNetworks(
+_networks: Any = SACNetworks
+BY_HAND = _networks(
     policy_network=FeedForwardNetwork(init=lambda key: key, apply=lambda _, p, o: p * o),
     q_network=FeedForwardNetwork(
         init=lambda key: key, apply=lambda _, q, o, a: jnp.concatenate([q * o + a, q * o - a], -1)
     ),
+    parametric_action_distribution=None,
 )
 
 

@@ -191,10 +191,10 @@ def test_a_replay_beyond_its_limit_is_refused():
     assert "sac.replay_limit_gb is 6e-05, but the replay of 512 transitions" in told
     assert "of 130 bytes each" in told and "sac.max_replay_size" in told and "float16" in told
     replay = replay_buffer.init(32, jnp.zeros((16, 29)), 2)
-    offpolicy.check_memory(dataclasses.replace(config.sac, replay_limit_gb=6.7e-5), replay)
+    offpolicy.check_memory(dataclasses.replace(config.sac, replay_limit_gb=6.7e-5), replay, "sac")
     images = replay_buffer.init(32, {"pixels/depth": jnp.zeros((16, 12, 12, 1))}, 2)
     with pytest.raises(ConfigError, match="choose env.image_dtype=uint8"):
-        offpolicy.check_memory(config.sac, images)
+        offpolicy.check_memory(config.sac, images, "sac")
 
 
 def test_a_reward_that_is_no_number_stops_the_run_and_is_in_the_saved_batch(straight):
