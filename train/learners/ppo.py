@@ -68,11 +68,6 @@ class PPOParts:
     """Actor and critic have one encoder."""
 
     @property
-    def networks(self) -> ppo_networks.PPONetworks:
-        """As Brax takes them, of observations."""
-        return self.nets.networks
-
-    @property
     def steps_per_update(self) -> int:
         """Environment steps collected for one update."""
         c = self.config
@@ -82,8 +77,8 @@ class PPOParts:
     def init(self, key_networks: jax.Array, key: jax.Array) -> PPOState:
         """A learner that has learned nothing; `key` is what its updates will draw from."""
         key_policy, key_value = jax.random.split(key_networks)
-        policy = self.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
-        value = self.networks.value_network.init(key_value)  # type: ignore[call-arg]
+        policy = self.nets.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
+        value = self.nets.networks.value_network.init(key_value)  # type: ignore[call-arg]
         if self.shared:
             params: Any = SharedParams(encoder=policy["encoder"], policy=policy["head"], value=value["head"])
         else:
@@ -97,7 +92,7 @@ class PPOParts:
 
     def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
         """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-        make = ppo_networks.make_inference_fn(self.networks)
+        make = ppo_networks.make_inference_fn(self.nets.networks)
         return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
 
 
@@ -175,7 +170,7 @@ def collect(
 
 def _heads(parts: PPOParts) -> ppo_networks.PPONetworks:
     assert parts.nets.policy and parts.nets.value
-    return parts.networks.replace(policy_network=parts.nets.policy.head, value_network=parts.nets.value.head)
+    return parts.nets.networks.replace(policy_network=parts.nets.policy.head, value_network=parts.nets.value.head)
 
 
 def shared_loss(
@@ -205,7 +200,7 @@ def minibatch_step(
     config = parts.config
     loss_fn = functools.partial(
         shared_loss if parts.shared else ppo_losses.compute_ppo_loss,
-        ppo_network=_heads(parts) if parts.shared else parts.networks,
+        ppo_network=_heads(parts) if parts.shared else parts.nets.networks,
         **({"encode": parts.nets.policy.encoder.apply} if parts.shared and parts.nets.policy else {}),
         entropy_cost=config.entropy_cost,
         discounting=config.discounting,

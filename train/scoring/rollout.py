@@ -111,21 +111,8 @@ class BatchPlayer:
         parts: list[PlayedEpisodes] = []
         done = 0
         while done < count:
-            chosen = np.minimum(np.arange(done, done + size), count - 1)  # the last batch is as large as the others
-            take = functools.partial(jax.tree.map, operator.itemgetter(chosen))
             try:
-                parts.append(
-                    self._play_batch(
-                        policy,
-                        take(keys),
-                        min(size, count - done),
-                        max(0, min(record - done, size)),
-                        lambda finished, step, before=done: on_progress(before + finished, step),
-                        None if starts is None else take(starts),
-                        None if scene_index is None else np.asarray(scene_index)[chosen],
-                        done,
-                    )
-                )
+                parts.append(self._play_batch(policy, keys, done, size, record, on_progress, starts, scene_index))
             except jax.errors.JaxRuntimeError as error:
                 if "RESOURCE_EXHAUSTED" not in str(error) or size == 1:
                     raise
@@ -137,18 +124,21 @@ class BatchPlayer:
 
     def _play_batch(
         self,
-        policy: PolicyFn | HostPolicy,
+        policy: Any,
         keys: jax.Array,
-        count: int,
+        done: int,
+        size: int,
         record: int,
-        on_progress: Callable[[int, int], None],
+        on_progress: Any,
         starts: Any,
-        scene_index: np.ndarray | None,
-        first_episode: int,
+        scenes: Any,
     ) -> PlayedEpisodes:
-        """Plays the first `count` of the keys' episodes; the rest fill the batch and are over from the start."""
-        size, record = len(keys), min(record, count)
-        state = self._begin(keys, starts, scene_index)
+        """The next `size` episodes behind those that are done; where there are not so many left, the last one fills the
+        batch and is over from the start. Words as `play`'s."""
+        chosen, count = np.minimum(np.arange(done, done + size), len(keys) - 1), min(size, len(keys) - done)
+        keys, starts, scenes = jax.tree.map(operator.itemgetter(chosen), (keys, starts, scenes))
+        record = max(0, min(record - done, count))
+        state = self._begin(keys, starts, scenes)
         policy_keys = jax.vmap(policy_key_of)(keys)
         first = jax.tree.map(np.asarray, state.info["nav"])
         metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
@@ -157,14 +147,13 @@ class BatchPlayer:
 
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
-        planner = policy if isinstance(policy, HostPolicy) else None
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
-        if not isinstance(policy, jax.tree_util.Partial):
-            act = None if isinstance(policy, HostPolicy) else jax.tree_util.Partial(policy)
+        if not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):
+            act = jax.tree_util.Partial(policy)
         step, carry = 0, _carry(state, jnp.asarray(finished))
         while not finished.all():
-            if act is None:
-                carry, track = _play_planned(self._step, planner, carry, first_episode + episode_of, step)
+            if isinstance(policy, HostPolicy):
+                carry, track = _play_planned(self._step, policy, carry, done + episode_of, step)
             else:
                 carry, track = self._chunk(act, carry, policy_keys[episode_of], step)
             _, ended, final, moved = carry
@@ -179,7 +168,7 @@ class BatchPlayer:
             seen = episode_of < record
             places[:, episode_of[seen]] = np.asarray(track)[:, seen]
             tracks.append(places)
-            on_progress(int(finished[:count].sum()), step)
+            on_progress(done + int(finished[:count].sum()), step)
             running = np.flatnonzero(~finished[episode_of])
             if self.env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
                 carry = jax.tree.map(operator.itemgetter(running), carry)

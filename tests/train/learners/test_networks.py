@@ -168,7 +168,7 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
 
     def loss_apart(params):
         return ppo_losses.compute_ppo_loss(
-            params, one.normalizer_params, data, KEY, ppo_network=apart.networks, **settings
+            params, one.normalizer_params, data, KEY, ppo_network=apart.nets.networks, **settings
         )[0]
 
     both = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
