@@ -1,23 +1,303 @@
-"""`python -m interactive_nav.episodes make`: an environment and a seed in, a file of fixed evaluation episodes out.
+"""Fixed evaluation episodes: an environment and a seed in, a versioned file out, and back into starts.
 
 `python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
 
-What such a file is, and how it becomes starts again: `interactive_nav.task.episode_files`, whose names are here too.
+A file names its scenes by the digest of what decides the task in them (`Scene.task_digest`), so the same file means
+the same episodes on every machine and backend; with other scenes, another robot or other objects it is refused.
+Files made before that digest was there name the digest of scene.xml and maps.npz, and are held to that.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import functools
+import gzip
+import hashlib
+import json
 import sys
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 import interactive_nav
-from interactive_nav.task.episode_files import EpisodeFile, EpisodeFileError, draw, load, load_all, save, starts_of
-from interactive_nav_common.errors import reports_errors
+from interactive_nav.navigation.lookup import geodesic_at, goal_field
+from interactive_nav.navigation.ways import Ways
+from interactive_nav.scenes.scene import TASK_DIGEST
+from interactive_nav.task.env import InteractiveNav
+from interactive_nav.types import EpisodeStart
+from interactive_nav_common.config import Natural, NotNegative, Seed
+from interactive_nav_common.errors import ConfigError, UserError, reports_errors
+from interactive_nav_common.files import whole_file
+from interactive_nav_common.records import Reader
 from interactive_nav_common.words import add_words, read_commands
 
-__all__ = ["EpisodeFile", "EpisodeFileError", "draw", "load", "load_all", "main", "save", "starts_of"]
+FORMAT = "interactive-nav-episodes"
+VERSION = 1
+PACKED = ".gz"
+LENGTH_TOLERANCE_M = 1e-3
+"""L* of a file and of the environment may differ by rounding only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeFile:
+    """N episodes, as they stand in a file."""
+
+    robot: str
+    seed: Seed
+    scenes: tuple[tuple[str, str], ...]
+    """(name, digest) of each scene: `Scene.task_digest`, in old files `Scene.digest`."""
+    objects: tuple[str, ...]
+    """Categories of the small objects, in order."""
+    objects_digest: str
+    """`TASK_DIGEST` and SHA-256 of the small objects' boxes, masses, friction and categories, of those from folders
+    of inertia, centre of mass and hulls too; in old files without it, also of their looks."""
+    episodes: tuple[dict[str, Any], ...]
+    """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
+    that found no place), shortest_path_m, and, in newer files, push_needed: whether there is no way round everything
+    that can be moved; metres and radians, world frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Episode:
+    """An entry of `EpisodeFile.episodes`."""
+
+    scene: Natural
+    start_xy_w: tuple[float, float]
+    start_yaw_rad: float
+    goal_xy_w: tuple[float, float]
+    objects: tuple[tuple[float, float, float] | None, ...]
+    shortest_path_m: NotNegative
+    push_needed: bool | None = None
+
+
+class EpisodeFileError(UserError):
+    """An episode file that cannot be used; the message says what, where, what was expected and what to do."""
+
+
+_FILES = Reader(EpisodeFileError, "make it again")
+
+
+def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
+    """Draws episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
+
+    Args:
+        env: not batched.
+        episodes: how many, at least 1.
+        seed: of the draw.
+
+    Raises:
+        ConfigError: fewer than one episode.
+    """
+    if episodes < 1:
+        raise ConfigError(f"episodes is {episodes}, expected at least 1")
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
+    starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
+    starts, lengths = jax.tree.map(np.asarray, (starts, lengths))
+    qpos, ways = np.asarray(jax.jit(jax.vmap(lambda start: env.initial_physics(start).qpos))(starts)), Ways(env, None)
+    rows = []
+    for i in range(episodes):
+        small = [
+            [*map(_short_float, xy), _short_float(yaw)] if placed else None
+            for xy, yaw, placed in zip(
+                starts.small_xy_w[i], starts.small_yaw_rad[i], starts.small_placed[i], strict=True
+            )
+        ]
+        rows.append(
+            {
+                "scene": int(starts.scene_index[i]),
+                "start_xy_w": [_short_float(v) for v in starts.start_xy_w[i]],
+                "start_yaw_rad": _short_float(starts.start_yaw_rad[i]),
+                "goal_xy_w": [_short_float(v) for v in starts.goal_xy_w[i]],
+                "objects": small,
+                "shortest_path_m": _short_float(lengths[i]),
+                "push_needed": not ways.exists(
+                    int(starts.scene_index[i]), qpos[i], starts.start_xy_w[i], starts.goal_xy_w[i]
+                ),
+            }
+        )
+    return EpisodeFile(
+        robot=env.robot.name,
+        seed=seed,
+        scenes=tuple((scene.name, scene.task_digest) for scene in env.scenes),
+        objects=tuple(o.category for o in env.world.small_objects),
+        objects_digest=_objects_digests(env)[0],
+        episodes=tuple(rows),
+    )
+
+
+def _short_float(value: Any) -> float:
+    """A 32-bit float by the fewest digits that tell it from its neighbours."""
+    return float(str(np.float32(value)))
+
+
+def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart, Any]:
+    field = goal_field(env.tables, start.scene_index, start.goal_xy_w)
+    return start, geodesic_at(env.tables, start.scene_index, field, start.start_xy_w)
+
+
+def _objects_digests(env: InteractiveNav) -> tuple[str, str]:
+    """Of what decides the task, and as old files have it."""
+    small = env.world.small_objects
+    task = [o.task_parts for o in small]
+    new, old = (hashlib.sha256(repr(content).encode()).hexdigest() for content in (task, small))
+    return TASK_DIGEST + new, old
+
+
+def _short(digest: str) -> str:
+    return digest.rpartition(":")[2][:12]
+
+
+def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str, int]:
+    """Digest -> index of the environment's scenes, once robot, scenes and small objects are those of the file."""
+    if file.robot != env.robot.name:
+        raise EpisodeFileError(
+            f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
+            "make the episodes again for it"
+        )
+    # Each file is held to digests of the kind that it has; no digest of one kind is one of the other.
+    ours = {digest: i for i, scene in enumerate(env.scenes) for digest in (scene.digest, scene.task_digest)}
+    by_name = {scene.name: scene for scene in env.scenes}
+    for name, digest in file.scenes:
+        if digest in ours:
+            continue
+        if name in by_name:
+            has = by_name[name].task_digest if digest.startswith(TASK_DIGEST) else by_name[name].digest
+            raise EpisodeFileError(
+                f"{where}: scene '{name}' has digest {_short(digest)}, the environment's '{name}' has "
+                f"{_short(has)}: its content changed since; use the scene it was made from or make the "
+                "episodes again"
+            )
+        raise EpisodeFileError(
+            f"{where}: needs scene '{name}' (digest {_short(digest)}), the environment has {', '.join(by_name)}; "
+            "add it to --scenes"
+        )
+    if file.objects_digest not in _objects_digests(env):
+        raise EpisodeFileError(
+            f"{where}: made with {len(file.objects)} small objects ({', '.join(file.objects) or 'none'}), the "
+            f"environment has {len(env.world.small_objects)} or other models; set num_objects={len(file.objects)} and "
+            "the same objects, or make the episodes again"
+        )
+    return ours
+
+
+def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -> EpisodeStart:
+    """The file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...].
+
+    Args:
+        file: of `load`.
+        env: whose scenes must include the file's; their order may differ.
+        where: named in errors.
+
+    Raises:
+        EpisodeFileError: the file was made for another robot, other scenes, other small objects or another map of
+            shortest paths than the environment's.
+    """
+    scene_of_digest = _check_fits(file, env, where)
+    rows, count = file.episodes, len(file.objects)
+    small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]
+    poses = np.asarray(small, np.float32).reshape(len(rows), count, 3)
+    scene = [scene_of_digest[file.scenes[row["scene"]][1]] for row in rows]
+
+    def f32(name: str) -> jax.Array:
+        return jnp.asarray([row[name] for row in rows], jnp.float32)
+
+    starts = EpisodeStart(
+        scene_index=jnp.asarray(scene, jnp.int32),
+        start_xy_w=f32("start_xy_w"),
+        start_yaw_rad=f32("start_yaw_rad"),
+        goal_xy_w=f32("goal_xy_w"),
+        small_xy_w=jnp.asarray(poses[..., :2]),
+        small_yaw_rad=jnp.asarray(poses[..., 2]),
+        small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows]).reshape(-1, count),
+    )
+    _, lengths = jax.jit(jax.vmap(lambda start: _with_length(env, start)))(starts)
+    wrong = np.abs(np.asarray(lengths) - np.asarray(f32("shortest_path_m"))) > LENGTH_TOLERANCE_M
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise EpisodeFileError(
+            f"{where}: episode {i}: shortest_path_m is {rows[i]['shortest_path_m']:.3f} m, the environment finds "
+            f"{float(lengths[i]):.3f} m; use the settings (nav_cell_m) and version it was made with, or make it again"
+        )
+    return starts
+
+
+def save(file: EpisodeFile, path: str | Path) -> None:
+    """Writes whole or not at all; packed where the name ends with `.gz`.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    data = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(file)}
+    head = {k: v for k, v in data.items() if k != "episodes"}
+    # One line an episode: readable, and small in a diff.
+    lines = ",\n".join(json.dumps(row) for row in file.episodes)
+    text = f'{json.dumps(head, indent=1)[:-2]},\n "episodes": [\n{lines}\n ]\n}}\n'
+    with whole_file(path) as partial:
+        data = text.encode("utf-8")
+        partial.write_bytes(gzip.compress(data, mtime=0) if Path(path).suffix == PACKED else data)
+
+
+def load(path: str | Path) -> EpisodeFile:
+    """Reads and checks a file.
+
+    Raises:
+        EpisodeFileError: no such file, not such a file, another version, a missing or impossible value.
+    """
+    try:
+        text = Path(path).read_bytes()
+        text = gzip.decompress(text) if Path(path).suffix == PACKED else text
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise EpisodeFileError(f"{path}: not readable as packed with gzip ({error}); make it again") from None
+    except OSError as error:
+        raise EpisodeFileError(
+            f"{path}: cannot read ({error.strerror}); make one with 'python -m interactive_nav.episodes make'"
+        ) from None
+    data = _FILES.decoded(text, "JSON", str(path))
+    if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
+        raise EpisodeFileError(f"{path}: not an episode file (format is not '{FORMAT}')")
+    if (version := data.pop("version", None)) != VERSION:
+        raise EpisodeFileError(f"{path}: version is {version!r}, expected {VERSION}; make it again")
+    file = _FILES.record(data, EpisodeFile, str(path))
+    if not file.episodes:
+        raise EpisodeFileError(f"{path}: episodes is [], expected at least one; make it again")
+    for i, row in enumerate(file.episodes):
+        episode = _FILES.record(row, _Episode, f"{path}: episodes[{i}]")
+        if episode.scene >= len(file.scenes) or len(episode.objects) != len(file.objects):
+            raise EpisodeFileError(
+                f"{path}: episodes[{i}] is in scene {episode.scene} with {len(episode.objects)} objects, expected one "
+                f"of {len(file.scenes)} scenes and {len(file.objects)} objects; make it again"
+            )
+    return file
+
+
+def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
+    """Episodes of several files one after the other, as those of one; and the digest of the files.
+
+    Args:
+        paths: at least one.
+
+    Raises:
+        EpisodeFileError: as `load` does; or the files are of different robots or small objects.
+    """
+    files = [load(path) for path in paths]
+    first = files[0]
+    for path, other in zip(paths, files, strict=True):
+        if (other.robot, other.objects_digest) != (first.robot, first.objects_digest):
+            raise EpisodeFileError(
+                f"{path}: made for robot '{other.robot}' with {len(other.objects)} small objects, {paths[0]} for "
+                f"'{first.robot}' with {len(first.objects)} or other models; play them one by one"
+            )
+    scenes = tuple(dict.fromkeys(scene for file in files for scene in file.scenes))
+    rows = [row | {"scene": scenes.index(file.scenes[row["scene"]])} for file in files for row in file.episodes]
+    contents = [Path(path).read_bytes() for path in paths]
+    content = contents[0] if len(paths) == 1 else b"".join(hashlib.sha256(data).digest() for data in contents)
+    return dataclasses.replace(first, scenes=scenes, episodes=tuple(rows)), hashlib.sha256(content).hexdigest()[:16]
 
 
 @reports_errors("interactive_nav.episodes")

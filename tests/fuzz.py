@@ -110,9 +110,9 @@ def scenes() -> dict[str, Target]:
     """What the converters write, and lists of it."""
     from converters.recipes import load_recipes
     from converters.single_object import ObjectConfig, convert_object
+    from interactive_nav import episodes as episode_files
     from interactive_nav.scenes.object_folders import load_object
     from interactive_nav.scenes.scene import load_scene
-    from interactive_nav.task import episode_files
     from scenes_mjcf.schema import load_manifest, load_maps
     from scenes_mjcf.sets import read_set, scene_digest
     from tests.toys import write_room

@@ -64,7 +64,6 @@ class Physics(abc.ABC):
     """A backend: steps N environments at once by `substeps` physics steps."""
 
     name: str
-    nq: int
     nv: int
     tells_convergence = True
     """Whether `StepSignals.unconverged` is known."""

@@ -42,7 +42,7 @@ class MjxPhysics(Physics):
         self.window = Window(world, config)
         physics = config.physics
         self._world, self._substeps = world, physics.substeps
-        self.nq, self.nv = world.models[0].nq, world.models[0].nv
+        self.nv = world.models[0].nv
         self.contacts_per_env, self.constraints_per_env = physics.contacts_per_env, physics.constraints_per_env
         self._host = self._host_model()
         self._model = uncommitted(mjx.put_model(self._host, impl=self.name))

@@ -100,7 +100,6 @@ class Renderer(abc.ABC):
         other.lens = lens
         return other
 
-    @abc.abstractmethod
     def render_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
         """Draws a batch.
 
@@ -113,6 +112,8 @@ class Renderer(abc.ABC):
             Depth [N, H, W] f32, the distance along the optical axis, m, 0 where nothing is met, and class ids
             [N, H, W] u8.
         """
+        seen = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
+        return seen["depth"], seen["segmentation"]
 
     @abc.abstractmethod
     def images_batch(
@@ -148,7 +149,3 @@ class Renderer(abc.ABC):
         """One environment's `images_batch`; under any number of `vmap`s all environments are drawn in one call."""
         drawn = (scene, qpos, camera) if look is None else (scene, qpos, camera, look)
         return one_of_batch(functools.partial(self.images_batch, names), drawn)
-
-    def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""
-        return one_of_batch(self.render_batch, (scene, qpos, camera))

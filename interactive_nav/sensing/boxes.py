@@ -201,11 +201,10 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, r
             at = slice(first[m], first[m] + len(boxes))
             pos[s, at], half[s, at], ids[s, at] = boxes[:, :3], boxes[:, 7:10], number
             axes[s, at] = matrix_from_quat(boxes[:, 3:7])
-        for m in np.flatnonzero(is_hinge):
-            leaf = layout.slot_body[m]
-            joint = model.body_jntadr[leaf]
-            hinge_pos[s, m], hinge_axes[s, m] = model.body_pos[leaf], matrix_from_quat(model.body_quat[leaf])
-            hinge_axis[s, m], anchor[s, m] = model.jnt_axis[joint], model.jnt_pos[joint]
+        leaf = layout.slot_body[is_hinge]
+        joint = model.body_jntadr[leaf]
+        hinge_pos[s, is_hinge], hinge_axes[s, is_hinge] = model.body_pos[leaf], matrix_from_quat(model.body_quat[leaf])
+        hinge_axis[s, is_hinge], anchor[s, is_hinge] = model.jnt_axis[joint], model.jnt_pos[joint]
     painted = [
         _colours_of_slots(world, s, [number for _, number in column], classes)[[*body, -1]]
         for s, column in enumerate(columns if colours else [])

@@ -347,10 +347,6 @@ class MeshRenderer(Renderer):
         )
         self._draw = wp.jax_kernel(_draw, num_outputs=5)
 
-    def render_batch(self, scene, qpos, camera):
-        seen = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
-        return seen["depth"], seen["segmentation"]
-
     def images_batch(self, names, scene, qpos, camera, look=None):
         pos, axes = body_poses(self.tables, scene, qpos)
         slot = jnp.asarray(self._slot)[scene]

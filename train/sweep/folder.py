@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from interactive_nav.task.episode_files import load_all
+from interactive_nav.episodes import load_all
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_partial, write_text
 from interactive_nav_common.locks import is_locked
