@@ -102,23 +102,17 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     qpos, ways = np.asarray(jax.jit(jax.vmap(lambda start: env.initial_physics(start).qpos))(starts)), Ways(env, None)
     rows = []
     for i in range(episodes):
-        small = [
-            [*map(_short_float, xy), _short_float(yaw)] if placed else None
-            for xy, yaw, placed in zip(
-                starts.small_xy_w[i], starts.small_yaw_rad[i], starts.small_placed[i], strict=True
-            )
-        ]
+        scene, start, goal = int(starts.scene_index[i]), starts.start_xy_w[i], starts.goal_xy_w[i]
+        small = zip(starts.small_xy_w[i], starts.small_yaw_rad[i], starts.small_placed[i], strict=True)
         rows.append(
             {
-                "scene": int(starts.scene_index[i]),
-                "start_xy_w": [_short_float(v) for v in starts.start_xy_w[i]],
+                "scene": scene,
+                "start_xy_w": [*map(_short_float, start)],
                 "start_yaw_rad": _short_float(starts.start_yaw_rad[i]),
-                "goal_xy_w": [_short_float(v) for v in starts.goal_xy_w[i]],
-                "objects": small,
+                "goal_xy_w": [*map(_short_float, goal)],
+                "objects": [[*map(_short_float, (*xy, yaw))] if placed else None for xy, yaw, placed in small],
                 "shortest_path_m": _short_float(lengths[i]),
-                "push_needed": not ways.exists(
-                    int(starts.scene_index[i]), qpos[i], starts.start_xy_w[i], starts.goal_xy_w[i]
-                ),
+                "push_needed": not ways.exists(scene, qpos[i], start, goal),
             }
         )
     return EpisodeFile(

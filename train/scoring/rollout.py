@@ -138,7 +138,11 @@ class BatchPlayer:
         chosen, count = np.minimum(np.arange(done, done + size), len(keys) - 1), min(size, len(keys) - done)
         keys, starts, scenes = jax.tree.map(operator.itemgetter(chosen), (keys, starts, scenes))
         record = max(0, min(record - done, count))
-        state = self._begin(keys, starts, scenes)
+        if starts is None:
+            state = self._reset(keys, *(() if scenes is None else (jnp.asarray(scenes),)))
+        else:
+            assert self._reset_to is not None
+            state = self._reset_to(starts, keys)
         policy_keys = jax.vmap(policy_key_of)(keys)
         first = jax.tree.map(np.asarray, state.info["nav"])
         metrics = {name: np.full(size, np.nan, np.float32) for name in state.metrics}
@@ -176,13 +180,6 @@ class BatchPlayer:
         paths = _paths(first, ends.pop("object_pos_w"), tracks, record)
         metrics, ends = ({name: x[:count] for name, x in values.items()} for values in (metrics, ends))
         return PlayedEpisodes(first.scene_index[:count], metrics, ends, paths)
-
-    def _begin(self, keys: jax.Array, starts: Any, scene_index: np.ndarray | None) -> Any:
-        """The first states of a batch; see `play`."""
-        if starts is not None:
-            assert self._reset_to is not None
-            return self._reset_to(starts, keys)
-        return self._reset(keys) if scene_index is None else self._reset(keys, jnp.asarray(scene_index))
 
 
 def _paths(first: Any, object_end: np.ndarray, tracks: list[np.ndarray], record: int) -> Paths:

@@ -31,11 +31,6 @@ class Share:
     fraction: float
     """Of the GPU's memory, or of the machine's cores."""
 
-    @property
-    def label(self) -> str:
-        """For the table."""
-        return "cpu" if self.gpu is None else f"gpu {self.gpu.name}"
-
 
 def find_gpus() -> list[Gpu]:
     """The NVIDIA GPUs that this process may use; none where there are none."""
@@ -86,8 +81,10 @@ class Machine(Launcher):
             share = Share(None, 1.0 / self._slots)
         else:
             free = {gpu: 1.0 - sum(s.fraction for s in self._given if s.gpu == gpu) for gpu in self._gpus}
-            gpu = max(free, key=lambda g: free[g])
-            share = Share(gpu, min(1.0, factor * fraction_of(gpu, launch)))
+            gpu, runs = max(free, key=lambda g: free[g]), launch.runs_per_gpu
+            if launch.gpu_memory_gb:
+                runs = max(1, min(runs, int(USABLE * gpu.memory_gb / launch.gpu_memory_gb)))
+            share = Share(gpu, min(1.0, factor * (1.0 / runs)))
             if share.fraction > free[gpu] + 1e-9:
                 return None
         self._given.append(share)
@@ -102,15 +99,8 @@ class Machine(Launcher):
         share = self.take(job.launch, job.factor)
         if share is None:
             return None
-        return Child(job, share_env(share, job.launch)), share.label, lambda: self.give_back(share)
-
-
-def fraction_of(gpu: Gpu, launch: LaunchConfig) -> float:
-    """Part of a GPU's memory that one run gets."""
-    runs = launch.runs_per_gpu
-    if launch.gpu_memory_gb:
-        runs = max(1, min(runs, int(USABLE * gpu.memory_gb / launch.gpu_memory_gb)))
-    return 1.0 / runs
+        where = "cpu" if share.gpu is None else f"gpu {share.gpu.name}"
+        return Child(job, share_env(share, job.launch)), where, lambda: self.give_back(share)
 
 
 def share_env(share: Share, launch: LaunchConfig) -> dict[str, str]:

@@ -144,7 +144,7 @@ class Scheduler:
             states = self._states()
             late = time_limit_s is not None and time_limit_s - elapsed < min(LAST_START_S, 0.1 * time_limit_s)
             if not self._stopping and not late:
-                states = self._start(states)
+                self._start(states)
             self._display.update(states, self._busy)
             waiting = [] if self._stopping else self._waiting(states)
             elsewhere = {s.name for s in states if s.state == "running" and s.name in self._not_before}
@@ -174,19 +174,18 @@ class Scheduler:
         left = [s for s in states if self._needs(stage, s) and self._not_before.get(s.name, 0.0) <= now]
         return [s.name for s in (sorted(left, key=lambda s: s.env_steps == 0) if stage == "train" else left)]
 
-    def _start(self, states: list[RunState]) -> list[RunState]:
+    def _start(self, states: list[RunState]) -> None:
         """Starts what there is room for: training first, then evaluation."""
         for name in self._free("train", states):
             command = words_of_training(self._folder, name, self._programs.train)
             if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.physics.threads:
                 command = [*command, f"env.threads={_threads(self._runs[name])}"]
             if not self._begin("train", [name], command):
-                return states
+                return
         for group in self._groups(self._free("evaluate", states)):
             command = words_of_evaluation(self._folder, group, self._programs.evaluate)
             if not self._begin("evaluate", group, command):
-                return states
-        return states
+                return
 
     def _groups(self, names: list[str]) -> list[list[str]]:
         """Runs to evaluate by one process each: those of one environment (k_int is in no score)."""

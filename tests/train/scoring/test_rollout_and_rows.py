@@ -87,11 +87,11 @@ def test_batches_that_do_not_fit_are_halved(monkeypatch):
     player = BatchPlayer(env)
     usual = player._chunk
 
-    def small_memory(policy, state, keys, ended, step):
+    def small_memory(policy, carry, keys, step):
         sizes.append(len(keys))
         if len(keys) > 3:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 12 bytes.")
-        return usual(policy, state, keys, ended, step)
+        return usual(policy, carry, keys, step)
 
     monkeypatch.setattr(player, "_chunk", small_memory)
     monkeypatch.setattr(rollout, "SHRINK", 10**9)

@@ -402,7 +402,7 @@ def test_shares_of_a_machine():
     assert machine.take(launch) is not None and machine.take(launch) is None
     cpu = Machine([], 2)
     first = cpu.take(launch)
-    assert first is not None and first.label == "cpu" and cpu.take(launch) is not None and cpu.take(launch) is None
+    assert first is not None and first.gpu is None and cpu.take(launch) is not None and cpu.take(launch) is None
 
 
 def test_exit_codes():
