@@ -149,3 +149,7 @@ class Renderer(abc.ABC):
         """One environment's `images_batch`; under any number of `vmap`s all environments are drawn in one call."""
         drawn = (scene, qpos, camera) if look is None else (scene, qpos, camera, look)
         return one_of_batch(functools.partial(self.images_batch, names), drawn)
+
+    def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""
+        return one_of_batch(self.render_batch, (scene, qpos, camera))
