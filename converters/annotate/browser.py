@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import functools
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 from converters.annotate.session import Item, Session, Store, step_of
-from converters.annotate.view import THUMBNAIL, View, around, by_size, coloured, hit, painted, thumbnail, view_of
-from converters.bodies.alignment import MIN_POINTS, Alignment, AlignmentError, apply_alignment, gross_outliers
+from converters.annotate.view import THUMBNAIL, around, coloured, hit, painted, thumbnail, view_of
+from converters.bodies.alignment import MIN_POINTS, AlignmentError, apply_alignment, gross_outliers
 from converters.propose.proposals import Proposal
 from converters.propose.report import floor_of
 from converters.propose.retrieval import retrieve
@@ -34,6 +34,8 @@ COLOURS = ((230, 60, 60), (40, 130, 230), (250, 170, 20), (30, 160, 80), (160, 7
 """Of pairs, in turn."""
 SHOWN = 4
 """Candidates side by side."""
+FITTED = (255, 140, 30)
+"""Colour of the fitted model, and of the frame of the one that was chosen."""
 MARKS = {"open": "", "accepted": " ✔ accepted", "skipped": " – skipped"}
 
 
@@ -50,9 +52,8 @@ class Page:
         self._lock, self._pool = threading.RLock(), concurrent.futures.ThreadPoolExecutor(1)
         self._ranked: dict[int, list[str]] = {}
         self._drawn: dict[str, Any] = {}
-        self._nodes: dict[str, Any] = {}
         self._first, self._adding, self._said = 0, False, ""
-        self._pictures: dict[str, np.ndarray] = {}
+        self._picture = functools.cache(lambda cad_id: thumbnail(self.library[cad_id]))
         server.gui.configure_theme(control_width="large", show_share_button=False, show_logo=False)
         self._words()
         server.scene.on_click()(self._clicked)
@@ -70,15 +71,12 @@ class Page:
         self._image = gui.add_image(np.full((THUMBNAIL, SHOWN * THUMBNAIL, 3), 255, np.uint8))
         self._pick = gui.add_button_group("Model", [*map(str, range(1, SHOWN + 1)), "more"])
         self._fit = gui.add_markdown("")
-        buttons = {
-            ("Accept (A)", "A", "green"): Session.accepted,
-            ("Skip (S)", "S", "gray"): Session.skipped,
-            ("Undo (U)", "U", "gray"): Session.undone,
-        }
-        for (label, key, colour), action in buttons.items():
-            for control in (gui.add_button(label, color=colour), gui.add_command(label, hotkey=key)):
-                register = getattr(control, "on_click", None) or control.on_trigger
-                register(lambda _, action=action: self.do(action))
+        for label, colour, action in (
+            ("Accept (A)", "green", Session.accepted), ("Skip (S)", "gray", Session.skipped),
+            ("Undo (U)", "gray", Session.undone),
+        ):  # fmt: skip
+            gui.add_button(label, color=colour).on_click(lambda _, action=action: self.do(action))
+            gui.add_command(label, hotkey=label[-2]).on_trigger(lambda _, action=action: self.do(action))
         gui.add_button("Add an object", color="gray").on_click(lambda _: self._add())
         self._whole = gui.add_checkbox("Show the whole room", False)
         self._whole.on_update(lambda _: self._draw())
@@ -106,9 +104,9 @@ class Page:
 
     def candidates(self) -> list[str]:
         """Ids of the models of the object's class, the likeliest first."""
-        own = by_size(self.session.item, self.library)
-        ranked = [k for k in self._ranked.get(self.session.at, []) if k in own]
-        return ranked + [k for k in own if k not in ranked]
+        own = [k for k, cad in sorted(self.library.items()) if cad.category == self.session.item.category]
+        ranked = self._ranked.get(self.session.at, [])
+        return sorted(own, key=lambda k: ranked.index(k) if k in ranked else len(ranked))
 
     def _add(self) -> None:
         self._adding = not self._adding
@@ -199,87 +197,53 @@ class Page:
         return f"{done} of {len(self.session.items)} objects done\n\n" + "\n\n".join(rows) + said
 
     def _show_candidates(self) -> None:
-        strip = Image.new("RGB", (SHOWN * THUMBNAIL, THUMBNAIL), "white")
+        strip = np.full((THUMBNAIL, SHOWN, THUMBNAIL, 3), 255, np.uint8)
         for k, cad_id in enumerate(self.candidates()[self._first : self._first + SHOWN]):
-            if cad_id not in self._pictures:
-                self._pictures[cad_id] = thumbnail(self.library[cad_id])
-            strip.paste(Image.fromarray(self._pictures[cad_id]), (k * THUMBNAIL, 0))
-            draw = ImageDraw.Draw(strip)
-            draw.text((k * THUMBNAIL + 4, 2), f"{k + 1}", fill="black")
-            if cad_id == self.session.item.cad_id:
-                box = (k * THUMBNAIL + 1, 1, (k + 1) * THUMBNAIL - 2, THUMBNAIL - 2)
-                draw.rectangle(box, outline=(240, 130, 20), width=3)
-        self._image.image = np.asarray(strip)
+            strip[:, k] = FITTED if cad_id == self.session.item.cad_id else 255
+            strip[3:-3, k, 3:-3] = self._picture(cad_id)[3:-3, 3:-3]
+        self._image.image = strip.reshape(THUMBNAIL, -1, 3)
 
     def _scene(self) -> None:
-        """Scan, model beside it, points, and the fitted model; sends only what is another than before."""
+        """Scan, model beside it, points, and the fitted model; sends meshes only if they are others than before."""
         item = self.session.item if self.session.items else None
-        cad = self.library.get(item.cad_id) if item else None
+        cad, scene = self.library.get(item.cad_id) if item else None, self.server.scene
         whole = self._adding or self._whole.value or item is None
-        key = (self.session.at, len(self.session.items), item and item.cad_id, whole)
-        if self._drawn.get("key") != key:
-            view = view_of(
-                item or Item("", tuple(self._room.centroid), tuple(self._room.extents), 0.0, 0), cad, self.raw
-            )
-            moved = self._drawn.get("key", (None,))[0] != key[0] or self._drawn["key"][3] != whole
-            self._drawn = {
-                "key": key,
-                "view": view,
-                "scan": self._room if whole or item is None else around(self._room, item),
-            }
+        key = (self.session.at, whole, len(self.session.items), item and item.cad_id)
+        before = self._drawn.get("key", ())
+        if before != key:
+            shown = item or Item("", tuple(self._room.centroid), tuple(self._room.extents), 0.0, 0)
+            view = view_of(shown, cad, self.raw)
+            self._drawn = {"key": key, "view": view, "scan": self._room if whole else around(self._room, shown)}
             if cad is not None:
                 self._drawn["model"] = coloured(cad, view.bench)
             for side in ("scan", "model"):
-                mesh = self._drawn.get(side)
-                self._node(f"/{side}", lambda name, mesh=mesh: mesh and self.server.scene.add_mesh_trimesh(name, mesh))
-            if moved:
+                scene.remove_by_name(f"/{side}")
+                if side in self._drawn:
+                    scene.add_mesh_trimesh(f"/{side}", self._drawn[side])
+            if before[:2] != key[:2]:
                 self._look(self.server.get_clients().values())
-        self._points(item, self._drawn["view"])
-        self._fit.content, fit = "", None
-        if item is not None and cad is not None and item.pairs >= MIN_POINTS:
-            try:
-                fit = item.fit()
-                out = (
-                    np.flatnonzero(
-                        gross_outliers(
-                            np.array(item.model[: item.pairs]), np.array(item.scan[: item.pairs]), item.symmetry
-                        )
-                    )
-                    + 1
-                )
-                left = f", without pair {', '.join(map(str, out))}" if len(out) else ""
-                self._fit.content = f"**Residual {100 * fit.rms_m:.1f} cm** over {item.pairs} pairs{left}"
-            except AlignmentError as error:
-                self._fit.content = f"⚠ {error}"
-
-        def over(name: str, fit: Alignment, cad: CadModel) -> Any:
-            points = apply_alignment(fit, cad.vertices)
-            paint = {"color": (255, 140, 30), "opacity": 0.6, "side": "double"}
-            return self.server.scene.add_mesh_simple(name, points, cad.faces, **paint)
-
-        self._node("/fit", lambda name: over(name, fit, cad) if fit and cad else None)
-
-    def _node(self, name: str, add: Callable[[str], Any]) -> None:
-        """Puts what `add` makes in the scene in place of what has the name; None: nothing."""
-        if name in self._nodes:
-            self._nodes.pop(name).remove()
-        if (made := add(name)) is not None:
-            self._nodes[name] = made
-
-    def _points(self, item: Item | None, view: View) -> None:
-        for name in [name for name in self._nodes if name.startswith("/points")]:
-            self._nodes.pop(name).remove()
-        for side, points in (("scan", item.scan), ("model", item.model)) if item else ():
-            at = (
-                np.array(points).reshape(-1, 3)
-                if side == "scan"
-                else apply_alignment(view.bench, np.array(points).reshape(-1, 3))
-            )
-            for k, point in enumerate(at):
-                name, colour = f"/points/{side}{k + 1}", COLOURS[k % len(COLOURS)]
-                self._nodes[name] = self.server.scene.add_icosphere(name, 0.015, color=colour, position=point)
-                label = f"{name}_number"
-                self._nodes[label] = self.server.scene.add_label(label, str(k + 1), position=point)
+        scene.remove_by_name("/said")
+        scene.add_frame("/said", show_axes=False)  # under it what the person said: it is removed with it
+        self._fit.content = ""
+        if item is None:
+            return
+        bench = self._drawn["view"].bench
+        for side, points in (("scan", item.scan), ("model", item.model)):
+            at = np.array(points).reshape(-1, 3)
+            for k, point in enumerate(at if side == "scan" else apply_alignment(bench, at)):
+                name = f"/said/{side}{k + 1}"
+                scene.add_icosphere(name, 0.015, color=COLOURS[k % len(COLOURS)], position=point)
+                scene.add_label(f"{name}/number", str(k + 1))
+        if cad is None or item.pairs < MIN_POINTS:
+            return
+        try:
+            fit, out = item.fit(), np.flatnonzero(gross_outliers(*item.points(), item.symmetry)) + 1
+            left = f", without pair {', '.join(map(str, out))}" if len(out) else ""
+            self._fit.content = f"**Residual {100 * fit.rms_m:.1f} cm** over {item.pairs} pairs{left}"
+            points, paint = apply_alignment(fit, cad.vertices), {"color": FITTED, "opacity": 0.6, "side": "double"}
+            scene.add_mesh_simple("/said/fit", points, cad.faces, **paint)
+        except AlignmentError as error:
+            self._fit.content = f"⚠ {error}"
 
     def _look(self, clients: Any) -> None:
         """Turns the cameras to the object and its model."""

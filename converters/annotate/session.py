@@ -66,13 +66,17 @@ class Item:
         """Number of whole pairs."""
         return min(len(self.scan), len(self.model))
 
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """(pairs, 3) of the model and of the scan."""
+        return np.array(self.model[: self.pairs]), np.array(self.scan[: self.pairs])
+
     def fit(self) -> Alignment:
         """The model's placement by the whole pairs, as `convert` would solve it.
 
         Raises:
             AlignmentError: too few pairs, or pairs that do not determine it.
         """
-        return solve_alignment(np.array(self.model[: self.pairs]), np.array(self.scan[: self.pairs]), self.symmetry)
+        return solve_alignment(*self.points(), self.symmetry)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,8 +187,8 @@ def as_annotations(session: Session, library: Mapping[str, CadModel]) -> list[di
             continue
         cad, fit = library[item.cad_id], item.fit()
         low, high = bounds(cad.vertices @ Y_UP_TO_Z_UP)
-        placed, seen = apply_alignment(fit, np.array(item.model[: item.pairs])), np.array(item.scan[: item.pairs])
-        points = {"keypoints_cad": placed @ Y_UP_TO_Z_UP, "keypoints_scan": seen @ Y_UP_TO_Z_UP}
+        clicked, seen = item.points()
+        points = {"keypoints_cad": apply_alignment(fit, clicked) @ Y_UP_TO_Z_UP, "keypoints_scan": seen @ Y_UP_TO_Z_UP}
         models.append(
             {"catid_cad": synset[item.category], "id_cad": item.cad_id, "sym": item.symmetry}
             | {"trs": scan2cad_trs(fit.scale, fit.yaw, fit.translation)}

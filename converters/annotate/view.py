@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import trimesh
-from PIL import Image, ImageDraw
 
 from converters.annotate.session import Item
 from converters.bodies.alignment import Alignment, apply_alignment
+from converters.check.model_sheet import camera_axes, mesh_picture
+from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.propose.proposals import bounds
+from converters.read.meshes import textured_by_face
 from converters.read.obj import texels
 from converters.records.raw import CEILING, CadModel, RawScene, ScanMesh
 from interactive_nav_common.rotations import yaw_matrix
@@ -72,11 +73,8 @@ def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> View:
 
 def coloured(cad: CadModel, pose: Alignment) -> trimesh.Trimesh:
     """A model under a pose, its faces coloured."""
-    points = apply_alignment(pose, cad.vertices)
-    mesh = trimesh.Trimesh(
-        points[cad.faces].reshape(-1, 3), np.arange(3 * len(cad.faces)).reshape(-1, 3), process=False
-    )
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.repeat(cad.face_colours, 3, axis=0))
+    mesh = trimesh.Trimesh(apply_alignment(pose, cad.vertices), cad.faces, face_colors=cad.face_colours, process=False)
+    mesh.unmerge_vertices()
     return mesh
 
 
@@ -88,31 +86,7 @@ def hit(mesh: trimesh.Trimesh, origin: np.ndarray, direction: np.ndarray) -> tup
     return (float(along[k]), points[k]) if k >= 0 else (math.inf, np.zeros(3))
 
 
-def by_size(item: Item, library: Mapping[str, CadModel]) -> list[str]:
-    """Ids of the class's models, those of the object's proportions first."""
-    own = np.log(np.array([*sorted(item.extent_m[:2]), item.extent_m[2]]))
-
-    def unlike(cad_id: str) -> float:
-        x, y, z = np.ptp(library[cad_id].vertices, axis=0)
-        return float(np.std(np.log(np.maximum([min(x, y), max(x, y), z], 1e-6)) - own))
-
-    return sorted((k for k, cad in library.items() if cad.category == item.category), key=lambda k: (unlike(k), k))
-
-
 def thumbnail(cad: CadModel) -> np.ndarray:
-    """(h, w, 3) uint8 picture of a model from its front, right and above; the nearest faces are drawn last."""
-    turned = (cad.vertices - cad.vertices.mean(axis=0)) @ yaw_matrix(math.radians(30)).T
-    c, s = math.cos(math.radians(25)), math.sin(math.radians(25))
-    flat = np.stack([turned[:, 0], -(c * turned[:, 2] + s * turned[:, 1]), c * turned[:, 1] - s * turned[:, 2]], axis=1)
-    low, high = bounds(flat)
-    flat[:, :2] = (flat[:, :2] - (low + high)[:2] / 2) * (0.9 * THUMBNAIL / (high - low)[:2].max()) + THUMBNAIL / 2
-    corners = flat[cad.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    light = 0.55 + 0.45 * np.abs(normal @ [0.3, -0.8, 0.5])
-    picture = Image.new("RGB", (THUMBNAIL, THUMBNAIL), "white")
-    draw = ImageDraw.Draw(picture)
-    for k in np.argsort(-corners[:, :, 2].mean(axis=1)):
-        colour = tuple(int(v) for v in cad.face_colours[k] * light[k])
-        draw.polygon([(x, y) for x, y, _ in corners[k].tolist()], fill=colour)
-    return np.asarray(picture)
+    """(`THUMBNAIL`, `THUMBNAIL`, 3) uint8 picture of a model from its front, right and above."""
+    mesh = cad.surface or textured_by_face(cad.vertices, cad.faces, cad.face_colours)
+    return mesh_picture(mesh, camera_axes() @ Y_UP_TO_Z_UP.T, THUMBNAIL)

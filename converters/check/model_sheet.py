@@ -41,17 +41,21 @@ def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
         pixels: side of the picture.
     """
     model = cad_model(name)
-    axes = camera_axes() * [model.front, 1, model.front]
     if (own := model.surface) is not None:
         mesh = TexturedMesh(own.vertices, own.faces, own.uv[own.uv_faces], own.image)
     else:
         colours = [np.tile(np.rint(255 * np.array(MATERIALS[p.material])), (len(p.faces), 1)) for p in model.parts]
         parts = zip(model.parts, colours, strict=True)
         mesh = join_meshes(*(textured_by_face(p.vertices, p.faces, colour) for p, colour in parts))
+    return mesh_picture(mesh, camera_axes() * [model.front, 1, model.front], pixels, one_sided=True)
+
+
+def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: bool = False) -> np.ndarray:
+    """(pixels, pixels, 3) uint8 picture of a whole mesh on white, along axes such as those of `camera_axes`."""
     seen = mesh.vertices @ axes.T
     half, middle = np.ptp(seen, axis=0)[:2].max() / 2 / 0.94, (seen.min(axis=0) + seen.max(axis=0)) / 2
     picture = Picture(over(axes, middle - half, middle + half - 1e-9, 2 * half / pixels))
-    picture.draw(mesh, one_sided=True)
+    picture.draw(mesh, one_sided)
     return picture.image
 
 
