@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import fast_simplification
 import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from converters.records.limits import SAMPLES, check_count
 
@@ -24,6 +26,12 @@ def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(m, 3) normals of the faces, twice as long as their areas (m2)."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.cross(b - a, c - a)
+
+
+def unit_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(m, 3) unit normals of the faces; about zero without an area."""
+    normal = face_vectors(vertices, faces)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
 
 
 def vertex_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -119,6 +127,26 @@ def _steps(corners: np.ndarray, spacing_m: float) -> np.ndarray:
     return np.maximum(np.ceil(np.max(_sides(corners), axis=1) / spacing_m).astype(int), 1)
 
 
+def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
+    """(m,) number of the connected part, by shared vertices of which there are `count`, that each face is of."""
+    edges = np.vstack([faces[:, :2], faces[:, 1:]])
+    graph = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), (count, count))
+    return csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
+
+
+def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that some faces use, and the faces into these."""
+    used, index = np.unique(faces, return_inverse=True)
+    return vertices[used], index.reshape(-1, 3)
+
+
+def stacked(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, k) and faces (m, 3) of several meshes as one."""
+    vertices, faces = zip(*parts, strict=True)
+    first = np.cumsum([0, *map(len, vertices)])
+    return np.vstack(vertices), np.vstack([f + k for f, k in zip(faces, first, strict=False)])
+
+
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Joins vertices at equal positions (to 1e-6 of the extent) and drops faces that collapse.
 
@@ -142,5 +170,4 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[n
             np.asarray(vertices, np.float64), faces.astype(np.int32), target_count=max_faces
         )[:2]
         vertices, faces, _ = merge_vertices(np.asarray(points, float), np.asarray(triangles, np.int64))
-    used, inverse = np.unique(faces, return_inverse=True)
-    return vertices[used], inverse.reshape(-1, 3)
+    return compacted(vertices, faces)

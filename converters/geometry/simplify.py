@@ -5,11 +5,18 @@ from __future__ import annotations
 import fast_simplification
 import numpy as np
 import trimesh
-from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-from converters.geometry.faces import face_areas, merge_vertices, sample_faces, simplify
+from converters.geometry.faces import (
+    compacted,
+    face_areas,
+    loose_parts,
+    merge_vertices,
+    sample_faces,
+    simplify,
+    stacked,
+    unit_normals,
+)
 
 PLAIN_FACES = 12
 """A part of so few faces stays as it is: a box."""
@@ -29,18 +36,6 @@ LEAST_FACES = 24
 """Of a part, however many there are."""
 SMALL_M = 0.6
 """Longest side of a thing that may be drawn as its hull."""
-
-
-def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
-    """(m,) number of the connected part, by shared vertices, that each face is of.
-
-    Args:
-        faces: (m, 3).
-        count: of the vertices.
-    """
-    edges = np.vstack([faces[:, :2], faces[:, 1:]])
-    graph = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), (count, count))
-    return csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
 
 
 class Surface:
@@ -119,15 +114,8 @@ def simplify_within(
     """
     vertices, faces, _ = merge_vertices(vertices, faces)
     part = loose_parts(faces, len(vertices))
-    done, first = [], 0
-    for k in np.unique(part):
-        own, index = np.unique(faces[part == k], return_inverse=True)
-        piece = vertices[own], index.reshape(-1, 3)
-        if len(piece[1]) > PLAIN_FACES:
-            piece = _simplified(*piece, most_m, least)
-        done.append((piece[0], piece[1] + first))
-        first += len(piece[0])
-    return np.vstack([v for v, _ in done]), np.vstack([f for _, f in done])
+    pieces = [compacted(vertices, faces[part == k]) for k in np.unique(part)]
+    return stacked(_simplified(*p, most_m, least) if len(p[1]) > PLAIN_FACES else p for p in pieces)
 
 
 def simplify_to(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -159,9 +147,8 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
     edges, owner = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), np.repeat(np.arange(len(faces)), 3)
     _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     edges, owner = edges[first[count == 1]], owner[first[count == 1]]
-    (a, b, c), (start, end) = vertices[faces[owner]].transpose(1, 0, 2), vertices[edges].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    start, end = vertices[edges].transpose(1, 0, 2)
+    normal = unit_normals(vertices, faces[owner])
     tips = (start + end) / 2 + normal * np.linalg.norm(end - start, axis=1, keepdims=True)
     points = np.vstack([vertices, tips])
     whole = np.vstack([faces, np.column_stack([edges[:, ::-1], len(vertices) + np.arange(len(edges))])]).astype(
@@ -199,8 +186,7 @@ def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: 
             hull = trimesh.convex.convex_hull(vertices)
             vertices, faces = simplify(np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int64), n)
         done[k] = vertices, faces
-    first = np.cumsum([0, *(len(vertices) for vertices, _ in done)])
-    return np.vstack([v for v, _ in done]), np.vstack([f + k for (_, f), k in zip(done, first, strict=False)])
+    return stacked(done)
 
 
 def _shares(parts: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, total: int) -> list[int]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import merge_vertices, sample_faces
+from converters.geometry.faces import compacted, merge_vertices, sample_faces
 from converters.geometry.simplify import simplify_to, simplify_within, surface_loss
 from converters.library.catalogue import Catalogue, Piece, read_catalogue, unpack_model
 from converters.library.store import Credit, Model, Shape, attribution, write_library
@@ -99,13 +99,13 @@ def as_catalogued(surface: TexturedMesh, piece: Piece, where: str) -> TexturedMe
     """
     if not len(surface.faces):
         raise SceneRejected(f"{where}: has no face; choose another model")
-    used, index = np.unique(surface.faces, return_inverse=True)
-    vertices = surface.vertices[used] @ piece.rotation.T
+    vertices, faces = compacted(surface.vertices, surface.faces)
+    vertices = vertices @ piece.rotation.T
     low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
     if not np.isfinite(span).all() or (span < 1e-9 * max(float(span.max()), 1e-12)).any():
         raise SceneRejected(f"{where}: its surface has the size {span}, expected one in each direction")
     vertices = (vertices - low - span * [0.5, 0.0, 0.5]) * (np.array(piece.size_m) / span)
-    return dataclasses.replace(surface, vertices=vertices, faces=index.reshape(-1, 3))
+    return dataclasses.replace(surface, vertices=vertices, faces=faces)
 
 
 def _standing(points: np.ndarray, foot_m: float) -> np.ndarray:

@@ -13,6 +13,7 @@ from urllib.parse import unquote
 import numpy as np
 from PIL import Image
 
+from converters.geometry.faces import stacked
 from converters.read.files import ObjMesh, SourceFolder, read_image, read_obj
 from converters.records.errors import SceneRejected
 from converters.records.limits import PIXELS
@@ -246,9 +247,7 @@ def join_meshes(*meshes: TexturedMesh) -> TexturedMesh:
     """All meshes as one, in their order; images that are alike are kept once."""
     if len(meshes) == 1:
         return meshes[0]
-    first = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    faces = np.vstack([m.faces + k for m, k in zip(meshes, first, strict=False)])
-    vertices = np.vstack([m.vertices for m in meshes])
+    vertices, faces = stacked((m.vertices, m.faces) for m in meshes)
     if all(m.texture is None for m in meshes):
         return TexturedMesh(vertices, faces, None, None)
     grey = np.array(GREY, np.uint8).reshape(1, 1, 3)

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from converters.geometry.faces import compacted
 from converters.read.surfaces import long_faces, structure_labels
 from converters.records.raw import RawScene
 
@@ -90,8 +91,7 @@ def _cut(
     z = vertices[faces, 2]
     low, of, high = (storey_of(some, heights_m) for some in (z.min(axis=1), z.mean(axis=1), z.max(axis=1)))
     mine = (of == number) | (long_faces(vertices, faces) & (low <= number) & (number <= high))
-    used, index = np.unique(faces[mine], return_inverse=True)
-    return [(vertices[used], index.reshape(-1, 3))] if mine.any() else []
+    return [compacted(vertices, faces[mine])] if mine.any() else []
 
 
 def _base_m(raw: RawScene, index: int) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.geometry.faces import face_areas, face_vectors
+from converters.geometry.faces import face_areas, unit_normals
 from converters.read.obj import texels
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
@@ -89,9 +89,8 @@ def sample_surface(scan: ScanMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
         colours = np.einsum("nc,ncd->nd", weight, scan.vertex_colours[scan.faces[face]])
     if colours is not None and not np.ptp(colours, axis=0).any():
         colours = None
-    normals = face_vectors(scan.vertices, scan.faces)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return Surface(np.einsum("nc,ncd->nd", weight, scan.vertices[scan.faces[face]]), normals[face], colours, face)
+    normals = unit_normals(scan.vertices, scan.faces)[face]
+    return Surface(np.einsum("nc,ncd->nd", weight, scan.vertices[scan.faces[face]]), normals, colours, face)
 
 
 def voxelise(surface: Surface, floor_m: float) -> Voxels:

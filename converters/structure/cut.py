@@ -6,13 +6,11 @@ import dataclasses
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import face_areas, face_labels
+from converters.geometry.faces import face_areas, face_labels, loose_parts
 from converters.records.raw import CATEGORY_LABELS, FLOOR, SMALL_LABELS, STRUCTURE_LABELS
 from interactive_nav_common.rotations import matrix_from_quat
 
@@ -40,16 +38,6 @@ class CutResult:
     """(m,) int64, index of the object that a removed face belonged to, -1 elsewhere."""
 
 
-def face_pieces(faces: np.ndarray, n_vertices: int) -> np.ndarray:
-    """(m,) number of the connected piece that each face lies in (faces that share a vertex are connected)."""
-    if len(faces) == 0:
-        return np.zeros(0, np.int64)
-    rows = np.concatenate([faces[:, 0], faces[:, 1]])
-    columns = np.concatenate([faces[:, 1], faces[:, 2]])
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(n_vertices, n_vertices))
-    return connected_components(graph, directed=False)[1][faces[:, 0]].astype(np.int64)
-
-
 def depth_in_hulls(points: np.ndarray, hulls: tuple[Hull, ...]) -> np.ndarray:
     """(n,) signed distance-like value: negative inside a hull (largest plane value, least over hulls), m."""
     best = np.full(len(points), np.inf)
@@ -62,12 +50,6 @@ def depth_in_hulls(points: np.ndarray, hulls: tuple[Hull, ...]) -> np.ndarray:
     return best
 
 
-def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """(count, 3) points spread over a surface by area; the same seed gives the same points."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
-
-
 def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> np.ndarray:
     """(m,) bool: faces that show this object, by place and label."""
     local = (centres - placed.position_w) @ matrix_from_quat(placed.quaternion_w)
@@ -75,7 +57,8 @@ def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> 
     around = ((local > low - NEAR_OWN_M) & (local < high + [NEAR_OWN_M, NEAR_OWN_M, LYING_ABOVE_M])).all(axis=1)
     index = np.flatnonzero(around)
     points, label = local[index], labels[index]
-    distance = KDTree(surface_samples(placed.vertices_b, placed.faces, 20000)).query(points, workers=1)[0]
+    mesh = trimesh.Trimesh(placed.vertices_b, placed.faces, process=False)
+    distance = KDTree(trimesh.sample.sample_surface(mesh, 20000, seed=0)[0]).query(points, workers=1)[0]
     inside = depth_in_hulls(points, placed.hulls_b)
     near = (distance < NEAR_OTHER_M) | (inside < 0.02)
     over = ((points > low - 0.03) & (points < high + [0.03, 0.03, LYING_ABOVE_M])).all(axis=1)
@@ -123,7 +106,7 @@ def cut_furniture(
         _take_rest_of_instances(owner, faces, label, centres, area, objects, category, len(vertices_w))
     keep = owner < 0
     kept = np.flatnonzero(keep)
-    piece = face_pieces(faces[kept], len(vertices_w))
+    piece = loose_parts(faces[kept], len(vertices_w))
     if len(kept):
         piece_area = np.bincount(piece, area[kept])
         keep[kept[piece_area[piece] < DEBRIS_AREA_M2]] = False
@@ -144,7 +127,7 @@ def _take_rest_of_instances(
     index = np.flatnonzero(np.isin(label, CATEGORY_LABELS.get(category, ())))
     if len(index) == 0:
         return
-    piece = face_pieces(faces[index], n_vertices)
+    piece = loose_parts(faces[index], n_vertices)
     total = np.bincount(piece, area[index])
     gone = np.bincount(piece, area[index] * (owner[index] >= 0))
     rest = index[(gone[piece] > INSTANCE_SHARE * total[piece]) & (owner[index] < 0)]

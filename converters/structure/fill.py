@@ -16,13 +16,20 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import count_samples, face_areas, face_labels, face_vectors, sample_faces
+from converters.geometry.faces import (
+    count_samples,
+    face_areas,
+    face_labels,
+    face_vectors,
+    sample_faces,
+    stacked,
+    unit_normals,
+)
 from converters.records.limits import CLOUD
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
 from converters.records.visual import ColourCloud
 from converters.structure.floor import LIFT_M
 from converters.structure.maps import FloorPlan, label_pieces
-from converters.structure.walls import cover_rectangles
 from interactive_nav_common.rotations import yaw_matrix
 
 WALL_TOLERANCE_M, FLOOR_TOLERANCE_M = 0.04, 0.05
@@ -97,9 +104,7 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
         labels: (n,) NYU40.
         seed: of the draws.
     """
-    label = face_labels(labels, faces)
-    area = face_areas(vertices, faces)
-    normal = face_vectors(vertices, faces) / np.maximum(2 * area, 1e-12)[:, None]
+    label, area, normal = face_labels(labels, faces), face_areas(vertices, faces), unit_normals(vertices, faces)
     left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
     middle = vertices[faces].mean(axis=1)
     flat = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-9)
@@ -178,24 +183,16 @@ class Shown:
         """Vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
         rearmost = ndimage.minimum_filter(self.depth_m, OVERLAP)
         rearmost = np.where(np.isfinite(rearmost), rearmost, 0.0) - BEHIND_M
-        wide = _grown(hidden, OVERLAP) & self.seen
-        pieces, count = label_pieces(wide | _grown(hidden, FREE))
-        points, triangles, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-        for k in range(1, count + 1):
-            own = pieces == k
-            rectangles = np.array(cover_rectangles(own, own, disjoint=True))[:, [2, 0, 3, 1]] * self.cell_m
-            outline = shapely.union_all(shapely.box(*(rectangles + np.tile(self.low, 2)).T), grid_size=1e-6)
-            outline = outline.simplify(self.cell_m).segmentize(1.5 * OVERLAP * self.cell_m)
-            corners = shapely.get_coordinates(shapely.constrained_delaunay_triangles(outline)).reshape(-1, 4, 2)[:, :3]
-            a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-            turned = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
-            corners[turned] = corners[turned][:, ::-1]
-            flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-            cell = np.clip(np.floor((flat - self.low) / self.cell_m).astype(int), 0, np.array(own.shape[::-1]) - 1)
-            points.append(self.plane.lift(flat) + rearmost[cell[:, 1], cell[:, 0], None] * self.plane.normal)
-            triangles.append(index.reshape(-1, 3) + first)
-            first += len(flat)
-        return np.vstack(points), np.vstack(triangles)
+        wide = (_grown(hidden, OVERLAP) & self.seen) | _grown(hidden, FREE)
+        row, column = np.nonzero(wide)
+        outline = shapely.coverage_union_all(shapely.box(column, row, column + 1, row + 1))
+        outline = outline.simplify(1.0).segmentize(1.5 * OVERLAP)
+        triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
+        corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+        flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+        at = np.minimum(flat.astype(int), np.array(wide.shape[::-1]) - 1)
+        points = self.plane.lift(self.low + flat * self.cell_m)
+        return points + rearmost[at[:, 1], at[:, 0], None] * self.plane.normal, index.reshape(-1, 3)
 
 
 def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarray:
@@ -306,9 +303,7 @@ def fill_holes(
         done.append(patch)
         if len(patch[1]) and len(seen):
             clouds.append(_coloured(patch, plane, ColourCloud(cloud.points[seen], cloud.normals, cloud.colours[seen])))
-    first = np.cumsum([0, *(len(points) for points, _ in done)])
-    faces = np.vstack([triangles + k for (_, triangles), k in zip(done, first, strict=False)])
-    return (np.vstack([points for points, _ in done]), faces), clouds
+    return stacked(done), clouds
 
 
 def _coloured(patch: tuple[np.ndarray, np.ndarray], plane: Plane, seen: ColourCloud) -> ColourCloud:

@@ -17,7 +17,7 @@ from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled
+from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled, unit_normals
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 from interactive_nav_common.rotations import yaw_matrix
@@ -309,8 +309,7 @@ def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.nd
     counts, top, heights = np.zeros((4, *grid.shape), np.int64), np.zeros(grid.shape), [np.zeros(0)]
     facing, turn = np.zeros((2, *grid.shape)), yaw_matrix(grid.yaw)[:2, 1::-1]
     kept, of_structure = np.flatnonzero(of_face != CEILING), np.isin(of_face, STRUCTURE_LABELS)
-    unit = face_vectors(vertices_w, faces)
-    unit = unit[:, :2] / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+    unit = unit_normals(vertices_w, faces)[:, :2]
     spacing_m = grid.resolution_m / 3
     # A large face's points are pushed off the cells' borders: along a wall on one, rounding would share them out.
     large = beyond_block(vertices_w[faces[kept]], spacing_m)

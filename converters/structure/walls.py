@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 
 import numpy as np
 from scipy import ndimage
@@ -23,25 +24,21 @@ def border_cells(traversable: np.ndarray) -> np.ndarray:
     return ndimage.binary_dilation(traversable, np.ones((3, 3))) & ~traversable
 
 
-def cover_rectangles(
-    needed: np.ndarray, allowed: np.ndarray, disjoint: bool = False
-) -> list[tuple[int, int, int, int]]:
+def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> list[tuple[int, int, int, int]]:
     """Covers the needed cells with rectangles of allowed cells, the most useful first.
 
     Args:
         needed: (rows, columns) bool, every one of these ends up covered.
         allowed: (rows, columns) bool, contains `needed`; no rectangle leaves it.
-        disjoint: rectangles must not overlap (fewer are found when they may).
 
     Returns:
         (row0, row1, column0, column1) half-open, none inside another.
     """
     assert not (needed & ~allowed).any()
-    left, allowed, rectangles = needed.copy(), allowed.copy(), []
+    left, rectangles = needed.copy(), []
     # Candidates: each run of allowed cells along a row, grown in rows, and the other way round. Border runs are
     # straight, so these contain the long rectangles. As cells are covered, gains only fall and first cells only move
     # on: the least of the heap is the best candidate if its rank has not changed since.
-    blocked = [_blocked_before(grid) for grid in (allowed, allowed.T)]
     heap: list[tuple[int, int, _Run]] = []
 
     def offer(run: _Run) -> None:
@@ -52,49 +49,25 @@ def cover_rectangles(
             at = (start + int(cells[0]), line) if upright else (line, start + int(cells[0]))
             heapq.heappush(heap, (-int(np.count_nonzero(left[r0:r1, c0:c1])), at[0] * left.shape[1] + at[1], run))
 
-    whole = [
-        (upright, line, 0, allowed.shape[1 - upright]) for upright in (0, 1) for line in range(allowed.shape[upright])
-    ]
-    found = [run for line in whole for run in _runs(allowed, blocked, *line)]
-    table = np.array(found, np.int32).reshape(-1, 8)
-    for run in found:
+    for run in (run for upright, grid in enumerate((allowed, allowed.T)) for run in _runs(grid, upright)):
         offer(run)
     while heap:
         ranked = heapq.heappop(heap)
         best = r0, r1, c0, c1 = ranked[2][4:]
-        if disjoint and not allowed[r0:r1, c0:c1].all():
-            continue
         offer(ranked[2])
         if not heap or heap[0] != ranked:
             continue
-        rectangles.append(_shrink(left if disjoint else needed, best))
+        rectangles.append(_shrink(needed, best))
         left[r0:r1, c0:c1] = False
-        if disjoint:
-            r0, r1, c0, c1 = rectangles[-1]
-            allowed[r0:r1, c0:c1] = False
-            blocked[0][:, r0:r1] = _blocked_before(allowed[r0:r1])
-            blocked[1][:, c0:c1] = _blocked_before(allowed.T[c0:c1])
-            # Candidates that reached into the rectangle are others now, and may have gained.
-            cut = (table[:, 4] < r1) & (table[:, 5] > r0) & (table[:, 6] < c1) & (table[:, 7] > c0)
-            found = [run for old in table[cut, :4].tolist() for run in _runs(allowed, blocked, *old)]
-            table = np.vstack([table[~cut], np.array(found, np.int32).reshape(-1, 8)])
-            for run in found:
-                offer(run)
     return rectangles
 
 
-def _blocked_before(grid: np.ndarray) -> np.ndarray:
-    """(columns + 1, rows) number of cells that are not allowed in each row before each column."""
-    result = np.zeros((grid.shape[1] + 1, grid.shape[0]), np.int32)
-    np.cumsum(~grid.T, axis=0, out=result[1:])
-    return result
-
-
-def _runs(allowed: np.ndarray, blocked: list[np.ndarray], upright: int, line: int, start: int, stop: int) -> list[_Run]:
-    """Runs of allowed cells between start and stop of a line, and the rectangles grown from them."""
-    steps = np.diff((allowed.T if upright else allowed)[line, start:stop], prepend=False, append=False)
-    ends = (np.flatnonzero(steps).reshape(-1, 2) + start).tolist()
-    return [(upright, line, s, e, *_grow(blocked[upright], upright, line, s, e)) for s, e in ends]
+def _runs(grid: np.ndarray, upright: int) -> Iterator[_Run]:
+    """Runs of allowed cells along the rows of a grid, and the rectangles grown from them."""
+    blocked = np.cumsum(np.pad(~grid.T, ((1, 0), (0, 0))), axis=0)  # cells that are not allowed before each column
+    for line, row in enumerate(grid):
+        ends = np.flatnonzero(np.diff(row, prepend=False, append=False)).reshape(-1, 2)
+        yield from ((upright, line, s, e, *_grow(blocked, upright, line, s, e)) for s, e in ends.tolist())
 
 
 def _grow(blocked: np.ndarray, upright: int, line: int, start: int, stop: int) -> tuple[int, int, int, int]:

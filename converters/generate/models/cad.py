@@ -16,6 +16,7 @@ import numpy as np
 
 from converters.generate.models.drawings import DRAWN, SPARSE, Drawing
 from converters.generate.models.parts import MATERIALS, Part, on_floor
+from converters.geometry.faces import stacked
 from converters.geometry.pieces import convex_pieces
 from converters.library.store import read_index, read_shape
 from converters.read.cad import MOST_OWN, OWN_SLACK
@@ -62,10 +63,7 @@ def _library_parts(name: str) -> list[Part]:
     shape = read_shape(name)
     colour = shape.visual.image.reshape(-1, 3).mean(axis=0) / 255
     material = min(MATERIALS, key=lambda m: float(np.abs(np.array(MATERIALS[m]) - colour).sum()))
-    first = np.cumsum([0, *(len(hull.vertices) for hull in shape.hulls)])
-    vertices = np.vstack([hull.vertices for hull in shape.hulls])
-    faces = np.vstack([hull.faces + k for hull, k in zip(shape.hulls, first, strict=False)])
-    pieces = convex_pieces(vertices, faces, MOST_OWN, OWN_SLACK)
+    pieces = convex_pieces(*stacked((h.vertices, h.faces) for h in shape.hulls), MOST_OWN, OWN_SLACK)
     assert pieces is not None, f"{name}: a hull is not convex"
     return [Part(v, f, material) for v, f in pieces]
 

@@ -13,7 +13,7 @@ import numpy as np
 from converters.generate.surface.finishes import Colouring
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas, charts_of, face_axes, pack_rows
-from converters.geometry.faces import face_vectors
+from converters.geometry.faces import compacted, face_vectors, stacked
 
 SHEETS = (1024, 1536, 2048)
 """Sides that a sheet may have, texels; on the largest the resolution is lowered until all fits."""
@@ -84,11 +84,7 @@ def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], label: 
 def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, paint: Colouring) -> list[Chart]:
     """A mesh as patches of faces that look mostly along one axis."""
     n, chart = charts_of(faces, face_axes(vertices, faces))
-    out = []
-    for k in range(n):
-        used, index = np.unique(faces[chart == k], return_inverse=True)
-        out.append(Chart(vertices[used], index.reshape(-1, 3), label, paint, 50.0))
-    return out
+    return [Chart(*compacted(vertices, faces[chart == k]), label, paint, 50.0) for k in range(n)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,15 +188,9 @@ def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
             uv.append(corner + q.chart.uv * n)
         else:
             uv.append(corner + (q.chart.vertices - q.corner) @ q.axes.T * density)
-    vertices, faces = _stacked([c.vertices for c in charts], [c.faces for c in charts])
-    uv, uv_faces = _stacked(uv, [c.faces if c.uv_faces is None else c.uv_faces for c in charts])
+    vertices, faces = stacked((c.vertices, c.faces) for c in charts)
+    uv, uv_faces = stacked(zip(uv, (c.faces if c.uv_faces is None else c.uv_faces for c in charts), strict=True))
     labels = np.repeat([c.label for c in charts], [len(c.vertices) for c in charts]).astype(np.uint8)
     colour = np.round(np.round(np.clip(sheet, 0, 1), 6) * LEVELS) * (255 / LEVELS)
     image = np.round(colour).astype(np.uint8)[::-1]
     return Scan(vertices, faces, labels), Atlas(uv / side, uv_faces, image)
-
-
-def _stacked(points: Sequence[np.ndarray], faces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """All points, and all faces into them."""
-    start = np.cumsum([0, *(len(p) for p in points)])
-    return np.concatenate(points), np.concatenate([f + k for f, k in zip(faces, start, strict=False)]).astype(np.int64)

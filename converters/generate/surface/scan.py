@@ -12,7 +12,7 @@ import dataclasses
 
 import fast_simplification
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from converters.generate.design.config import BuildingConfig
 from converters.generate.design.instance import Instance
@@ -20,7 +20,7 @@ from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
-from converters.geometry.faces import vertex_vectors
+from converters.geometry.faces import compacted, loose_parts, vertex_vectors
 from converters.records.raw import FLOOR, WALL
 from scenes_mjcf.categories import TABLE
 
@@ -129,13 +129,8 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
     """Drops connected pieces of fewer than `min_faces` faces, degenerate faces, and unused vertices."""
     degenerate = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~degenerate]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), shape=(len(vertices),) * 2)
-    _, piece = sparse.csgraph.connected_components(graph, directed=False)
-    of_face = piece[faces[:, 0]]
-    faces = faces[np.bincount(of_face)[of_face] >= min_faces]
-    used, index = np.unique(faces, return_inverse=True)
-    return vertices[used], index.reshape(-1, 3)
+    part = loose_parts(faces, len(vertices))
+    return compacted(vertices, faces[np.bincount(part)[part] >= min_faces])
 
 
 def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:

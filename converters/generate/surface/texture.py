@@ -19,7 +19,7 @@ from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Room, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
-from converters.geometry.faces import face_vectors
+from converters.geometry.faces import face_vectors, unit_normals
 from converters.records.visual import TexturedMesh
 from converters.write.texture import textured_cloud
 
@@ -246,8 +246,7 @@ def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m:
     """
     uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
     faces_at = face_image(uv, face_uv, side).ravel()
-    normals = face_vectors(scan.vertices, scan.faces)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals = unit_normals(scan.vertices, scan.faces)
     rows, columns = np.divmod(np.arange(side * side), side)
     points = texel_positions(uv, face_uv, scan, faces_at, np.stack([columns + 0.5, rows + 0.5], axis=1))
     shade = paint(scan, rooms, uses, points, faces_at, normals, rng)

@@ -22,6 +22,7 @@ import numpy as np
 import shapely
 
 from converters.geometry.boxes import convex_hull
+from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder
 from converters.read.homes.parts import Part, category_of, home
 from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
@@ -334,9 +335,8 @@ def _footprint(e: ElementTree.Element) -> Any:
 
 
 def _part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:
-    used, index = np.unique(mesh.faces[faces], return_inverse=True)
     uv = None if mesh.corner_uv is None else mesh.corner_uv[faces]
-    return TexturedMesh(mesh.vertices[used], index.reshape(-1, 3), uv, mesh.texture)
+    return TexturedMesh(*compacted(mesh.vertices, mesh.faces[faces]), uv, mesh.texture)
 
 
 def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from converters.geometry.faces import compacted
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder, read_image, read_obj
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number
@@ -145,9 +146,8 @@ class Models:
             uv, numbers, images = np.zeros((len(faces), 3, 2)), none, [colour(element.get("color"), GREYS)]
         else:
             vertices, faces = self._deformed(element, model)
-            used, faces = np.unique(faces, return_inverse=True)
-            faces, group = faces.reshape(-1, 3), model.group
-            vertices = vertices[used] @ _rotation(element).T
+            (vertices, faces), group = compacted(vertices, faces), model.group
+            vertices = vertices @ _rotation(element).T
             uv, numbers, images = self._painted(element, model)
         low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
         scale = np.where(span > 1e-9, size / np.maximum(span, 1e-12), 1.0)

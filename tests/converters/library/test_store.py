@@ -10,7 +10,8 @@ import pytest
 import trimesh
 import yaml
 
-from converters.geometry.simplify import Surface, loose_parts, simplify_within
+from converters.geometry.faces import loose_parts
+from converters.geometry.simplify import Surface, simplify_within
 from converters.library.build import MOST_FACES, SELECTION, as_catalogued, make_model, on_top, read_selection
 from converters.library.catalogue import Piece, read_catalogue
 from converters.library.store import ATTRIBUTION, PACKED, attribution, read_index, read_shape, write_library

@@ -10,9 +10,9 @@ from converters.bodies.objects import place_object
 from converters.bodies.physical import MATERIALS, physical_properties
 from converters.bodies.placement import upright
 from converters.geometry.boxes import Hull, convex_hull
-from converters.geometry.faces import face_labels
+from converters.geometry.faces import face_labels, loose_parts
 from converters.read.scan2cad import read_scan2cad
-from converters.structure.cut import cut_furniture, depth_in_hulls, face_pieces
+from converters.structure.cut import cut_furniture, depth_in_hulls
 
 
 def cube(side: float, centre=(0.0, 0.0, 0.0)) -> Hull:
@@ -75,8 +75,8 @@ def test_face_labels_take_the_majority():
     np.testing.assert_array_equal(face_labels(labels, faces), [1, 2, 2, 1])
 
 
-def test_face_pieces_join_over_shared_vertices():
-    pieces = face_pieces(np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]]), 8)
+def test_loose_parts_join_over_shared_vertices():
+    pieces = loose_parts(np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]]), 8)
     assert pieces[0] == pieces[1] != pieces[2]
 
 
