@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection
 from pathlib import Path
 
 import matplotlib
@@ -33,7 +32,7 @@ from converters.records.raw import RawScene, ScanMesh
 from converters.records.visual import TexturedMesh
 from converters.structure.cut import cut_furniture
 from interactive_nav_common.files import whole_file
-from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
+from scenes_mjcf.categories import CATEGORIES
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19
@@ -47,9 +46,6 @@ COLUMNS, PANEL_IN, LEAST_WIDTH_IN = 3, 3.3, 9.0
 SLANTWISE = 0.62
 """Of the page's width, the view from the south; that at eye height stands beside it."""
 DPI = 100
-SURFACE_COLOURS = 64
-ALWAYS_IN_PALETTE = 10
-"""Categories, from the first: pictures of scenes without others stay the same bytes."""
 TRAVERSABLE = (0.85, 0.94, 0.85)
 WALL = (0.75, 0.75, 0.75)
 
@@ -62,26 +58,6 @@ def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
         body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])) or ""
         found.append((name, body, geom))
     return found
-
-
-def _palette(views: list[np.ndarray], shown: Collection[str]) -> Image.Image:
-    """A palette image: the views' own commonest colours beside those that the panels draw with.
-
-    Args:
-        views: pictures in colour.
-        shown: the scene's categories; a palette has no room for all that there are.
-    """
-    drawn_in = [c for i, c in enumerate(OBJECT_CATEGORIES) if i < ALWAYS_IN_PALETTE or c in shown]
-    ground, flat = np.array(TRAVERSABLE), np.array([CATEGORIES[c].preview_colour for c in drawn_in])
-    drawn = [np.outer(np.linspace(0, 1, 12), np.ones(3)), ground[None], np.array(WALL)[None]]
-    drawn += [flat * light for light in (0.55, 0.75, 1.0)] + [ground + (flat - ground) * a for a in (0.3, 0.51, 0.66)]
-    chart = np.rint(255 * np.vstack(drawn)).astype(int).ravel().tolist()
-    count = min(SURFACE_COLOURS, 256 - len(chart) // 3)
-    surface = Image.fromarray(np.vstack([np.asarray(v, np.uint8).reshape(-1, 1, 3) for v in views]))
-    own = surface.quantize(count, method=Image.Quantize.MEDIANCUT).getpalette() or []
-    image = Image.new("P", (1, 1))
-    image.putpalette(own[: 3 * count] + chart)
-    return image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,12 +223,8 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
 
 
-def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
-    """Draws two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes.
-
-    Returns:
-        The figure, and a palette that suits it.
-    """
+def draw(scene: _Scene, raw: RawScene | None) -> Figure:
+    """Draws two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes."""
     left, right, bottom, top = scene.extent
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
     rows = 2 if raw is not None else 1
@@ -264,7 +236,6 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     top_row = places[0, :].subgridspec(1, 2, width_ratios=(SLANTWISE, 1 - SLANTWISE))
     slantwise, standing = figure.add_subplot(top_row[0]), figure.add_subplot(top_row[1])
     panels = [figure.add_subplot(places[row, column]) for row in range(1, 1 + rows) for column in range(COLUMNS)]
-    views = [slantwise, standing, *panels[:-3]]
     _draw_views(slantwise, standing, scene, width)
 
     if raw is not None:
@@ -290,7 +261,7 @@ def draw(scene: _Scene, raw: RawScene | None) -> tuple[Figure, Image.Image]:
     figure.suptitle(f"{scene.manifest.name} ({scene.manifest.split})", fontsize=11)
     lines = math.ceil(len(handles) / across)
     figure.tight_layout(rect=(0, 0.01 + LEGEND_LINE_IN * lines / figure.get_figheight(), 1, 0.985))
-    return figure, _palette([np.asarray(picture.get_array()) for axes in views for picture in axes.images[:1]], shown)
+    return figure
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
@@ -329,10 +300,10 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    figure, palette = draw(_Scene(model, data, manifest, maps, world_surfaces(model, data)), raw)
+    figure = draw(_Scene(model, data, manifest, maps, world_surfaces(model, data)), raw)
     with whole_file(target) as picture:
         figure.savefig(picture, format="png", metadata={"Software": None})
         with Image.open(picture) as image:
-            few = image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
+            few = image.convert("RGB").quantize(method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
             few.save(picture, "PNG", optimize=True)
     plt.close(figure)
