@@ -43,6 +43,13 @@ def vertex_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return out
 
 
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(n, 3) unit normals, weighted by face area; (0, 0, 1) where there are no faces."""
+    out = vertex_vectors(vertices, faces)
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+
+
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(m,) m2."""
     return np.linalg.norm(face_vectors(vertices, faces), axis=1) / 2
@@ -54,14 +61,16 @@ def sample_faces(
     """Points on every face no further apart than the spacing, by even barycentric steps (no chance involved), or by
     even rows on faces with more than `most_steps` of these: long thin ones then need few.
 
+    Vertices (n, 3 or more) may have more columns than x, y and z (m), such as texture coordinates.
+
     Returns:
-        points (k, 3) m, face (k,) the face each lies on.
+        points (k, columns), face (k,) the face each lies on.
 
     Raises:
         SceneRejected: more than `SAMPLES`.
     """
     if len(faces) == 0:
-        return np.zeros((0, 3)), np.zeros(0, np.int64)
+        return np.zeros((0, vertices.shape[1])), np.zeros(0, np.int64)
     count = count_samples(vertices, faces, spacing_m, most_steps)
     check_count(
         "a surface", count, SAMPLES, f"points at {spacing_m:g} m", "remove long thin faces, or split the source"
@@ -94,7 +103,7 @@ def sampled(
         for part in np.array_split(chosen, -(-len(chosen) * len(weights) // BLOCK)):
             large = len(weights) > LARGE  # matmul is faster there, and rounds otherwise
             points = weights @ corners[part] if large else np.einsum("kw,fwd->fkd", weights, corners[part])
-            yield points.reshape(-1, 3), np.repeat(part, len(weights))
+            yield points.reshape(-1, vertices.shape[1]), np.repeat(part, len(weights))
     for face in np.flatnonzero(beyond):
         for points in _by_rows(corners[face], int(steps[face]), spacing_m):
             yield points, np.full(len(points), face)
@@ -105,7 +114,7 @@ def _by_rows(corners: np.ndarray, n: int, spacing_m: float) -> Iterator[np.ndarr
     side = int(_sides(corners[None])[0].argmin())
     apex, first, last = corners[side - 2], corners[side], corners[side - 1]
     along = (np.arange(n) + 0.5) / n
-    counts = np.maximum(np.ceil(along * np.linalg.norm(last - first) / spacing_m).astype(int), 1)
+    counts = np.maximum(np.ceil(along * np.linalg.norm((last - first)[:3]) / spacing_m).astype(int), 1)
     for rows in np.split(np.arange(n), np.flatnonzero(np.diff(np.cumsum(counts) * 4 // BLOCK)) + 1):
         row = np.repeat(rows, counts[rows])
         column = np.arange(len(row)) - np.repeat(np.cumsum(counts[rows]) - counts[rows], counts[rows])
@@ -120,7 +129,7 @@ def beyond_block(corners: np.ndarray, spacing_m: float) -> np.ndarray:
 
 def _sides(corners: np.ndarray) -> np.ndarray:
     """(m, 3) m: lengths of the sides of triangles, each from the corner before."""
-    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return np.linalg.norm((corners - np.roll(corners, 1, axis=1))[..., :3], axis=2)
 
 
 def _steps(corners: np.ndarray, spacing_m: float) -> np.ndarray:

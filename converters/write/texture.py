@@ -6,13 +6,13 @@ import dataclasses
 import math
 
 import numpy as np
-import trimesh
 import xatlas
 from PIL import Image
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from converters.geometry.faces import BLOCK, face_vectors, sample_faces, vertex_vectors
+from converters.geometry.faces import face_areas, sample_faces, unit_normals, vertex_normals
+from converters.read.obj import texels
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
@@ -29,12 +29,9 @@ PLAIN, MARGIN = 8, 4
 
 
 def colour_cloud(
-    scan: ScanMesh,
-    vertices_w: np.ndarray,
-    faces: np.ndarray,
-    face_index: np.ndarray,
+    scan: ScanMesh, vertices_w: np.ndarray, faces: np.ndarray, face_index: np.ndarray,
     spacing_m: float = TEXTURE_SPACING_M,
-) -> ColourCloud:
+) -> ColourCloud:  # fmt: skip
     """Coloured points of some faces of the scan: their vertices, or a sampling of the texture.
 
     Args:
@@ -45,27 +42,16 @@ def colour_cloud(
         spacing_m: of the points on a textured scan.
     """
     chosen = faces[face_index]
-    a, b, c = (vertices_w[chosen[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
     if scan.texture is None or scan.corner_uv is None:
         assert scan.vertex_colours is not None
         used = np.unique(chosen)
-        return ColourCloud(
-            vertices_w[used], _unit(vertex_vectors(vertices_w, chosen)[used]), scan.vertex_colours[used].astype(float)
-        )
-    spacing_m = max(spacing_m, math.sqrt(np.linalg.norm(normal, axis=1).sum() / CLOUD))
-    points, index = sample_faces(vertices_w, chosen, spacing_m)
-    middle = sample_faces(
-        scan.corner_uv[face_index].reshape(-1, 2) @ np.eye(2, 3),
-        np.arange(3 * len(chosen)).reshape(-1, 3),
-        np.inf,
-    )[0][:, :2]
-    corners, blocks = scan.corner_uv[face_index], np.array_split(np.arange(len(index)), len(index) // BLOCK + 1)
-    uv = np.concatenate([_uv_at(points[at], *(x[index[at]] for x in (a, b, c, corners, middle))) for at in blocks])
-    height, width = scan.texture.shape[:2]
-    column = np.clip((uv[:, 0] % 1.0 * width).astype(int), 0, width - 1)
-    row = np.clip(((1.0 - uv[:, 1] % 1.0) * height).astype(int), 0, height - 1)
-    return ColourCloud(points, _unit(normal)[index], scan.texture[row, column].astype(float))
+        normals = vertex_normals(vertices_w, chosen)[used]
+        return ColourCloud(vertices_w[used], normals, scan.vertex_colours[used].astype(float))
+    spacing_m = max(spacing_m, math.sqrt(2 * face_areas(vertices_w, chosen).sum() / CLOUD))
+    corners = np.hstack([vertices_w[chosen].reshape(-1, 3), scan.corner_uv[face_index].reshape(-1, 2)])
+    points, index = sample_faces(corners, np.arange(len(corners)).reshape(-1, 3), spacing_m)
+    colours = texels(scan.texture, points[:, 3:]).astype(float)
+    return ColourCloud(points[:, :3], unit_normals(vertices_w, chosen)[index], colours)
 
 
 def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
@@ -75,31 +61,6 @@ def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
     none = np.zeros(len(mesh.vertices), np.int64)
     scan = ScanMesh(mesh.vertices, mesh.faces, none, None, mesh.corner_uv, mesh.texture)
     return colour_cloud(scan, mesh.vertices, mesh.faces, np.arange(len(mesh.faces)), spacing_m)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)
-
-
-def _uv_at(
-    points: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    c: np.ndarray,
-    corner_uv: np.ndarray,
-    fallback: np.ndarray,
-) -> np.ndarray:
-    """(n, 2) texture coordinates of points in triangles (barycentric); the middle's on degenerate ones."""
-    e1, e2, d = b - a, c - a, points - a
-    d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
-    q1, q2 = (d * e1).sum(1), (d * e2).sum(1)
-    det = d11 * d22 - d12 * d12
-    good = det > 1e-16
-    safe = np.where(good, det, 1.0)
-    v, w = (d22 * q1 - d12 * q2) / safe, (d11 * q2 - d12 * q1) / safe
-    uv = corner_uv[:, 0] * (1 - v - w)[:, None] + corner_uv[:, 1] * v[:, None] + corner_uv[:, 2] * w[:, None]
-    return np.where(good[:, None], uv, fallback)
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +199,7 @@ def bake_structure(
     known, sought = cloud.points, point
     if turned_m:
         known = np.hstack([known, turned_m * cloud.normals])
-        sought = np.hstack([point, turned_m * _unit(face_vectors(vertices, faces))[face]])
+        sought = np.hstack([point, turned_m * unit_normals(vertices, faces)[face]])
     distance, index = KDTree(known).query(sought, k=min(3, len(known)))
     distance, index = distance.reshape(len(point), -1), index.reshape(len(point), -1)
     weight = 1.0 / (distance + 0.002)
@@ -274,9 +235,7 @@ def bake_object(
     low_vertices, low_faces = low
     uv, uv_faces = unwrap(low_vertices, low_faces, size)
     texel, point, face = texel_surface(low_vertices, low_faces, uv, uv_faces, size)
-    normal = np.asarray(trimesh.triangles.normals(low_vertices[low_faces])[0])
-    if len(normal) != len(low_faces):  # degenerate faces are dropped by the library
-        normal = _unit(face_vectors(low_vertices, low_faces))
+    normal = unit_normals(low_vertices, low_faces)
     sample, sample_face = sample_faces(vertices, faces, max(0.02, float(np.ptp(vertices, axis=0).max()) / 60))
     on_face = sample_face[KDTree(sample).query(point)[1]]
     cad_colour = face_colours[on_face].astype(float)
@@ -292,7 +251,6 @@ def bake_object(
         index = np.where(found, index, 0)
         cosine = np.abs(np.einsum("kd,knd->kn", normal[face], cloud.normals[index]))
         weight = np.where(found & (cosine > AGREE), 1.0 / (distance + 0.005), 0.0)
-        weight = np.where(found, weight, 0.0)
         total = weight.sum(axis=1)
         seen = total > 0
         mixed = (cloud.colours[index] * weight[..., None]).sum(axis=1)

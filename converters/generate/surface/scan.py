@@ -20,7 +20,7 @@ from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
-from converters.geometry.faces import compacted, loose_parts, vertex_vectors
+from converters.geometry.faces import compacted, loose_parts, vertex_normals
 from converters.records.raw import FLOOR, WALL
 from scenes_mjcf.categories import TABLE
 
@@ -108,13 +108,6 @@ def seen_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volu
             index, direction, left = index[keep], direction[keep], left[keep] - step
             at = at[keep] + direction * step
     return seen
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n, 3) unit normals, weighted by face area; (0, 0, 1) where there are no faces."""
-    out = vertex_vectors(vertices, faces)
-    length = np.linalg.norm(out, axis=1, keepdims=True)
-    return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
 
 
 def smooth_noise(points: np.ndarray, wave_m: float, rng: np.random.Generator) -> np.ndarray:
