@@ -87,10 +87,6 @@ def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder
     return category
 
 
-def _turned(mesh: TexturedMesh, turn: np.ndarray) -> TexturedMesh:
-    return dataclasses.replace(mesh, vertices=mesh.vertices @ turn.T)
-
-
 def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFolder]:
     """Reads a URDF or a mesh, in metres and z up.
 
@@ -107,7 +103,8 @@ def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFo
     turn = config.scale * (Y_UP_TO_Z_UP if config.up == "y" else np.eye(3))
     pieces = None if item.pieces is None else tuple((v @ turn.T, f) for v, f in item.pieces)
     solid = (item.collision[0] @ turn.T, item.collision[1])
-    return dataclasses.replace(item, surface=_turned(item.surface, turn), pieces=pieces, collision=solid), source
+    surface = dataclasses.replace(item.surface, vertices=item.surface.vertices @ turn.T)
+    return dataclasses.replace(item, surface=surface, pieces=pieces, collision=solid), source
 
 
 def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
@@ -172,12 +169,14 @@ def convert_object(
         base = np.array([*(low + high)[:2] / 2, min(float(h.vertices[:, 2].min()) for h in hulls)])
         foot = FOOT_SHARE * float(high[2] - low[2])
         hulls = tuple(_level_feet(h.vertices - base, foot) for h in hulls)
-        visual = _visual(_moved(item.surface, -base), path.name, source)
+        surface = dataclasses.replace(item.surface, vertices=item.surface.vertices - base)
+        visual = _visual(surface, path.name, source)
         volume, com, inertia = mass_moments(hulls)
         mass, mass_source = _mass(item, category, volume, config)
         friction, friction_source = _friction(item, category, config)
         physical = Physical(mass, com, inertia * mass / volume, friction, volume, False)
-        parts = _at_rest(_at_origin(target.name, category, item, base, hulls), physical)
+        placed = _at_origin(target.name, category, item, base, hulls)
+        parts = settle(SceneParts(placed.name, (placed,), (physical,), ())).parts
         about = _origin(item, source) | {
             "name": target.name,
             "category": category,
@@ -193,10 +192,6 @@ def convert_object(
         }
         _write(dataclasses.replace(parts, object_visuals=(visual,)), about, folder)
     return about
-
-
-def _at_rest(placed: PlacedObject, physical: Physical) -> SceneParts:
-    return settle(SceneParts(placed.name, (placed,), (physical,), ())).parts
 
 
 def _origin(item: RigidObject, source: SourceFolder) -> dict[str, Any]:
@@ -238,10 +233,6 @@ def _at_origin(name: str, category: str, item: RigidObject, base: np.ndarray, hu
         quaternion_w=np.array([1.0, 0.0, 0.0, 0.0]),
         hinge=None,
     )
-
-
-def _moved(mesh: TexturedMesh, by: np.ndarray) -> TexturedMesh:
-    return dataclasses.replace(mesh, vertices=mesh.vertices + by)
 
 
 def _hulls(

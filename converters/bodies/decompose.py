@@ -8,6 +8,7 @@ cannot be interrupted from Python. A model is decomposed once, unscaled: scaling
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import errno
@@ -16,6 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
@@ -102,16 +104,6 @@ class Decomposition:
     """Most memory that one of its processes held."""
 
 
-@dataclasses.dataclass
-class _Job:
-    key: str
-    name: str
-    process: subprocess.Popen
-    started: float
-    output: Path
-    peak_mib: float = 0.0
-
-
 def decompose_all(
     meshes: dict[str, tuple[np.ndarray, np.ndarray]],
     config: DecomposeConfig,
@@ -155,9 +147,9 @@ def decompose_all(
     total = len(set(keys.values()))
     tell = progress or (lambda share: None)
     tell(len(done) / max(total, 1))
-    with contextlib.closing(_results(waiting, meshes, configs, max(jobs, 1), config.timeout_s)) as results:
-        for job, hulls, reason in results:
-            key, name, worker_mib = job.key, job.name, max(worker_mib, job.peak_mib)
+    with contextlib.closing(_results(waiting, meshes, configs, max(jobs, 1))) as results:
+        for (key, name), (hulls, reason, peak_mib) in results:
+            worker_mib = max(worker_mib, peak_mib)
             if hulls is None:
                 if strict:
                     raise StageFailed(f"decompose: {reason}")
@@ -178,57 +170,53 @@ def _results(
     meshes: dict[str, tuple[np.ndarray, np.ndarray]],
     configs: Mapping[str, DecomposeConfig],
     jobs: int,
-    timeout_s: float,
-) -> Generator[tuple[_Job, tuple[Hull, ...] | None, str], None, None]:
-    """Job, hulls and what `_finish` says of each that waits, as they end; closed early, it ends what runs."""
-    running: list[_Job] = []
-    with tempfile.TemporaryDirectory(prefix="hulls-") as scratch:
+) -> Generator[tuple[tuple[str, str], tuple[tuple[Hull, ...] | None, str, float]], None, None]:
+    """Key and name, and what `_run` says, of each that waits, as they end; closed early, it ends what runs."""
+    stop = threading.Event()
+    with tempfile.TemporaryDirectory(prefix="hulls-") as folder, concurrent.futures.ThreadPoolExecutor(jobs) as pool:
         try:
-            while waiting or running:
-                while waiting and len(running) < jobs:
-                    key, name = waiting.pop(0)
-                    running.append(_start(key, name, *meshes[name], configs[name], Path(scratch)))
-                for job in list(running):
-                    job.peak_mib = max(job.peak_mib, peak_memory_mib(job.process.pid))
-                    late = time.monotonic() - job.started > timeout_s
-                    if job.process.poll() is not None or late:
-                        hulls, reason = _finish(job, timeout_s)
-                        running.remove(job)
-                        yield job, hulls, reason
-                if running:
-                    time.sleep(0.05)
+            begun = {
+                pool.submit(_run, *one, *meshes[one[1]], configs[one[1]], Path(folder), stop): one for one in waiting
+            }
+            yield from ((begun[done], done.result()) for done in concurrent.futures.as_completed(begun))
         finally:
-            for job in running:
-                job.process.kill()
-                job.process.wait()
+            stop.set()
+            pool.shutdown(cancel_futures=True)
 
 
-def _finish(job: _Job, timeout_s: float) -> tuple[tuple[Hull, ...] | None, str]:
-    """Hulls of a job that ended or is out of time; None and the reason where there are none."""
-    if job.process.poll() is None:
-        job.process.kill()
-        job.process.wait()
-        return None, f"coacd ran past {timeout_s:g} s on {job.name}"
-    code = job.process.returncode
+def _run(
+    key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path,
+    stop: threading.Event,
+) -> tuple[tuple[Hull, ...] | None, str, float]:  # fmt: skip
+    """Hulls, or None and the reason, and the memory that it took, MiB; what is out of time or to stop is killed."""
+    process, peak_mib, until = _start(key, name, vertices, faces, config, scratch), 0.0, time.monotonic()
+    until += config.timeout_s
+    while process.poll() is None and time.monotonic() < until and not stop.wait(0.05):
+        peak_mib = max(peak_mib, peak_memory_mib(process.pid))
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+        return None, f"coacd ran past {config.timeout_s:g} s on {name}", peak_mib
+    code, output = process.returncode, scratch / f"{key}.npz"
     if code == CANNOT_WRITE:
-        raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(job.output.parent))
-    hulls = _load(job.output) if code == 0 else None
+        raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(scratch))
+    hulls = _load(output) if code == 0 else None
     if hulls is not None:
-        return hulls, ""
-    log = job.output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
-    return None, f"coacd failed on {job.name} (exit code {code}: {log[-1] if log else 'no message'})"
+        return hulls, "", peak_mib
+    log = output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
+    return None, f"coacd failed on {name} (exit code {code}: {log[-1] if log else 'no message'})", peak_mib
 
 
 def _start(
     key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path
-) -> _Job:
+) -> subprocess.Popen:
     mesh_path, output = scratch / f"{key}.in.npz", scratch / f"{key}.npz"
     parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
     np.savez(mesh_path, vertices=vertices, faces=faces, **parameters)  # pyright: ignore[reportArgumentType]
     # One thread each: results then do not depend on the machine's load, and `jobs` is what it says.
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with output.with_suffix(".log").open("wb") as log:
-        process = subprocess.Popen(
+        return subprocess.Popen(
             [sys.executable, "-m", "converters.bodies.coacd_worker", str(mesh_path), str(output)],
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -236,4 +224,3 @@ def _start(
             stdin=subprocess.DEVNULL,
             cwd=Path(__file__).resolve().parents[2],
         )
-    return _Job(key, name, process, time.monotonic(), output)

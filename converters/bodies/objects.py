@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -156,10 +158,5 @@ def place_object(
 
 def name_objects(annotations: tuple[Annotation, ...]) -> tuple[str, ...]:
     """Body names `<category>_<k>`, k counting from 0 inside its category in the annotation's order."""
-    count: dict[str, int] = {}
-    names = []
-    for annotation in annotations:
-        k = count.get(annotation.category, 0)
-        count[annotation.category] = k + 1
-        names.append(f"{annotation.category}_{k}")
-    return tuple(names)
+    count = collections.defaultdict(itertools.count)
+    return tuple(f"{a.category}_{next(count[a.category])}" for a in annotations)

@@ -109,14 +109,11 @@ def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, sym
     """
     period = SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
     at = [apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
-    yaw = abs(wrap_angle(one.yaw - other.yaw, period)) if period else 0.0
-    quarter_turns = (
-        round((wrap_angle(one.yaw - other.yaw) - wrap_angle(one.yaw - other.yaw, period)) / (math.pi / 2))
-        if period
-        else 0
-    )
-    scale = one.scale[[1, 0, 2]] if quarter_turns % 2 else one.scale
-    return PoseDifference(float(np.linalg.norm(at[0] - at[1])), yaw, scale / other.scale)
+    turn = wrap_angle(one.yaw - other.yaw)
+    yaw = wrap_angle(turn, period) if period else 0.0
+    swapped = period and round((turn - yaw) / (math.pi / 2)) % 2
+    scale = one.scale[[1, 0, 2]] if swapped else one.scale
+    return PoseDifference(float(np.linalg.norm(at[0] - at[1])), abs(yaw), scale / other.scale)
 
 
 def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:

@@ -7,8 +7,10 @@ import math
 
 import mujoco
 import numpy as np
+import shapely
 from PIL import Image
 
+from converters.check.object_preview import geom_outline
 from converters.check.render import Camera, Picture, looking_at, over
 from converters.check.surfaces import geom_surface
 from converters.geometry.density import clearance_m
@@ -128,14 +130,8 @@ def _vantage(
 
 def _hidden(model: mujoco.MjModel, data: mujoco.MjData, places: np.ndarray, way: np.ndarray) -> np.ndarray:
     """(p, k) whether a wall stands in the way (p, k, 2) from a place (p, 2)."""
-    hidden = np.zeros(way.shape[:2], bool)
-    for geom in range(model.ngeom):
-        if model.geom(geom).name.startswith("wall_"):
-            turn = data.geom_xmat[geom].reshape(3, 3)[:2, :2]
-            half = model.geom_size[geom, :2]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                start, along = (places - data.geom_xpos[geom, :2]) @ turn, way @ turn
-                a, b = (-half - start)[:, None] / along, (half - start)[:, None] / along
-            enter, leave = np.minimum(a, b).max(axis=2), np.maximum(a, b).min(axis=2)
-            hidden |= np.maximum(enter, 0.0) < np.minimum(leave, 1.0)
-    return hidden
+    walls = [g for g in range(model.ngeom) if model.geom(g).name.startswith("wall_")]
+    outlines = [shapely.Polygon(geom_outline(model, data, g, np.eye(3))) for g in walls]
+    start = np.broadcast_to(places[:, None], way.shape)
+    lines = shapely.linestrings(np.stack([start, start + way], axis=2))
+    return np.asarray(shapely.intersects(lines, shapely.union_all(outlines)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from typing import Any
 
@@ -74,18 +75,9 @@ def _join(pieces: list[Piece]) -> Piece:
 def merge(pieces: list[Piece], same: Any) -> list[Piece]:
     """Joins pieces for which `same` holds, the largest first, until none is left to join."""
     pieces = sorted(pieces, key=lambda p: (-len(p.voxels), p.voxels[0].tolist()))
-    merged = True
-    while merged:
-        merged = False
-        for i in range(len(pieces)):
-            for j in range(i + 1, len(pieces)):
-                if same(pieces[i], pieces[j]):
-                    pieces[i] = _join([pieces[i], pieces[j]])
-                    del pieces[j]
-                    merged = True
-                    break
-            if merged:
-                break
+    while pair := next((p for p in itertools.combinations(range(len(pieces)), 2) if same(*(pieces[k] for k in p))), ()):
+        i, j = pair
+        pieces[i] = _join([pieces[i], pieces.pop(j)])
     return pieces
 
 

@@ -105,14 +105,9 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
                 Polygon(np.asarray(outline.exterior.coords), fill=True, alpha=0.25, facecolor=colour, edgecolor=colour)
             )
             text += f"\nmodel {model.cad.cad_id[:6]} {model.confidence:.2f}"
-        axes.annotate(
-            text,
-            (float(proposal.centre[0]), float(proposal.centre[1])),
-            ha="center",
-            va="center",
-            fontsize=8,
-            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1},
-        )
+        box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1}
+        x, y = proposal.centre[:2].tolist()
+        axes.text(x, y, text, ha="center", va="center", fontsize=8, bbox=box)
     for annotation in raw.annotations:
         hull = MultiPoint(annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
         axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)

@@ -14,6 +14,7 @@ import trimesh
 from PIL import Image
 
 from converters.records.errors import SceneRejected
+from converters.records.raw import RawScene, ScanMesh
 from interactive_nav_common.errors import readable
 from interactive_nav_common.records import Reader
 
@@ -37,6 +38,11 @@ class SourceFolder:
         self.warnings: list[str] = []
         self.surfaces: dict[str, Any] = {}
         """Path -> what `read_surface` made of it."""
+
+    def scene(self, layout: str, scan: ScanMesh, **more: Any) -> RawScene:
+        """The record of what was read, with the folder's name, hashes and warnings."""
+        about = {"name": self.root.resolve().name, "source_format": layout, "scan": scan}
+        return RawScene(**about, **more, sources=dict(sorted(self.sha256.items())), warnings=tuple(self.warnings))
 
     def has(self, relative: str) -> bool:
         """True when the file exists."""

@@ -14,11 +14,11 @@ import numpy as np
 from converters.read.annotations import inside_scan, parse_annotations
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_npz
-from converters.read.obj import GREY, TexturedMesh, read_scan_obj
+from converters.read.obj import TexturedMesh, read_scan_obj, scan_of
 from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_upright, labelled, with_own_corners
 from converters.records.errors import SceneRejected
-from converters.records.raw import ATTRIBUTION, FLOOR, GivenMap, RawScene, ScanMesh, Storey
+from converters.records.raw import ATTRIBUTION, FLOOR, GivenMap, RawScene, Storey
 
 MESH = "mesh_z_up.obj"
 LABELS = "mesh_z_up.labels.npz"
@@ -79,26 +79,19 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
     Raises:
         SceneRejected: a map does not fit the mesh.
     """
-    grey = np.full((len(mesh.vertices), 3), GREY[0], np.uint8)
     floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
     maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
-    licence = read_licence(source)
-    return RawScene(
-        name=source.root.resolve().name,
-        source_format=layout,
-        scan=ScanMesh(
-            mesh.vertices, mesh.faces, labels, None if mesh.texture is not None else grey, mesh.corner_uv, mesh.texture
-        ),
+    raw = source.scene(
+        layout,
+        scan_of(mesh, labels),
         cads=cads,
         annotations=annotations,
         floor_height_m=heights[0],
         given_map=maps[0],
-        licence=licence,
-        sources=dict(sorted(source.sha256.items())),
+        licence=read_licence(source),
         storeys=tuple(Storey(h, m) for h, m in zip(heights, maps, strict=True)) if len(heights) > 1 else (),
-        warnings=tuple(source.warnings),
-        attribution=read_attribution(source),
     )
+    return dataclasses.replace(raw, attribution=read_attribution(source))
 
 
 def _furnished(path: Path) -> bool:

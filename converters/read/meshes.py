@@ -21,12 +21,12 @@ from trimesh.visual import ColorVisuals
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
 from converters.read.files import SourceFolder, check_mesh, read_labels
-from converters.read.obj import GREY, TexturedMesh, join_meshes, read_scan_obj, read_texture, texels, use_found
+from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, read_texture, scan_of, texels, use_found
 from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_extent, floor_level, labelled, with_own_corners
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, check_count
-from converters.records.raw import RawScene, ScanMesh
+from converters.records.raw import RawScene
 from interactive_nav_common.records import Reader
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
@@ -177,20 +177,9 @@ def read_single_mesh(
         mesh = with_own_corners(mesh)
         labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
         source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
-    grey = np.full((len(mesh.vertices), 3), GREY[0], np.uint8) if mesh.texture is None else None
-    scan = ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture)
-    return RawScene(
-        name=path.stem,
-        source_format="mesh",
-        scan=scan,
-        cads={},
-        annotations=(),
-        floor_height_m=floor_m,
-        given_map=None,
-        licence="unknown: a mesh file says none",
-        sources=dict(sorted(source.sha256.items())),
-        warnings=tuple(source.warnings),
-    )
+    licence = "unknown: a mesh file says none"
+    raw = source.scene("mesh", scan_of(mesh, labels), floor_height_m=floor_m, licence=licence)
+    return dataclasses.replace(raw, name=path.stem)
 
 
 def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMesh:

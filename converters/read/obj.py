@@ -17,6 +17,7 @@ from converters.geometry.faces import stacked
 from converters.read.files import ObjMesh, SourceFolder, read_image, read_obj
 from converters.records.errors import SceneRejected
 from converters.records.limits import PIXELS
+from converters.records.raw import ScanMesh
 from converters.records.visual import TexturedMesh
 
 GREY = (170, 170, 170)
@@ -182,6 +183,12 @@ def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedM
         return TexturedMesh(mesh.vertices, mesh.faces, None, None)
     uv = mesh.corner_uv if mesh.corner_uv is not None else np.zeros((len(mesh.faces), 3, 2))
     return TexturedMesh(mesh.vertices, mesh.faces, *join_textures(uv, number, images))
+
+
+def scan_of(mesh: TexturedMesh, labels: np.ndarray) -> ScanMesh:
+    """A mesh with labels (n,) of its vertices; grey where it has no image."""
+    grey = np.full((len(mesh.vertices), 3), GREY, np.uint8) if mesh.texture is None else None
+    return ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture)
 
 
 def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:

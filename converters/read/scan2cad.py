@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -52,18 +53,9 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
     check_upright(f"{root / stem}.ply", vertices, faces, labels, None)
     cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
     annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, vertices, faces)
-    return RawScene(
-        name=scan_id,
-        source_format="scan2cad",
-        scan=ScanMesh(vertices, faces, labels, colours),
-        cads={a.cad_id: cads[a.cad_id] for a in annotations},
-        annotations=annotations,
-        floor_height_m=None,
-        given_map=None,
-        licence=LICENCE,
-        sources=dict(sorted(source.sha256.items())),
-        warnings=tuple(source.warnings),
-    )
+    scan, kept = ScanMesh(vertices, faces, labels, colours), {a.cad_id: cads[a.cad_id] for a in annotations}
+    raw = source.scene("scan2cad", scan, cads=kept, annotations=annotations, licence=LICENCE)
+    return dataclasses.replace(raw, name=scan_id)
 
 
 def _labels(path: Path) -> np.ndarray:

@@ -154,15 +154,15 @@ class RawScene:
     name: str = dataclasses.field(metadata=NOT_HASHED)
     source_format: str = dataclasses.field(metadata=NOT_HASHED)
     scan: ScanMesh
-    cads: dict[str, CadModel]
-    """By `cad_id`."""
-    annotations: tuple[Annotation, ...]
-    floor_height_m: float | None
-    """Of the scan frame, the lowest of several; None: the pipeline finds it from the floor labels."""
-    given_map: GivenMap | None
     licence: str = dataclasses.field(metadata=NOT_HASHED)
     sources: dict[str, str] = dataclasses.field(metadata=NOT_HASHED)
     """Path relative to the source folder -> sha256."""
+    cads: dict[str, CadModel] = dataclasses.field(default_factory=dict)
+    """By `cad_id`."""
+    annotations: tuple[Annotation, ...] = ()
+    floor_height_m: float | None = None
+    """Of the scan frame, the lowest of several; None: the pipeline finds it from the floor labels."""
+    given_map: GivenMap | None = None
     storeys: tuple[Storey, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """From the lowest up, where there are several; `converters.read.storeys.split_storeys` takes them apart."""
     picture: tuple[tuple[np.ndarray, np.ndarray], ...] = ()

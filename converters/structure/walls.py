@@ -24,18 +24,18 @@ def border_cells(traversable: np.ndarray) -> np.ndarray:
     return ndimage.binary_dilation(traversable, np.ones((3, 3))) & ~traversable
 
 
-def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> list[tuple[int, int, int, int]]:
+def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
     """Covers the needed cells with rectangles of allowed cells, the most useful first.
 
     Args:
         needed: (rows, columns) bool, every one of these ends up covered.
         allowed: (rows, columns) bool, contains `needed`; no rectangle leaves it.
 
-    Returns:
+    Yields:
         (row0, row1, column0, column1) half-open, none inside another.
     """
     assert not (needed & ~allowed).any()
-    left, rectangles = needed.copy(), []
+    left = needed.copy()
     # Candidates: each run of allowed cells along a row, grown in rows, and the other way round. Border runs are
     # straight, so these contain the long rectangles. As cells are covered, gains only fall and first cells only move
     # on: the least of the heap is the best candidate if its rank has not changed since.
@@ -57,9 +57,8 @@ def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> list[tuple[int,
         offer(ranked[2])
         if not heap or heap[0] != ranked:
             continue
-        rectangles.append(_shrink(needed, best))
+        yield _shrink(needed, best)
         left[r0:r1, c0:c1] = False
-    return rectangles
 
 
 def _runs(grid: np.ndarray, upright: int) -> Iterator[_Run]:

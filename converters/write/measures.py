@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import shapely
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import ConvexHull
@@ -21,6 +20,7 @@ from scipy.spatial import ConvexHull
 from converters.bodies.objects import PlacedObject, to_world
 from converters.geometry.density import ROBOTS, clearance_m, must_push_shares, regions
 from converters.geometry.faces import face_areas
+from converters.structure.maps import Grid
 from converters.write.emit import SceneParts
 from scenes_mjcf.schema import SceneMaps
 
@@ -34,20 +34,12 @@ LEAST_APART_M = 1.0
 def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = math.inf) -> np.ndarray:
     """[rows, columns] bool: cells of the map with their middle below a movable's hull that reaches below a height."""
     out = np.zeros_like(maps.traversable)
-    rows, columns = out.shape
-    step, (x, y) = maps.resolution_m, maps.origin_w
+    grid = Grid(0.0, maps.origin_w, out.shape, maps.resolution_m)
     for placed in objects:
         for hull in placed.hulls_b:
             points_w = to_world(placed, hull.vertices)
-            if points_w[:, 2].min() > height_m:
-                continue
-            outline = shapely.MultiPoint(points_w[:, :2]).convex_hull
-            x0, y0, x1, y1 = outline.bounds
-            # Of an object beside the map, no cells: an end below 0 would count from the map's other side.
-            xs = np.arange(max(int((x0 - x) / step), 0), min(int((x1 - x) / step) + 1, columns))
-            ys = np.arange(max(int((y0 - y) / step), 0), min(int((y1 - y) / step) + 1, rows))
-            grid = np.meshgrid(x + (xs + 0.5) * step, y + (ys + 0.5) * step)
-            out[np.ix_(ys, xs)] |= shapely.contains_xy(outline, *grid)
+            if points_w[:, 2].min() <= height_m:
+                grid.add_below(out, points_w, 0.0)
     return out
 
 

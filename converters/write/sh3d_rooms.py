@@ -62,7 +62,9 @@ def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall
                 own[slice(*rows), slice(*columns)] = True
             own &= ~taken
             taken |= own
-            for r0, r1, c0, c1 in cover_rectangles(own, own, disjoint=True):
+            while own.any():
+                r0, r1, c0, c1 = next(cover_rectangles(own, own))
+                own[r0:r1, c0:c1] = False
                 low, high = np.array([xs[c0], ys[r0]]), np.array([xs[c1], ys[r1]])
                 along = int(np.argmax(high - low))
                 ends = np.tile((low + high) / 2, (2, 1))

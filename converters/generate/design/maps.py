@@ -1,4 +1,4 @@
-"""A floor plan in, the two map images of the raw layout out, and clearances.
+"""A floor plan in, the two map images of the raw layout out.
 
 Both images show the STATIC structure only: walls and built-in cupboards that stand in the robot's height
 band; movable furniture and door leaves are in neither. 0.01 m a pixel, square, the image's centre is the
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from scipy import ndimage
 
 from converters.generate.design.plan import CM, Plan, Rect
 
@@ -63,8 +62,3 @@ def floor_maps(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
             obstacles[r0:r1, c0:c1][inside] = 0
             traversable[r0:r1, c0:c1][inside] = 0
     return obstacles, traversable
-
-
-def clearance(free: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Distance in metres from each free cell's centre to the nearest cell that is not free (0 there)."""
-    return np.asarray(ndimage.distance_transform_edt(free)) * resolution_m - resolution_m / 2 * free

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from scipy import ndimage
 
 from converters.generate.design.instance import Instance
-from converters.generate.design.maps import clearance, floor_maps
+from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, Rect
+from converters.geometry.density import clearance_m, regions
 
 GRID_M = 0.05
 
@@ -58,19 +58,12 @@ def room_mask(grid: np.ndarray, room: Rect) -> np.ndarray:
     return ((c > room.y0) & (c < room.y1))[:, None] & ((c > room.x0) & (c < room.x1))[None]
 
 
-def _regions(mask: np.ndarray) -> np.ndarray:
-    """Connected regions, numbered from 1; 0 where the mask is False."""
-    out = np.zeros(mask.shape, np.int32)
-    ndimage.label(mask, output=out)
-    return out
-
-
 def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float = 0.4) -> bool:
     """True where a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
-    regions = _regions(clearance(grid, GRID_M) >= radius_m)
-    if not regions.any():
+    region = regions(clearance_m(grid, GRID_M) >= radius_m)
+    if not region.any():
         return False
-    main = regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])
+    main = region == 1 + np.argmax(np.bincount(region.ravel())[1:])
     return all((main & room_mask(grid, r)).sum() * GRID_M**2 >= least_m2 for r in plan.rooms)
 
 
@@ -82,5 +75,5 @@ def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
         masks: two of (n, n) bool.
         width_m: the disc's diameter.
     """
-    regions = _regions(room_m >= width_m / 2)
-    return bool(set(np.unique(regions[masks[0]])) & set(np.unique(regions[masks[1]])) - {0})
+    region = regions(room_m >= width_m / 2)
+    return bool(set(np.unique(region[masks[0]])) & set(np.unique(region[masks[1]])) - {0})

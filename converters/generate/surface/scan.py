@@ -16,10 +16,10 @@ from scipy import ndimage
 
 from converters.generate.design.config import BuildingConfig
 from converters.generate.design.instance import Instance
-from converters.generate.design.maps import clearance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
+from converters.geometry.density import clearance_m
 from converters.geometry.faces import compacted, loose_parts, vertex_normals
 from converters.records.raw import FLOOR, WALL
 from scenes_mjcf.categories import TABLE
@@ -71,7 +71,7 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
 
 def camera_positions(plan: Plan, items: list[Instance], rng: np.random.Generator) -> np.ndarray:
     """(n, 3) places where the camera stood: two to four a room, at eye height, and one in each doorway."""
-    free = clearance(free_grid(plan, items), GRID_M)
+    free = clearance_m(free_grid(plan, items), GRID_M)
     centres = cell_centres(free)
     out = []
     for room in plan.rooms:

@@ -19,11 +19,11 @@ from converters.geometry.upright import find_up, turn_upright
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_licence
 from converters.read.homes.parts import category_of
-from converters.read.obj import GREY
+from converters.read.obj import TexturedMesh, scan_of
 from converters.read.storeys import label_storeys
 from converters.read.surfaces import floor_level
 from converters.records.errors import SceneRejected
-from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene, ScanMesh
+from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene
 from interactive_nav_common.errors import readable
 from interactive_nav_common.records import read_packaged
 
@@ -116,24 +116,11 @@ def _record(
         if unknown:
             more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
             source.note(f"classes that NYU40 has no name for, taken as otherprop: {', '.join(unknown[:8])}{more}")
-    grey = np.full((len(vertices), 3), GREY[0], np.uint8)
-    return RawScene(
-        name=root.name,
-        source_format=name,
-        scan=ScanMesh(
-            vertices,
-            faces,
-            labels,
-            grey if colours is None else np.clip(np.round(255 * colours), 0, 255).astype(np.uint8),
-        ),
-        cads={},
-        annotations=(),
-        floor_height_m=floor_m,
-        given_map=None,
-        licence=read_licence(source),
-        sources=dict(sorted(source.sha256.items())),
-        warnings=tuple(source.warnings),
-    )
+    scan = scan_of(TexturedMesh(vertices, faces, None, None), labels)
+    if colours is not None:
+        scan = dataclasses.replace(scan, vertex_colours=np.clip(np.round(255 * colours), 0, 255).astype(np.uint8))
+    licence = read_licence(source)
+    return dataclasses.replace(source.scene(name, scan, floor_height_m=floor_m, licence=licence), name=root.name)
 
 
 def label_of(name: str) -> int:

@@ -22,13 +22,13 @@ from converters.read.files import SourceFolder
 from converters.read.gibson import read_attribution, read_licence
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces
-from converters.read.obj import TexturedMesh, at_most, join_meshes
+from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of
 from converters.read.storeys import label_storeys, storey_of
 from converters.read.surfaces import floor_level, with_own_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
-from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, Storey
+from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScannedHinge, Storey
 from interactive_nav_common.records import read_packaged
 from scenes_mjcf.categories import CATEGORIES, Category
 
@@ -139,21 +139,17 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         if moving
     ]
     _tell(source, parts, moves, carried)
-    grey = np.full((len(mesh.vertices), 3), 170, np.uint8) if mesh.texture is None else None
-    return RawScene(
-        name=source.root.resolve().name,
-        source_format=layout,
-        scan=ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture),
+    licence, attribution = read_licence(source), read_attribution(source)
+    return source.scene(
+        layout,
+        scan_of(mesh, labels),
         cads={a.cad_id: c for a, c in pairs},
         annotations=tuple(a for a, _ in pairs),
         floor_height_m=floors_m[0],
-        given_map=None,
         storeys=tuple(Storey(z, None) for z in floors_m) if len(floors_m) > 1 else (),
-        licence=read_licence(source),
-        attribution=read_attribution(source),
+        licence=licence,
+        attribution=attribution,
         picture=tuple((shell.vertices, shell.faces) for shell in shells),
-        sources=dict(sorted(source.sha256.items())),
-        warnings=tuple(source.warnings),
     )
 
 
@@ -180,17 +176,10 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
     mesh = with_own_corners(join_meshes(*shells))
     whole = join_meshes(TexturedMesh(raw.scan.vertices, raw.scan.faces, raw.scan.corner_uv, texture), mesh)
     fresh = len(whole.vertices) - len(raw.scan.vertices)
+    labels = np.concatenate([raw.scan.labels, np.full(fresh, OTHER_STRUCTURE)])
     return dataclasses.replace(
         rest,
-        scan=dataclasses.replace(
-            raw.scan,
-            vertices=whole.vertices,
-            faces=whole.faces,
-            labels=np.concatenate([raw.scan.labels, np.full(fresh, OTHER_STRUCTURE)]),
-            vertex_colours=np.full((len(whole.vertices), 3), 170, np.uint8) if whole.texture is None else None,
-            corner_uv=whole.corner_uv,
-            texture=whole.texture,
-        ),
+        scan=dataclasses.replace(scan_of(whole, labels), furnished=raw.scan.furnished),
         picture=raw.picture + tuple((shell.vertices, shell.faces) for shell in shells),
     )
 

@@ -112,11 +112,11 @@ def test_a_full_disk_is_no_fault_of_the_model(tmp_path, monkeypatch):
     start = decompose._start
 
     def elsewhere(*arguments):
-        job = start(*arguments)
-        job.process.kill()
-        job.process.wait()
-        job.process.returncode = decompose.CANNOT_WRITE
-        return job
+        process = start(*arguments)
+        process.kill()
+        process.wait()
+        process.returncode = decompose.CANNOT_WRITE
+        return process
 
     monkeypatch.setattr(decompose, "_start", elsewhere)
     with pytest.raises(OSError, match="cannot be written"):
