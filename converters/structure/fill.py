@@ -183,16 +183,19 @@ class Shown:
         """Vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
         rearmost = ndimage.minimum_filter(self.depth_m, OVERLAP)
         rearmost = np.where(np.isfinite(rearmost), rearmost, 0.0) - BEHIND_M
-        wide = (_grown(hidden, OVERLAP) & self.seen) | _grown(hidden, FREE)
-        row, column = np.nonzero(wide)
-        outline = shapely.coverage_union_all(shapely.box(column, row, column + 1, row + 1))
-        outline = outline.simplify(1.0).segmentize(1.5 * OVERLAP)
-        triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
-        corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-        flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-        at = np.minimum(flat.astype(int), np.array(wide.shape[::-1]) - 1)
-        points = self.plane.lift(self.low + flat * self.cell_m)
-        return points + rearmost[at[:, 1], at[:, 0], None] * self.plane.normal, index.reshape(-1, 3)
+        pieces, count = label_pieces((_grown(hidden, OVERLAP) & self.seen) | _grown(hidden, FREE))
+        done = [(np.zeros((0, 3)), np.zeros((0, 3), np.int64))]
+        for k in range(1, count + 1):
+            cells = np.argwhere(pieces == k)[:, ::-1] * self.cell_m + self.low
+            outline = shapely.union_all(shapely.box(*cells.T, *(cells + self.cell_m).T), grid_size=1e-6)
+            outline = outline.simplify(self.cell_m).segmentize(1.5 * OVERLAP * self.cell_m)
+            triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
+            corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+            flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+            cell = np.clip(np.floor((flat - self.low) / self.cell_m).astype(int), 0, np.array(pieces.shape[::-1]) - 1)
+            points = self.plane.lift(flat) + rearmost[cell[:, 1], cell[:, 0], None] * self.plane.normal
+            done.append((points, index.reshape(-1, 3)))
+        return stacked(done)
 
 
 def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarray:
