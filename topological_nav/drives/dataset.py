@@ -29,7 +29,7 @@ from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
 from topological_nav.data.shards import read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
-from topological_nav.drives.fleet import Driven, Fleet, Tasks, make_env
+from topological_nav.drives.fleet import Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
 from topological_nav.errors import DatasetError, SpaceError
 from topological_nav.maps.nodes import place_nodes
@@ -282,12 +282,11 @@ def load_drives(folder: Path) -> Drives:
     return Drives(scene=plan["scene"], test=plan["test"], goal_w=plan["goal_w"], first=first, **joined)
 
 
-def _write_batch(path: Path, driven: Driven, count: int) -> None:
+def _write_batch(path: Path, driven: dict[str, np.ndarray], count: int) -> None:
     """Writes the first drives of a batch, without what came after their ends."""
-    on = np.arange(driven.pose_w.shape[1]) < driven.steps[:count, None]
-    arrays = {name: getattr(driven, name)[:count][on] for name in ("pose_w", "command", "touching", "gap_m")}
-    arrays |= {name: getattr(driven, name)[:count] for name in ("steps", "reached", "broken")}
-    write_arrays(path, **arrays)
+    on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:count, None]
+    rows = {name: values[:count] for name, values in driven.items()}
+    write_arrays(path, **{name: row[on] if row.shape[:2] == on.shape else row for name, row in rows.items()})
 
 
 def summary(drives: Drives) -> dict[str, float]:

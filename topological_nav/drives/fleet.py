@@ -44,26 +44,6 @@ class Tasks(Rows):
     """[B]."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Driven:
-    """What happened; B drives, T control steps. Rows after a drive's end mean nothing."""
-
-    pose_w: np.ndarray
-    """[B, T, 3] f32 x, y (m) and yaw at the beginning of each step."""
-    command: np.ndarray
-    """[B, T, 2] f32 m/s and rad/s, commanded in it."""
-    gap_m: np.ndarray
-    """[B, T] f32 that the expert expected to keep."""
-    touching: np.ndarray
-    """[B, T, 2] bool: furniture, a wall was touched in it."""
-    steps: np.ndarray
-    """[B] i32."""
-    reached: np.ndarray
-    """[B] bool: the last node was reached in time."""
-    broken: np.ndarray
-    """[B] bool: physics failed, or dropped contacts."""
-
-
 def make_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
     """The environment of the drives: furniture at rest, no small objects, the robot commanded by velocities.
 
@@ -111,12 +91,16 @@ class Fleet:
         self._half_m = jnp.asarray(size[:2], jnp.float32) / 2
         self._begin, self._segment = jax.jit(self._begun), jax.jit(self._driven)
 
-    def drive(self, tasks: Tasks, told: Callable[[int], None] = lambda _: None) -> Driven:
+    def drive(self, tasks: Tasks, told: Callable[[int], None] = lambda _: None) -> dict[str, np.ndarray]:
         """Drives until all have arrived or run out of time.
 
         Args:
             tasks: the batch.
             told: called now and then with the number of drives that have ended.
+
+        Returns:
+            Fields of `dataset.Drives`: those of control steps [B, T, ...], where rows after a drive's `steps` [B] mean
+            nothing; and `reached` and `broken` [B].
         """
         placed = jax.tree.map(jnp.asarray, dataclasses.asdict(tasks))
         carry, parts = self._begin(placed), []
@@ -127,9 +111,8 @@ class Fleet:
             told(ended)
             if ended == len(tasks):
                 break
-        pose, asked, gap, touching = (np.concatenate(column, 0).swapaxes(0, 1) for column in zip(*parts, strict=True))
-        outcome = (np.asarray(carry[name]) for name in ("steps", "reached", "broken"))
-        return Driven(pose, asked, gap, touching, *outcome)
+        outcome = {name: np.asarray(carry[name]) for name in ("steps", "reached", "broken")}
+        return {name: np.concatenate([part[name] for part in parts]).swapaxes(0, 1) for name in parts[0]} | outcome
 
     def _begun(self, tasks: dict[str, Any]) -> dict[str, Any]:
         count = len(tasks["scene"])
@@ -137,16 +120,8 @@ class Fleet:
         state = jax.vmap(self._env.reset_to)(start, jnp.zeros((count, 2), jnp.uint32))
         no = jnp.zeros(count, bool)
         zero = jnp.zeros(count, jnp.int32)
-        return {
-            "state": state,
-            "velocity": jnp.zeros((count, 2)),
-            "leg": zero,
-            "leg_steps": zero,
-            "steps": zero,
-            "ended": no,
-            "reached": no,
-            "broken": no,
-        }
+        counts = dict.fromkeys(("leg", "leg_steps", "steps"), zero) | dict.fromkeys(("ended", "reached", "broken"), no)
+        return {"state": state, "velocity": jnp.zeros((count, 2)), **counts}
 
     def _driven(self, terrain: Terrain, tasks: dict[str, Any], carry: dict[str, Any]):
         return jax.lax.scan(lambda c, _: self._step(terrain, tasks, c), carry, None, length=SEGMENT)
@@ -185,4 +160,4 @@ class Fleet:
             "reached": carry["reached"] | done,
             "broken": carry["broken"] | broken,
         }
-        return out, (pose, asked, gap, nav.touching)
+        return out, {"pose_w": pose, "command": asked, "gap_m": gap, "touching": nav.touching}

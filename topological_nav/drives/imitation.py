@@ -140,6 +140,21 @@ def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dic
     return params
 
 
+def _applied(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array):
+    """Logits of runs of embeddings [B, T + 1, D], and what makes of actions [B, T, classes] the next embeddings."""
+    x = standardised(u, scale)
+
+    def next_after(action: list[jax.Array]) -> Any:
+        given = (u[:, :-1], x[:, :-1], jnp.concatenate(action, -1), scale["deviation"])
+        return forward.apply({"params": params["forward"]}, *given)
+
+    return unrolled(policy, params["policy"], x[:, :-1]), next_after
+
+
+def _one_hot(policy: Policy, linear: jax.Array, angular: jax.Array) -> list[jax.Array]:
+    return [jax.nn.one_hot(linear, policy.linear_classes), jax.nn.one_hot(angular, policy.angular_classes)]
+
+
 @functools.cache
 def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: int, count: int) -> Epoch:
     """An epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`.
@@ -150,20 +165,10 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
     tx = optax.adam(learning_rate)
 
     def loss_of(params, scale, u, batch, weights):
-        x = standardised(u, scale)
-        logits = unrolled(policy, params["policy"], x[:, :-1])
         truth = (batch["linear"], batch["angular"])
-        sizes = (policy.linear_classes, policy.angular_classes)
-        expert = jnp.concatenate([jax.nn.one_hot(t, n) for t, n in zip(truth, sizes, strict=True)], -1)
-        own = jnp.concatenate([nn.softmax(value) for value in logits], -1)
-
-        def next_after(action) -> Any:
-            given = (u[:, :-1], x[:, :-1], action, scale["deviation"])
-            return forward.apply({"params": params["forward"]}, *given)
-
-        loss, parts = policy_loss(
-            logits, *truth, batch["valid"], next_after(expert), next_after(own), u[:, 1:], batch["followed"], **weights
-        )
+        logits, next_after = _applied(policy, forward, params, scale, u)
+        guesses = next_after(_one_hot(policy, *truth)), next_after([nn.softmax(value) for value in logits])
+        loss, parts = policy_loss(logits, *truth, batch["valid"], *guesses, u[:, 1:], batch["followed"], **weights)
         right = {
             f"{name}_accuracy": ((one.argmax(-1) == t) & batch["valid"]).sum() / batch["valid"].sum()
             for name, one, t in zip(("linear", "angular"), logits, truth, strict=True)
@@ -233,13 +238,9 @@ def _judge(policy: Policy, forward: Forward) -> Callable[..., tuple[jax.Array, .
 
     @jax.jit
     def judged(params, scale, u, linear, angular):
-        x = standardised(u, scale)
-        logits = unrolled(policy, params["policy"], x[:, :-1])
-        action = jnp.concatenate(
-            [jax.nn.one_hot(linear, policy.linear_classes), jax.nn.one_hot(angular, policy.angular_classes)], -1
-        )
-        predicted = forward.apply({"params": params["forward"]}, u[:, :-1], x[:, :-1], action, scale["deviation"])
-        errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in (predicted, u[:, :-1])]
+        logits, next_after = _applied(policy, forward, params, scale, u)
+        guesses = next_after(_one_hot(policy, linear, angular)), u[:, :-1]
+        errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in guesses]
         return *(value.argmax(-1) for value in logits), *errors
 
     return judged
@@ -259,13 +260,8 @@ def _scores(
     for first in range(0, len(held_out), config.batch):
         rows = np.minimum(np.arange(first, first + config.batch), len(held_out) - 1)
         part = held_out.take(rows)
-        told = judged(
-            learner.params,
-            learner.batch_stats,
-            jnp.asarray(features[part.rows], jnp.float32),
-            part.linear,
-            part.angular,
-        )
+        u = jnp.asarray(features[part.rows], jnp.float32)
+        told = judged(learner.params, learner.batch_stats, u, part.linear, part.angular)
         columns.append([np.asarray(c)[: len(held_out) - first] for c in told])
     linear, angular, predicted, still = (np.concatenate(c) for c in zip(*columns, strict=True))
     out: dict[str, Any] = {"steps": int(held_out.valid.sum())}

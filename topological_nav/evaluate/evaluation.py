@@ -98,9 +98,10 @@ class _Tally:
     def __init__(self, episodes: DrivenEpisodes, config: EvaluationConfig, dt_s: float):
         n = len(episodes)
         self._episodes, self._config, self._dt_s = episodes, config, dt_s
-        self._whole = {name: np.zeros(n, bool) for name in ("success", "arrived", "broken")}
-        self._numbers = {name: np.zeros(n) for name in ("goal_m", "path_m", "duration_s", "contact_s", "wall_s")}
-        self._counts = {name: np.zeros(n, int) for name in ("runs", "contact_runs", "localisations", "blocked", "lost")}
+        kinds = dict.fromkeys(("success", "arrived", "broken"), bool)
+        kinds |= dict.fromkeys(("goal_m", "path_m", "duration_s", "contact_s", "wall_s"), float)
+        kinds |= dict.fromkeys(("runs", "contact_runs", "localisations", "blocked", "lost"), int)
+        self._numbers = {name: np.zeros(n, kind) for name, kind in kinds.items()}
         self._tracks: list[list[np.ndarray]] = [[] for _ in range(n)]
         self._at = np.arange(n)
         """Episode of each row of the batch."""
@@ -114,29 +115,26 @@ class _Tally:
         if step % max(1, round(TRACK_S / self._dt_s)) == 0:
             self._track(np.flatnonzero(going), seen)
         ended = events.run_ended & going
-        self._count_runs(at[ended], at[ended & self._touched])
+        self._count_runs(ended)
         self._in_run = (self._in_run & ~ended) | events.run_started
         self._touched = self._touched & ~ended & ~events.run_started
         for name, flag in (("localisations", events.localised), ("blocked", events.blocked), ("lost", events.lost)):
-            self._counts[name][at[flag & going]] += 1
+            self._numbers[name][at[flag & going]] += 1
         near = ended & (goal_m < self._config.success_m)
         arrived, broken = events.arrived & going, seen.broken & going
         ends = near | arrived | broken | (events.timed_out & going)
-        rows = np.flatnonzero(ends)
-        for name, value in (("success", (near | arrived) & ~broken), ("arrived", arrived & ~near), ("broken", broken)):
-            self._whole[name][at[rows]] = value[rows]
-        for name, value in (("goal_m", goal_m), ("path_m", seen.path_m)):
-            self._numbers[name][at[rows]] = value[rows]
-        self._numbers["duration_s"][at[rows]] = step * self._dt_s
+        came = {"success": (near | arrived) & ~broken, "arrived": arrived & ~near, "broken": broken}
+        came |= {"goal_m": goal_m, "path_m": seen.path_m, "duration_s": np.full(len(at), step * self._dt_s)}
+        for name, value in came.items():
+            self._numbers[name][at[ends]] = value[ends]
         # A run that the end of its episode cuts short counts, as the whole run that it is scored as.
-        cut = rows[self._in_run[rows] & ~ended[rows] & ~events.run_started[rows]]
-        self._count_runs(at[cut], at[cut[self._touched[cut]]])
-        self._track(rows, seen)
+        self._count_runs(ends & self._in_run & ~ended & ~events.run_started)
+        self._track(np.flatnonzero(ends), seen)
         self.over |= ends
 
-    def _count_runs(self, ended: np.ndarray, touched: np.ndarray) -> None:
-        self._counts["runs"][ended] += 1
-        self._counts["contact_runs"][touched] += 1
+    def _count_runs(self, over: np.ndarray) -> None:
+        self._numbers["runs"][self._at[over]] += 1
+        self._numbers["contact_runs"][self._at[over & self._touched]] += 1
 
     def _track(self, rows: np.ndarray, seen: Seen) -> None:
         for row in rows:
@@ -156,32 +154,25 @@ class _Tally:
 
     def played(self) -> Played:
         """All of it."""
-        tracks = [np.array(track) for track in self._tracks]
-        return Played(**self._whole, **self._numbers, **self._counts, track_w=tracks)
+        return Played(**self._numbers, track_w=[np.array(track) for track in self._tracks])
 
 
 def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) -> dict[str, np.ndarray]:
     """A row's numbers, an array each; SPL, RC and AADC are means of them (see `scores`)."""
-    contact = played.contact_s > 0
+
+    def own(*names: str) -> dict[str, np.ndarray]:
+        return {name: getattr(played, name) for name in names}
+
     return {
         "success": played.success.astype(np.float64),
         "spl": np.asarray(path_efficiency(played.success, episodes.shortest_m, played.path_m), np.float64),
         "within": (played.goal_m < config.success_m).astype(np.float64),
         "arrived": played.arrived,
-        "contact": contact.astype(np.float64),
+        "contact": (played.contact_s > 0).astype(np.float64),
         "aadc_s": played.contact_runs * config.navigator.run_s,
-        "contact_s": played.contact_s,
-        "wall_s": played.wall_s,
-        "duration_s": played.duration_s,
-        "path_m": played.path_m,
+        **own("contact_s", "wall_s", "duration_s", "path_m"),
         "shortest_m": episodes.shortest_m,
-        "goal_m": played.goal_m,
-        "runs": played.runs,
-        "contact_runs": played.contact_runs,
-        "localisations": played.localisations,
-        "blocked": played.blocked,
-        "lost": played.lost,
-        "broken": played.broken,
+        **own("goal_m", "runs", "contact_runs", "localisations", "blocked", "lost", "broken"),
         "start_room": episodes.start_room,
         "goal_room": episodes.goal_room,
         "start_x_w": episodes.start_xy_w[:, 0],

@@ -159,11 +159,12 @@ class SimulatorNode:
             out = [name for name, least in listeners.items() if self._out[name].get_num_connections() < least]
             return out if self._in.get_num_connections() else [*out, topics.COMMAND]
 
-        _wait(lambda: not lacking(), stop, lambda: f"nobody joined {', '.join(lacking())}: is the navigator running?")
+        ready, told = lambda: not lacking(), lambda: f"nobody joined {', '.join(lacking())}: is the navigator running?"
+        _wait(self._news, ready, stop, told)
 
     def _wait_for_command(self, seen: int, stop: Asked) -> None:
-        come = _told(self._news, lambda: self._commands > seen or self._done)
-        _wait(come, stop, lambda: f"no command came on {topics.COMMAND}: has the navigator ended?", pause_s=0.0)
+        told = lambda: f"no command came on {topics.COMMAND}: has the navigator ended?"  # noqa: E731
+        _wait(self._news, lambda: self._commands > seen or self._done, stop, told)
 
     def _send_frames(self) -> None:
         upright = messages.yaw_quat(0.0)
@@ -308,16 +309,18 @@ class NavigatorNode:
 
     def _heading_at(self, time_s: float, stop: Asked) -> float | None:
         """The heading when a picture was taken; waits a little for one that is not older."""
-        told = _told(self._news, lambda: self._headings.newest_s >= time_s - 1e-6)
-        any_told = lambda: told() or math.isfinite(self._headings.newest_s)  # noqa: E731
-        if not _wait(any_told, stop, lambda: f"no heading came on {self._heading_topic}", pause_s=0.0):
-            return None
         with self._news:
+            self._news.wait_for(lambda: self._headings.newest_s >= time_s - 1e-6, 0.2)
+            any_told, lacking = (
+                lambda: math.isfinite(self._headings.newest_s),
+                f"no heading came on {self._heading_topic}",
+            )
+            if not _wait(self._news, any_told, stop, lambda: lacking):
+                return None
             return math.remainder(self._headings.at(time_s) + self._offset, math.tau)
 
     def _fov_deg(self, stop: Asked) -> float:
-        told = _told(self._news, lambda: self._lens is not None)
-        _wait(told, stop, lambda: f"no camera_info came on {topics.INFO}", pause_s=0.0)
+        _wait(self._news, lambda: self._lens is not None, stop, lambda: f"no camera_info came on {topics.INFO}")
         lens = self._lens
         return lens.fov_deg if isinstance(lens, Lens) else math.nan
 
@@ -344,23 +347,13 @@ class NavigatorNode:
                 self._tell(f"navigator: {topic}: {error}")
 
 
-def _told(news: threading.Condition, ready: Callable[[], bool]) -> Callable[[], bool]:
-    """Waits a little for news that make it ready."""
-
-    def told() -> bool:
-        with news:
-            return news.wait_for(ready, 0.2)
-
-    return told
-
-
-def _wait(ready: Callable[[], bool], stop: Asked, lacking: Callable[[], str], pause_s: float = 0.05) -> bool:
-    """Waits until it is ready (True) or a stop is asked for; an error after `_PATIENCE_S`."""
+def _wait(news: threading.Condition, ready: Callable[[], bool], stop: Asked, lacking: Callable[[], str]) -> bool:
+    """Waits until news make it ready (True) or a stop is asked for; an error after `_PATIENCE_S`."""
     until = time.monotonic() + _PATIENCE_S
-    while not ready():
-        if stop():
-            return False
-        if time.monotonic() > until:
-            raise RosError(f"waited {_PATIENCE_S:.0f} s: {lacking()}")
-        time.sleep(pause_s)
+    with news:
+        while not news.wait_for(ready, 0.05):
+            if stop():
+                return False
+            if time.monotonic() > until:
+                raise RosError(f"waited {_PATIENCE_S:.0f} s: {lacking()}")
     return True
