@@ -10,12 +10,12 @@ adds files; the same one finds its own and plays what is missing.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -24,10 +24,9 @@ import pyarrow as pa
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.rows import read_rows, write_parquet
 from interactive_nav_common.versions import versions
-from topological_nav.evaluate.contenders import Contender
 from topological_nav.evaluate.contest import Contest, ContestScene
-from topological_nav.evaluate.evaluation import columns, play
-from topological_nav.scenes.simulation import Simulator
+from topological_nav.evaluate.episodes import DrivenEpisodes
+from topological_nav.evaluate.evaluation import Played, columns, play
 
 CPU_BATCH = 8
 """Episodes played at a time on a CPU unless asked otherwise."""
@@ -52,22 +51,24 @@ def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Tell = 
     total = sum(len(scene.episodes) for scene, _, _ in plan)
     done = total - sum(map(len, missing))
     cpu = jax.default_backend() == "cpu"
-    for (scene, name, stem), numbers in zip(plan, missing, strict=True):
+    for (scene, name, _), numbers in zip(plan, missing, strict=True):
         if not len(numbers):
             continue
         contender, simulator = scene.contender(name)
         size = contest.config.batch or (CPU_BATCH if cpu else len(numbers))
         for first in range(0, len(numbers), size):
             rows = numbers[first : first + size]
-            told = functools.partial(_tell, tell, f"{scene.scene.name} {name}", done, total)
-            _play(scene, contest.out, name, stem, contender, simulator, rows, told)
+            what, before = f"{scene.scene.name} {name}", done
+
+            def told(over: int, _: float, what: str = what, before: int = before) -> None:
+                tell(what, min(before + over, total - 1), total)
+
+            episodes, began = scene.episodes.take(rows), time.perf_counter()
+            played = play(contender, simulator, episodes, contest.config, told)
+            _write(scene, name, simulator.env, episodes, played, time.perf_counter() - began)
             done += len(rows)
-            tell(f"{scene.scene.name} {name}", done, total)
+            tell(what, done, total)
     return pa.concat_tables([_rows(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan])
-
-
-def _tell(tell: Tell, what: str, before: int, total: int, over: int, _: float) -> None:
-    tell(what, min(before + over, total - 1), total)
 
 
 def _stem(scene: ContestScene, contender: str) -> str:
@@ -95,21 +96,8 @@ def _rows(out: Path, stem: str, count: int) -> pa.Table:
     return rows.take(first[number < count])
 
 
-def _play(
-    scene: ContestScene,
-    out: Path,
-    name: str,
-    stem: str,
-    contender: Contender,
-    simulator: Simulator,
-    rows: np.ndarray,
-    tell: Callable[[int, float], None],
-) -> None:
-    config = scene.contest.config
-    episodes = scene.episodes.take(rows)
-    began = time.perf_counter()
-    played = play(contender, simulator, episodes, config, tell)
-    here = versions()
+def _write(scene: ContestScene, name: str, env: Any, episodes: DrivenEpisodes, played: Played, wall_s: float) -> None:
+    config, out, here = scene.contest.config, scene.contest.out, versions()
     navigates = name in ("dense", "sparse")
     constants = {
         "contender": name,
@@ -118,17 +106,17 @@ def _play(
         "policy": scene.contest.policy if navigates else name,
         "scene": scene.scene.name,
         "split": scene.scene.split,
-        "robot": simulator.env.robot.name,
+        "robot": env.robot.name,
         "seed": config.seed,
-        "backend": simulator.env.backend,
+        "backend": env.backend,
         "device": here["device"]["kind"],
         "commit": here["commit"],
-        "wall_s": time.perf_counter() - began,
+        "wall_s": wall_s,
     }
-    table = {key: [value] * len(rows) for key, value in constants.items()}
+    table = {key: [value] * len(episodes) for key, value in constants.items()}
     table |= {"episode": episodes.number, **columns(episodes, played, config)}
-    file = f"{stem}-{rows[0]:04d}"
-    tracks = {str(n): np.asarray(t, np.float32) for n, t in zip(rows, played.track_w, strict=True)}
+    file = f"{_stem(scene, name)}-{episodes.number[0]:04d}"
+    tracks = {str(n): np.asarray(t, np.float32) for n, t in zip(episodes.number, played.track_w, strict=True)}
     write_arrays(out / "tracks" / f"{file}.npz", **tracks)
     # Rows last: an episode counts as played once its row is there.
     notes = {"asked": json.dumps(scene.asked(name)), "versions": json.dumps(here["packages"])}

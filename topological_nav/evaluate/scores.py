@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -37,6 +37,11 @@ OF_SUCCESSES = {"rc": "contact", "aadc_s": "aadc_s", "duration_s": "duration_s"}
 @dataclasses.dataclass(frozen=True)
 class Score(Estimate):
     """A mean over so many episodes, or scenes, and its 95 % interval; NaN where there is nothing to average."""
+
+    @classmethod
+    def over(cls, means: Iterable[float]) -> Score:
+        """Student's, see `estimate`."""
+        return cls(*dataclasses.astuple(estimate(means)))
 
     def __str__(self) -> str:
         if not self.runs:
@@ -70,7 +75,7 @@ def where(rows: pa.Table, **wanted: str) -> pa.Table:
 def over_scenes(rows: pa.Table, name: str) -> Score:
     """Mean over scenes of their scores; scenes without any (RC where nothing succeeded) are left out."""
     means = (score(where(rows, scene=scene), name).mean for scene in _in_order(rows, "scene"))
-    return Score(*dataclasses.astuple(estimate(m for m in means if not np.isnan(m))))
+    return Score.over(m for m in means if not np.isnan(m))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,12 +116,10 @@ class Difference:
 
     compared: str
     score: str
-    result: Estimate | Contrast
+    result: Score | Contrast
 
     def __str__(self) -> str:
-        if isinstance(self.result, Contrast):
-            return str(self.result)
-        return str(Score(*dataclasses.astuple(self.result)))
+        return str(self.result)
 
 
 def differences(rows: pa.Table) -> list[Difference]:
@@ -129,7 +132,7 @@ def differences(rows: pa.Table) -> list[Difference]:
             both = dense.join(sparse, EPISODE, join_type="inner", right_suffix="_sparse")
             both = both.append_column("gap", pc.subtract(both[name], both[f"{name}_sparse"]))
             gaps = both.group_by("scene").aggregate([("gap", "mean")])["gap_mean"]
-            found.append(Difference("dense minus sparse map", name, estimate(gaps.to_pylist())))
+            found.append(Difference("dense minus sparse map", name, Score.over(gaps.to_pylist())))
         for contender in contenders:
             mine = where(rows, contender=contender)
             sides = [

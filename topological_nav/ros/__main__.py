@@ -89,8 +89,7 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
         refuse_unused(arguments, options, "with --driver heading, only with --driver topological")
 
 
-def _journey(arguments: argparse.Namespace) -> Any:
-    from topological_nav.ros.pilot import Journey
+def _seeing(arguments: argparse.Namespace) -> Any:
     from topological_nav.weights.packaged import choose
 
     if arguments.map is None:
@@ -98,14 +97,7 @@ def _journey(arguments: argparse.Namespace) -> Any:
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
     if chosen.told:
         _tell(chosen.told)
-    return Journey(
-        arguments.map,
-        chosen.localiser,
-        chosen.detector,
-        tuple(arguments.goal),
-        arguments.goal_heading or 0.0,
-        chosen.policy,
-    )
+    return chosen
 
 
 def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
@@ -134,19 +126,20 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
 
 def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
     config = overridden(DRIVERS[arguments.driver](), arguments.settings)
-    journey = _journey(arguments) if arguments.driver == "topological" else None
+    seeing = _seeing(arguments) if arguments.driver == "topological" else None
     ros = debian.load()
     from topological_nav.ros import drivers
     from topological_nav.ros.nodes import NavigatorNode
 
     debian.need_master(ros)
     with _ended(ros):
-        if journey is None:
+        if seeing is None:
             driver: drivers.Driver = drivers.HeadingDriver(config)
         else:
             from topological_nav.ros.pilot import topological_driver
 
-            driver = topological_driver(journey, config)
+            goal = tuple(arguments.goal), arguments.goal_heading or 0.0
+            driver = topological_driver(arguments.map, seeing, *goal, config)
         node = NavigatorNode(ros, driver, arguments.heading_from, arguments.heading_offset, _tell)
         done = node.run(lambda: bool(stops))
         _tell(f"navigator: {'done' if done else 'stopped'}")

@@ -25,6 +25,12 @@ class Command:
     done: bool = False
     """The episode is over: the robot stands, and no more is asked."""
 
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.linear_mps + self.angular_radps):
+            raise UserError(
+                f"the driver commands {self.linear_mps} m/s and {self.angular_radps} rad/s, expected finite numbers"
+            )
+
 
 class Driver(Protocol):
     """Drives one episode; called once for each picture that arrives."""
@@ -86,12 +92,3 @@ class PilotDriver:
         linear, angular, events = self._pilot.step(image[None], np.array([heading_rad]), np.array([time_s]))
         done = bool(events.arrived[0]) or bool(events.timed_out[0])
         return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))
-
-
-def checked(command: Command) -> Command:
-    """The command, or an error if it is not finite."""
-    if not (math.isfinite(command.linear_mps) and math.isfinite(command.angular_radps)):
-        raise UserError(
-            f"the driver commands {command.linear_mps} m/s and {command.angular_radps} rad/s, expected finite numbers"
-        )
-    return command

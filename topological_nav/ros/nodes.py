@@ -15,7 +15,7 @@ import numpy as np
 from interactive_nav.sensing.base import Lens
 from topological_nav.ros import messages, topics
 from topological_nav.ros.debian import RosError
-from topological_nav.ros.drivers import Command, Driver, checked
+from topological_nav.ros.drivers import Command, Driver
 
 if TYPE_CHECKING:
     from topological_nav.ros.simulator import RosSimulator, Sensed
@@ -280,7 +280,7 @@ class NavigatorNode:
                 image = messages.image_array(message)
                 if self._driver.lens is not None:
                     image = messages.seen_through(image, self._fov_deg(stop), self._driver.lens)
-                command = checked(self._driver.step(image, heading, time_s))
+                command = self._driver.step(image, heading, time_s)
                 self._send(command)
                 if time_s - told_s >= 10.0:
                     told_s = time_s
@@ -311,11 +311,8 @@ class NavigatorNode:
         """The heading when a picture was taken; waits a little for one that is not older."""
         with self._news:
             self._news.wait_for(lambda: self._headings.newest_s >= time_s - 1e-6, 0.2)
-            any_told, lacking = (
-                lambda: math.isfinite(self._headings.newest_s),
-                f"no heading came on {self._heading_topic}",
-            )
-            if not _wait(self._news, any_told, stop, lambda: lacking):
+            told = f"no heading came on {self._heading_topic}"
+            if not _wait(self._news, lambda: math.isfinite(self._headings.newest_s), stop, lambda: told):
                 return None
             return math.remainder(self._headings.at(time_s) + self._offset, math.tau)
 

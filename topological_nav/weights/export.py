@@ -22,8 +22,10 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import flax.serialization
+import flax.traverse_util
 import jax
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
@@ -35,7 +37,6 @@ from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.errors import MapError, RunError
-from topological_nav.learn.localise import nearest_node
 from topological_nav.learn.pairs import SAME, camera_of, load_pair
 from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
 from topological_nav.learn.training import Trained, load_trained
@@ -174,18 +175,15 @@ def half(variables: Any) -> Any:
         RunError: a number is too large for it.
     """
 
-    def halved(path: Any, leaf: Any) -> np.ndarray:
+    tree = flax.serialization.to_state_dict(jax.device_get(variables))
+    flat: dict[str, Any] = flax.traverse_util.flatten_dict(tree, sep="/")
+    for name, leaf in flat.items():
         value = np.asarray(leaf)
-        if value.ndim < 2:
-            return value
         with np.errstate(over="ignore"):
-            small = value.astype(np.float16)
-        if not np.isfinite(small).all():
-            where = "/".join(str(getattr(key, "key", key)) for key in path)
-            raise RunError(f"{where} holds {np.abs(value).max():.3g}, more than {PRECISION} can; train again")
-        return small
-
-    return jax.tree_util.tree_map_with_path(halved, flax.serialization.to_state_dict(jax.device_get(variables)))
+            flat[name] = value.astype(np.float16) if value.ndim > 1 else value
+        if not np.isfinite(flat[name]).all():
+            raise RunError(f"{name} holds {np.abs(value).max():.3g}, more than {PRECISION} can; train again")
+    return flax.traverse_util.unflatten_dict(flat, sep="/")
 
 
 def compare(
@@ -221,15 +219,12 @@ def compare(
     }
     apart = np.zeros(len(flat))
     if places > 1:
-        grouped = before[0].reshape(places, around, -1)
-        found = np.zeros((2, len(flat)), int)
-        for place in range(places):
-            rows = slice(place * around, (place + 1) * around)
-            others = np.delete(grouped, place, 0)
-            for i, queries in enumerate((before[0], after[0])):
-                found[i, rows], gap = nearest_node(queries[rows], others)
-                apart[rows] = gap if i == 0 else apart[rows]
-        scores["same_nearest_place"] = float((found[0] == found[1]).mean())
+        place, own = np.arange(len(flat)) // around, before[0].astype(float)
+        far = [
+            cdist(one, own) + np.where(place[:, None] == place, np.inf, 0.0) for one in (own, after[0].astype(float))
+        ]
+        apart = far[0].min(1)
+        scores["same_nearest_place"] = float((place[far[0].argmin(1)] == place[far[1].argmin(1)]).mean())
         scores["mean_distance_to_nearest_place"] = float(apart.mean())
     if driver is not None and exported_driver is not None:
         said = [np.array(list(_driven(one, images))) for one in (driver, exported_driver)]

@@ -11,8 +11,13 @@ from topological_nav.config import NavigatorConfig
 from topological_nav.data.dataset import load_rooms
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
-from topological_nav.ros.__main__ import main
-from topological_nav.ros.pilot import Journey, topological_driver
+from topological_nav.ros.__main__ import _seeing, main, parser
+from topological_nav.ros.pilot import topological_driver
+from topological_nav.weights.packaged import choose
+
+
+def seeing(made):
+    return choose(made.rooms, made.passages, "passage")
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +31,7 @@ def goal(made, tmp_path_factory):
 
 
 def test_the_goal_is_the_node_that_looks_like_its_picture(made, goal):
-    journey = Journey(made.map, made.rooms, made.passages, (goal[0],))
-    driver = topological_driver(journey, NavigatorConfig(match="aligned"))
+    driver = topological_driver(made.map, seeing(made), (goal[0],), 0.0, NavigatorConfig(match="aligned"))
     read, trained = load_map(made.map), load_trained(made.rooms)
     away = np.linalg.norm(read.embeddings[:, 0] - trained.embed(goal[1][None])[0], axis=-1)
     assert driver._pilot.state.goal.tolist() == [int(away.argmin())]  # type: ignore[attr-defined]
@@ -39,26 +43,22 @@ def test_the_goal_is_the_node_that_looks_like_its_picture(made, goal):
 
 
 def test_out_of_time_it_is_done(made, goal):
-    driver = topological_driver(Journey(made.map, made.rooms, made.passages, (goal[0],)), NavigatorConfig(limit_s=1.0))
+    driver = topological_driver(made.map, seeing(made), (goal[0],), 0.0, NavigatorConfig(limit_s=1.0))
     assert not driver.step(goal[1], 0.5, 10.0).done
     assert driver.step(goal[1], 0.5, 11.0).done
 
 
-def test_a_journey_is_read_from_words(made, goal):
-    journey = Journey(made.map, made.rooms, made.passages, (goal[0], goal[0]), 0.5)
-    from topological_nav.ros.__main__ import _journey, parser
-
-    words = ["--goal", str(goal[0])] * 2 + ["--goal-heading", "0.5", "--map", str(made.map), "--policy", journey.policy]
-    words += ["--localiser", str(made.rooms), "--detector", str(made.passages)]
-    assert _journey(parser().parse_args(["navigator", "--driver", "topological", *words])) == journey
+def test_networks_are_read_from_words(made):
+    words = ["--map", str(made.map), "--localiser", str(made.rooms), "--detector", str(made.passages)]
+    chosen = _seeing(parser().parse_args(["navigator", "--driver", "topological", *words, "--policy", "passage"]))
+    assert (chosen.localiser, chosen.detector, chosen.policy) == (made.rooms, made.passages, "passage")
 
 
 def test_what_is_missing_is_told(made, tmp_path, capsys):
     with pytest.raises(ConfigError, match="no goal; name a picture"):
-        topological_driver(Journey(made.map, made.rooms, made.passages, ()), NavigatorConfig())
+        topological_driver(made.map, seeing(made), (), 0.0, NavigatorConfig())
     (tmp_path / "goal.png").write_text("no")
     with pytest.raises(ConfigError, match="is no picture that can be read"):
-        journey = Journey(made.map, made.rooms, made.passages, (tmp_path / "goal.png",))
-        topological_driver(journey, NavigatorConfig())
+        topological_driver(made.map, seeing(made), (tmp_path / "goal.png",), 0.0, NavigatorConfig())
     assert main(["navigator", "--driver", "topological"]) == 2
     assert "needs a map: --map PATH" in capsys.readouterr().err

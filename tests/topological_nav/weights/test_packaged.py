@@ -22,7 +22,7 @@ from topological_nav.learn.pairs import camera_of
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.ros.__main__ import _journey
+from topological_nav.ros.__main__ import _seeing
 from topological_nav.ros.__main__ import parser as ros_parser
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
@@ -184,9 +184,9 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
 def test_the_robots_navigator_uses_the_package_too(made, exported, here, capsys):
     shutil.copytree(exported, here)
     words = ["navigator", "--driver", "topological", "--map", str(made.map)]
-    journey = _journey(ros_parser().parse_args(words))
-    assert (journey.localiser, journey.detector) == (here / "rooms", here / "passages")
-    assert journey.policy == str(here / "policy") and "of the package" in capsys.readouterr().err
+    chosen = _seeing(ros_parser().parse_args(words))
+    assert (chosen.localiser, chosen.detector) == (here / "rooms", here / "passages")
+    assert chosen.policy == str(here / "policy") and "of the package" in capsys.readouterr().err
 
 
 needs_weights = pytest.mark.skipif(
