@@ -160,21 +160,16 @@ def make_dataset(
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
     """Yields each file of a scene and the camera poses of its sheets."""
-    around, pitches = headings(config), np.asarray(config.pitches_rad)
-    for first in range(0, len(plan.xy_w), config.shard):
-        poses = []
-        for xy in plan.xy_w[first : first + config.shard]:
-            pitch, heading = np.meshgrid(pitches, around, indexing="ij")
-            poses.append(camera_pose(robot, xy, heading.ravel(), pitch.ravel()))
-        yield folder / f"rooms-{first // config.shard:03d}.npz", poses
-    each = 3 * config.headings
-    rows = np.arange(len(plan.passages))
-    for i, first in enumerate(range(0, len(rows), each * config.shard)):
-        poses = []
-        for begin in range(first, min(first + each * config.shard, len(rows)), each):
-            at = rows[begin : begin + each]
-            poses.append(camera_pose(robot, plan.passages.xy_w[at], plan.passages.heading_rad[at], np.zeros(len(at))))
-        yield folder / f"passages-{i:03d}.npz", poses
+    pitch, heading = (a.ravel() for a in np.meshgrid(config.pitches_rad, headings(config), indexing="ij"))
+    passages, each, level = plan.passages, len(pitch), np.zeros(len(pitch))
+    rows = [np.arange(first, min(first + each, len(passages))) for first in range(0, len(passages), each)]
+    sheets = {
+        "rooms": [camera_pose(robot, xy, heading, pitch) for xy in plan.xy_w],
+        "passages": [camera_pose(robot, passages.xy_w[r], passages.heading_rad[r], level[: len(r)]) for r in rows],
+    }
+    for kind, poses in sheets.items():
+        for i, first in enumerate(range(0, len(poses), config.shard)):
+            yield folder / f"{kind}-{i:03d}.npz", poses[first : first + config.shard]
 
 
 def load_rooms(folder: Path) -> RoomImages:

@@ -188,15 +188,13 @@ def simulate_drives(
             mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
             if not path.is_file():
                 fleet = fleet or Fleet(make_env(scene_folders, config), plan.terrain, config)
+
+                def told(ended: int, mine: np.ndarray = mine) -> None:
+                    progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
+
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(np.arange(i * config.batch, (i + 1) * config.batch), total - 1)
-                before, most = int(mine[0]), len(mine) - 1  # the padding's ends are no news
-
-                def told(ended: int, before: int = before, most: int = most) -> None:
-                    progress("drives", before + min(ended, most), total)
-
-                driven = fleet.drive(plan.tasks.take(rows), told)
-                _write_batch(path, driven, len(mine))
+                _write_batch(path, fleet.drive(plan.tasks.take(rows), told), len(mine))
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
 

@@ -23,7 +23,7 @@ from topological_nav.scenes.simulation import episode_starts
 SEGMENT = 25
 """Control steps a program; between two of them the host looks whether any drive still goes on."""
 LIDAR_B = {"ttbot": (0.17, 0.0, 0.36)}
-"""Scanners by robot, m, as `interactive_nav/robots/mjcf` has them."""
+"""Scanners by robot, m in the base's frame, as `interactive_nav/robots/mjcf` has them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -75,10 +75,7 @@ def make_sequences(
         for start in window_starts(steps, window, min(overlap, window - 1)):
             rows.append(begin + start + np.arange(window + 1))
             ends.append(begin + steps)
-    if not rows:
-        none = np.zeros((0, window), bool)
-        return Sequences(np.zeros((0, window + 1), np.int32), none, none, none.astype(np.int32), none.astype(np.int32))
-    at, end = np.stack(rows), np.asarray(ends)[:, None]
+    at, end = np.array(rows, int).reshape(-1, window + 1), np.array(ends, int)[:, None]
     capped = np.minimum(at, end - 1).astype(np.int32)
     asked = drives.command[capped[:, :-1]]
     return Sequences(

@@ -107,14 +107,9 @@ class ContestScene:
     @functools.cached_property
     def simulator(self) -> Simulator:
         """Of the navigator."""
-        return self._simulator(None)
+        return self._simulator()
 
-    @functools.cached_property
-    def expert_simulator(self) -> Simulator:
-        """Of the expert, which plans for half of the robot's width: doorways are narrower than its diagonal."""
-        return self._simulator(self.robot.body_width_m / 2)
-
-    def _simulator(self, radius_m: float | None) -> Simulator:
+    def _simulator(self, radius_m: float | None = None) -> Simulator:
         config = self.contest.config
         return Simulator(make_env(self.scene, self.contest.robot, config.backend, radius_m, config.objects))
 
@@ -167,7 +162,9 @@ class ContestScene:
         """Who plays, and in what."""
         config = self.contest.config
         if name == "expert":
-            return expert(self.expert_simulator, config.navigator), self.expert_simulator
+            # It plans for half of the robot's width: doorways are narrower than its diagonal.
+            simulator = self._simulator(self.robot.body_width_m / 2)
+            return expert(simulator, config.navigator), simulator
         if name == "ppo":
             assert self.contest.ppo is not None
             simulator, policy = _learned(self.contest.ppo, self.scene, config)

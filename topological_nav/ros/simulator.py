@@ -20,13 +20,13 @@ from interactive_nav.pictures.camera import Camera
 from interactive_nav.sensing.base import Lens
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
+from topological_nav.drives.fleet import LIDAR_B
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.scenes.rendering import need_engine, shrink
 from topological_nav.scenes.space import free_space
 
 ROBOT = "ttbot"
-LIDAR_POS_M = (0.17, 0.0, 0.36)
-"""In the base's frame: TTbot's site `lidar`."""
+LIDAR_POS_M = LIDAR_B[ROBOT]
 _FOREVER = 10**9
 
 

@@ -75,7 +75,7 @@ def choose(
         own = localiser or RUNS / "rooms", detector or RUNS / "passages"
         return Choice(*own, policy or PASSAGE_POLICY, (RUNS / "maps",), False, "")
     packaged = packaged_weights()
-    place = next((p for p in (RUNS, packaged) if all(_finished(p / task) for task in missing)), None)
+    place = next((p for p in (RUNS, packaged) if all((p / task / DESCRIPTION).is_file() for task in missing)), None)
     if place is None:
         what = " and ".join(missing)
         options = " or ".join({"rooms": "--localiser RUN", "passages": "--detector RUN"}[task] for task in missing)
@@ -86,7 +86,7 @@ def choose(
     found = {task: given[task] or place / task for task in given}
     if policy is None:
         policy = PASSAGE_POLICY
-        if not any(given.values()) and _finished(place / "policy"):
+        if not any(given.values()) and (place / "policy" / DESCRIPTION).is_file():
             policy = str(place / "policy")
     if place == RUNS:
         said = f"networks: {' and '.join(str(found[task]) for task in missing)}"
@@ -119,10 +119,6 @@ def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
             if [made.about.get(name) for name in ("localiser", "detector")] == networks:
                 return path
     return None
-
-
-def _finished(run: Path) -> bool:
-    return (run / DESCRIPTION).is_file()
 
 
 def _origin(folder: Path) -> str:
