@@ -51,16 +51,6 @@ LIMIT_M = 8.0
 
 
 @dataclasses.dataclass(frozen=True)
-class DrivePlan:
-    """All drives of a folder, scene by scene."""
-
-    tasks: Tasks
-    test: np.ndarray
-    """[n] bool."""
-    terrain: Terrain
-
-
-@dataclasses.dataclass(frozen=True)
 class Drives:
     """What the expert did: n drives, F control steps in all, drive after drive."""
 
@@ -109,12 +99,15 @@ class Drives:
         return self.reached & ~self.broken & ~self.touched
 
 
-def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
+def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np.ndarray, Terrain]:
     """Decides on all drives.
 
     Args:
         scenes: with different names.
         config: of the drives.
+
+    Returns:
+        The n drives, scene by scene, [n] bool which of them are for testing, and what the expert knows of the scenes.
 
     Raises:
         SpaceError: a scene in which no two nodes are joined.
@@ -138,7 +131,7 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> DrivePlan:
         tests.append(routes.test)
         spaces.append(space)
         fields.append(field)
-    return DrivePlan(Tasks.joined(parts), np.concatenate(tests), _terrain(spaces, fields))
+    return Tasks.joined(parts), np.concatenate(tests), _terrain(spaces, fields)
 
 
 def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terrain:
@@ -181,20 +174,20 @@ def simulate_drives(
         if all(path.is_file() for path in (*files, out / "plan.npz")):
             progress("drives", total, total)
             return load_drives(out)
-        plan = plan_drives(scenes, config)
-        write_arrays(out / "plan.npz", scene=plan.tasks.scene, test=plan.test, goal_w=plan.tasks.goals_w[:, -1])
+        tasks, test, terrain = plan_drives(scenes, config)
+        write_arrays(out / "plan.npz", scene=tasks.scene, test=test, goal_w=tasks.goals_w[:, -1])
         fleet: Fleet | None = None
         for i, path in enumerate(files):
             mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
             if not path.is_file():
-                fleet = fleet or Fleet(make_env(scene_folders, config), plan.terrain, config)
+                fleet = fleet or Fleet(make_env(scene_folders, config), terrain, config)
 
                 def told(ended: int, mine: np.ndarray = mine) -> None:
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(np.arange(i * config.batch, (i + 1) * config.batch), total - 1)
-                _write_batch(path, fleet.drive(plan.tasks.take(rows), told), len(mine))
+                _write_batch(path, fleet.drive(tasks.take(rows), told), len(mine))
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
 

@@ -17,6 +17,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 from typing import Any
@@ -68,8 +69,6 @@ class Compared:
 class Exported:
     """What was written."""
 
-    about: dict[str, Any]
-    """Content of export.json."""
     sizes: dict[str, int]
     """Part -> bytes."""
     compared: Compared
@@ -141,17 +140,16 @@ def export(
         if sum(sizes.values()) > config.limit_mib * 2**20:
             raise RunError(f"{out}: {size_lines(sizes, config.limit_mib)}")
     progress("comparing", total, total)
-    return Exported(about, sizes, compared)
+    return Exported(sizes, compared)
 
 
 def sizes_of(folder: Path) -> dict[str, int]:
     """Bytes of an export by what they are for: weights of each network, maps, descriptions."""
-    sizes: dict[str, int] = {}
+    sizes: Counter[str] = Counter()
     for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
         part = path.relative_to(folder).parts[0]
-        what = part if path.name == PACKED_WEIGHTS or part == "maps" else "descriptions"
-        sizes[what] = sizes.get(what, 0) + path.stat().st_size
-    return sizes
+        sizes[part if path.name == PACKED_WEIGHTS or part == "maps" else "descriptions"] += path.stat().st_size
+    return dict(sizes)
 
 
 def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
@@ -234,7 +232,7 @@ def compare(
 
 
 def level_images(
-    source: Path, networks: tuple[Trained, Trained], places: int, progress: Progress = lambda *_: None, seed: int = 0
+    source: Path, networks: tuple[Trained, Trained], places: int, progress: Progress = lambda *_: None
 ) -> np.ndarray:
     """[P, K, H, W, 3] u8: level images around places of a dataset, or of a scene, which is drawn.
 
@@ -243,7 +241,6 @@ def level_images(
         networks: localiser and detector: a scene is drawn as they learned to see.
         places: at most so many, of a dataset evenly from all.
         progress: told what is drawn, images done and in all; may raise to stop.
-        seed: of the places in a scene.
 
     Raises:
         TopologicalError, SceneError: the source cannot be used.
@@ -258,7 +255,7 @@ def level_images(
         )
     data, scene = camera_of(*networks), load_scene(source)
     robot = get_robot(data.robot)
-    xy = free_space(scene, robot.height_m).sample(np.random.default_rng([seed, 19]), places, data.clearance_m)
+    xy = free_space(scene, robot.height_m).sample(np.random.default_rng([0, 19]), places, data.clearance_m)
     return Pictures(scene, data, robot, progress).draw_around(xy, headings(data), scene.name)
 
 
