@@ -155,11 +155,10 @@ def outline(half_m: jax.Array) -> jax.Array:
 
 
 def moved(pose: jax.Array, by: jax.Array) -> jax.Array:
-    """[..., 3] poses given in the frames of poses [..., 3], in those poses' own frame of reference."""
-    cos, sin = jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2])
+    """[..., 3] poses given in the frame of a pose [3], in that pose's own frame of reference."""
+    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y = by[..., 0], by[..., 1]
-    at = pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y, pose[..., 2] + by[..., 2]
-    return jnp.stack(at, -1)
+    return jnp.stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, pose[2] + by[..., 2]], -1)
 
 
 def command(
@@ -193,8 +192,11 @@ def command(
     ways_w = moved(pose_w, ways_b)
     origin, resolution = terrain.origin_w[scene], terrain.resolution_m[scene]
     seen = scan_gap(ways_b, points_b, half_m)
-    rim = moved(ways_w[..., None, :], jnp.pad(outline(half_m), ((0, 0), (0, 1))))[..., :2]
-    known = sample(terrain.clearance_m[scene], origin, resolution, rim).min(-1)
+    rim = outline(half_m)[None, None]
+    cos, sin = jnp.cos(ways_w[..., 2])[..., None], jnp.sin(ways_w[..., 2])[..., None]
+    x = ways_w[..., :1] + cos * rim[..., 0] - sin * rim[..., 1]
+    y = ways_w[..., 1:2] + sin * rim[..., 0] + cos * rim[..., 1]
+    known = sample(terrain.clearance_m[scene], origin, resolution, jnp.stack([x, y], -1)).min(-1)
     gap = jnp.minimum(seen, known).min(-1)
     left, end = _left(terrain.to_go_m[goal], origin, resolution, ways_w, linear, config)
     heading = _fall(terrain.to_go_m[goal], origin, resolution, end[:, :2])

@@ -37,11 +37,15 @@ class RosError(UserError):
 def load() -> types.SimpleNamespace:
     """The modules of ROS by their first names, messages as `std_msgs.Bool` and so on.
 
+    Where the master is on loopback, this process and its children stay there too, unless ROS_IP or ROS_HOSTNAME is set.
+
     Raises:
         RosError: a package is missing.
     """
     if importlib.util.find_spec("rospy") is None and str(DIST_PACKAGES) not in sys.path:
         sys.path.append(str(DIST_PACKAGES))
+    if urlsplit(_master()).hostname in ("localhost", "127.0.0.1", "::1") and "ROS_HOSTNAME" not in os.environ:
+        os.environ.setdefault("ROS_IP", "127.0.0.1")
     found: dict[str, Any] = {}
     for name in _MODULES:
         try:
@@ -55,9 +59,10 @@ def load() -> types.SimpleNamespace:
 
 
 def need_master(ros: Any) -> None:
-    """Raises RosError unless a master is there; where it is on loopback, this process's node stays there too."""
-    uri = os.environ.get("ROS_MASTER_URI") or "http://localhost:11311"
-    if urlsplit(uri).hostname in ("localhost", "127.0.0.1", "::1") and "ROS_HOSTNAME" not in os.environ:
-        os.environ.setdefault("ROS_IP", "127.0.0.1")
+    """Raises RosError unless a master is there."""
     if not ros.rosgraph.is_master_online():
-        raise RosError(f"no master answers at {uri}; start one (roscore), or set ROS_MASTER_URI")
+        raise RosError(f"no master answers at {_master()}; start one (roscore), or set ROS_MASTER_URI")
+
+
+def _master() -> str:
+    return os.environ.get("ROS_MASTER_URI") or "http://localhost:11311"
