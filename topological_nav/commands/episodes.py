@@ -135,5 +135,5 @@ def evaluate(arguments: argparse.Namespace) -> None:
     write_text(contest.out / "summary.md", markdown(lines, compared))
     Console(width=None if sys.stdout.isatty() else 160).print(console_table(lines))
     for difference in compared:
-        print(f"{difference.compared}, {difference.score}: {difference}")
+        print(f"{difference.compared}, {difference.score}: {difference.result}")
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
+from topological_nav.drives.frames import embedded
 from topological_nav.drives.imitation import fresh_params
 from topological_nav.drives.policy import Forward, Policy, standardised
 from topological_nav.errors import RunError
@@ -63,11 +64,7 @@ class TrainedPolicy:
         return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
 
     def _stepped(self, weights, state, images):
-        parts = [
-            network.network.apply(variables, images, method="embed")
-            for network, variables in zip(self._networks, weights["embedders"], strict=True)
-        ]
-        x = standardised(jnp.concatenate(parts, -1), weights["policy"]["scale"])  # type: ignore[arg-type]
+        x = standardised(embedded(self._networks, weights["embedders"], images), weights["policy"]["scale"])
         state, logits = self._policy.apply({"params": weights["policy"]["params"]}, state, x)  # type: ignore[misc]
         return state, tuple(one.argmax(-1) for one in logits)
 

@@ -92,16 +92,18 @@ def embed_drives(
     return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
 
 
+def embedded(networks: Sequence[Trained], weights: Any, images: jax.Array) -> jax.Array:
+    """[N, D] embeddings of images [N, H, W, 3] by all networks, one network after the other."""
+    pairs = zip(networks, weights, strict=True)
+    return jnp.concatenate([network.network.apply(w, images, method="embed") for network, w in pairs], -1)  # type: ignore[arg-type]
+
+
 def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
     """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
-    modules, weights = [network.network for network in networks], [network.variables for network in networks]
 
     @jax.jit
-    def embedded(weights: Any, images: jax.Array) -> jax.Array:
-        sides = []
-        for shown in (images, images[:, :, ::-1]) if mirror else (images,):
-            parts = [m.apply(w, shown, method="embed") for m, w in zip(modules, weights, strict=True)]
-            sides.append(jnp.concatenate(parts, -1))  # type: ignore[arg-type]
-        return jnp.stack(sides, 1).astype(jnp.float16)
+    def sides(weights: Any, images: jax.Array) -> jax.Array:
+        shown = (images, images[:, :, ::-1]) if mirror else (images,)
+        return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
 
-    return functools.partial(embedded, weights)
+    return functools.partial(sides, [network.variables for network in networks])

@@ -60,24 +60,23 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
     column, row = space.cells(places).T
     part, room = parts[row, column], rooms.of(places)
     rng = np.random.default_rng([config.seed, 17, int(digest[:8], 16)])
-    pairs, yaws, tries = [], [], 0
-    while len(pairs) < count:
+    drawn, tries = [], 0
+    while len(drawn) < count:
         a, b = rng.integers(len(places), size=2)
         yaw = rng.uniform(-np.pi, np.pi)
         tries += 1
-        if tries > 2000 * (len(pairs) + 1):
+        if tries > 2000 * (len(drawn) + 1):
             raise SpaceError(
-                f"after {tries:,} draws {len(pairs)} of {count} episodes have start and goal in different rooms, more "
+                f"after {tries:,} draws {len(drawn)} of {count} episodes have start and goal in different rooms, more "
                 f"than {config.min_goal_m} m apart and joined by a way; ask for less clearance_m or min_goal_m"
             )
         if part[a] != part[b] or not part[a] or room[a] == room[b]:
             continue
         if np.linalg.norm(places[a] - places[b]) > config.min_goal_m:
-            pairs.append((a, b))
-            yaws.append(yaw)
-    a, b = np.array(pairs).T
+            drawn.append((a, b, yaw))
+    a, b, yaws = map(np.array, zip(*drawn, strict=True))
     shortest = _shortest_m(space, places[a], places[b])
-    return DrivenEpisodes(np.arange(count), places[a], np.array(yaws), places[b], room[a], room[b], shortest)
+    return DrivenEpisodes(np.arange(count), places[a], yaws, places[b], room[a], room[b], shortest)
 
 
 def _shortest_m(space: FreeSpace, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:

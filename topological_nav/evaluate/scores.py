@@ -118,9 +118,6 @@ class Difference:
     score: str
     result: Score | Contrast
 
-    def __str__(self) -> str:
-        return str(self.result)
-
 
 def differences(rows: pa.Table) -> list[Difference]:
     """Dense minus sparse map on the same episodes, scene by scene; unseen minus seen scenes, Welch's test."""
@@ -158,7 +155,7 @@ def markdown(lines: Sequence[Line], compared: Sequence[Difference]) -> str:
     """For a file: the summary and the comparisons."""
     text = tables.markdown(HEADER, map(_cells, lines))
     header = ("Compared", "Score", "Difference [95 % interval]")
-    told = [(d.compared, SCORES[d.score], d) for d in compared]
+    told = [(d.compared, SCORES[d.score], d.result) for d in compared]
     return text + ("\n" + tables.markdown(header, told) if told else "")
 
 
