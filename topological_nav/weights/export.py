@@ -23,7 +23,6 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import flax.serialization
-import flax.traverse_util
 import jax
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -173,15 +172,18 @@ def half(variables: Any) -> Any:
         RunError: a number is too large for it.
     """
 
-    tree = flax.serialization.to_state_dict(jax.device_get(variables))
-    flat: dict[str, Any] = flax.traverse_util.flatten_dict(tree, sep="/")
-    for name, leaf in flat.items():
+    def halved(path: Any, leaf: Any) -> np.ndarray:
         value = np.asarray(leaf)
+        if value.ndim < 2:
+            return value
         with np.errstate(over="ignore"):
-            flat[name] = value.astype(np.float16) if value.ndim > 1 else value
-        if not np.isfinite(flat[name]).all():
-            raise RunError(f"{name} holds {np.abs(value).max():.3g}, more than {PRECISION} can; train again")
-    return flax.traverse_util.unflatten_dict(flat, sep="/")
+            small = value.astype(np.float16)
+        if not np.isfinite(small).all():
+            where = "/".join(str(getattr(key, "key", key)) for key in path)
+            raise RunError(f"{where} holds {np.abs(value).max():.3g}, more than {PRECISION} can; train again")
+        return small
+
+    return jax.tree_util.tree_map_with_path(halved, flax.serialization.to_state_dict(jax.device_get(variables)))
 
 
 def compare(
