@@ -35,8 +35,8 @@ class CheckpointMeta:
     wall_s: float
     """Training time up to here, over all sittings."""
     score: float | None
-    """Mean of run.best_metric over the checkpoint interval; None if no episode ended in it, or before every
-    environment has had the time for a whole episode."""
+    """Mean of run.best_metric over the checkpoint interval, at least a time limit; None if no episode ended in it, or
+    if it reaches back to before every environment has had the time for a whole episode."""
     algorithm: str
     robot: str
     observations: tuple[str, ...]

@@ -161,15 +161,16 @@ class FolderCallbacks:
         self._display.log(env_steps, metrics)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
-        """Writes a checkpoint; its score is the mean over the episodes of the last checkpoint interval.
+        """Writes a checkpoint; its score is the mean over the episodes of at least the time that one can take.
 
-        Where all environments began together, the first episodes to end are the short ones, which succeed; until
-        each had the time for a whole episode, scores would flatter.
+        Where all environments began together, those that fail end together too, one time limit later, and what ends
+        in between are the short episodes, which succeed: a score is of a whole limit, and of none before the first.
         """
         run = self._config.run
-        fair = self._began_together + num_envs(self._config) * self._config.env.rules.episode_steps
-        since = max(snapshot.env_steps - run.checkpoint_every_steps, fair)
-        lines = [line for line in self._folder.read_metrics() if line["env_steps"] > since]
+        limit = num_envs(self._config) * self._config.env.rules.episode_steps
+        since = snapshot.env_steps - max(run.checkpoint_every_steps, limit)
+        fair = since >= self._began_together + limit
+        lines = [line for line in self._folder.read_metrics() if fair and line["env_steps"] > since]
         meta = CheckpointMeta(
             env_steps=snapshot.env_steps,
             wall_s=self._wall_s(),

@@ -287,27 +287,27 @@ def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path, monkeypatch):
 
 
 def test_checkpoints_have_no_score_before_every_environment_had_time_for_an_episode(tmp_path):
-    """16 environments and a limit of 60 steps: what ends in the first 960 env steps are the short episodes."""
+    """16 environments and a limit of 60 steps: what ends in the first 960 env steps are the short episodes. Those that
+    failed begin together again, so that a score is of 960 env steps after the first 960."""
 
     def short(_):
         return ToyEnv(ToyConfig(episode_steps=20))
 
-    config = toy_config(tmp_path, updates=6, keep_checkpoints=9)
+    config = toy_config(tmp_path, updates=8, keep_checkpoints=9)
     _, folder, _ = train_run(config, quiet(), build_env=short)
     lines = read_metrics(folder.metrics)
     saved = {c.env_steps: c.score for c in checkpoint.list_checkpoints(folder.checkpoints)}
-    assert list(saved) == [512, 1024, 1536] and saved[512] is None
+    assert list(saved) == [512, 1024, 1536, 2048] and [*saved.values()][:3] == [None] * 3
     assert all(line["episodes"] > 0 for line in lines if line["env_steps"] in (512, 768))  # in no score
-    first = [line for line in lines if line["env_steps"] == 1024]
-    later = [line for line in lines if line["env_steps"] > 1024]
-    assert saved[1024] == pytest.approx(mean_over_episodes(first, "episode/ins_0.5"))
-    assert saved[1536] == pytest.approx(mean_over_episodes(later, "episode/ins_0.5"))
+    later = [line for line in lines if line["env_steps"] > 2048 - 960]
+    assert saved[2048] == pytest.approx(mean_over_episodes(later, "episode/ins_0.5"))
+    assert len(later) == 4  # updates of 256: the checkpoint's own interval holds two
     # Without room for the environments all begin anew, and the wait with them.
-    config = toy_config(tmp_path, updates=10, keep_checkpoints=9, env_state_limit_mb=0.0)
-    (folder.checkpoints / "000000001536" / checkpoint.ENV_STATE).unlink()
+    config = toy_config(tmp_path, updates=16, keep_checkpoints=9, env_state_limit_mb=0.0)
+    (folder.checkpoints / "000000002048" / checkpoint.ENV_STATE).unlink()
     train_run(config, quiet(), build_env=short)
     saved = {c.env_steps: (c.score, c.began_together) for c in checkpoint.list_checkpoints(folder.checkpoints)}
-    assert saved[2048] == (None, 1536) and saved[2560][1] == 1536 and saved[2560][0] is not None
+    assert saved[3584] == (None, 2048) and saved[4096][1] == 2048 and saved[4096][0] is not None
 
 
 def test_unknown_best_metric_is_refused(tmp_path):
