@@ -165,3 +165,6 @@ def test_a_digest_passes_over_rounding_but_not_over_a_millimetre(tmp_path: Path)
         changed = text[: at.start] + f"{float(number[1]) + change_m:.12f}" + text[at.stop :]
         (folder / "scene.xml").write_text(changed)
         assert (scene_digest(folder) == digest) is same
+    where = text.replace('<body name="chair_0"', '<site name="window_0" size="1 1 1"/><body name="chair_0"', 1)
+    (folder / "scene.xml").write_text(where)
+    assert where != text and scene_digest(folder) == digest  # where a window is moves nothing

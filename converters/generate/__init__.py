@@ -22,7 +22,7 @@ from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
 from converters.generate.surface.write import LICENCE, write_cad, write_json, write_png, write_scan
 from converters.library.store import attribution, read_index
-from converters.records.raw import ATTRIBUTION
+from converters.records.raw import ATTRIBUTION, WINDOWS
 from interactive_nav_common.files import part_folder, publish, write_text
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
@@ -152,6 +152,8 @@ def _write(
 ) -> None:
     write_scan(folder, scan, atlas, building.floor_height_m)
     (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
+    corners = np.array([(w.low, w.high) for w in building.plan.windows]) + [0.0, 0.0, building.floor_height_m]
+    np.savetxt(folder / WINDOWS, corners.reshape(-1, 6), "%.4f")
     obstacles, traversable = floor_maps(building.plan)
     write_png(folder / "floor_0.png", obstacles)
     write_png(folder / "floor_trav_0.png", traversable)

@@ -18,7 +18,8 @@ from converters.read.obj import TexturedMesh, read_scan_obj, scan_of
 from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_upright, labelled, with_own_corners
 from converters.records.errors import SceneRejected
-from converters.records.raw import ATTRIBUTION, FLOOR, GivenMap, RawScene, Storey
+from converters.records.raw import ATTRIBUTION, FLOOR, WINDOWS, GivenMap, RawScene, Storey, Window
+from interactive_nav_common.errors import readable
 
 MESH = "mesh_z_up.obj"
 LABELS = "mesh_z_up.labels.npz"
@@ -70,7 +71,8 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
         source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")
     raw = building(source, "gibson", mesh, labels, heights, cads, annotations)
     furnished = not source.has(LABELS) or _furnished(root / LABELS)
-    return dataclasses.replace(raw, scan=dataclasses.replace(raw.scan, furnished=furnished))
+    scan = dataclasses.replace(raw.scan, furnished=furnished)
+    return dataclasses.replace(raw, scan=scan, windows=read_windows(source))
 
 
 def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heights, cads, annotations) -> RawScene:
@@ -125,6 +127,25 @@ def read_floors(source: SourceFolder) -> tuple[float, ...]:
                 f"{path}: floors at {low:g} m and {high:g} m are less than {STOREY_M:g} m apart; give each floor once"
             )
     return tuple(heights)
+
+
+def read_windows(source: SourceFolder) -> tuple[Window, ...]:
+    """Boxes along x and y that windows fill; none without the file.
+
+    Raises:
+        SceneRejected: a line is no box.
+    """
+    if not source.has(WINDOWS):
+        return ()
+    path, remedy = source.use(WINDOWS, ""), "expected a lower and an upper corner a line, x y z x y z in metres"
+    with readable(path, SceneRejected, remedy):
+        corners = np.loadtxt(path, ndmin=2).reshape(-1, 2, 3)
+    middle, half = corners.mean(axis=1), np.diff(corners, axis=1)[:, 0] / 2
+    if not (np.isfinite(corners).all() and (half > 0).all()):
+        raise SceneRejected(f"{path}: holds a box without volume, or one that is not finite; {remedy}")
+    turned = half[:, 1] > half[:, 0]  # along the wall lies the longer side
+    half[turned, :2] = half[turned, 1::-1]
+    return tuple(Window(m, h, float(t) * np.pi / 2) for m, h, t in zip(middle, half, turned, strict=True))
 
 
 def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, floor_xy: np.ndarray) -> GivenMap | None:

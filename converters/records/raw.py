@@ -135,6 +135,10 @@ class Lamp:
     """(3,) in [0, 1], times its power."""
 
 
+WINDOWS = "windows.txt"
+"""Of a folder in Gibson's layout: the boxes that windows fill."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Window:
     """A box that a window's opening fills."""

@@ -90,7 +90,7 @@ def gap_around(stands: Any, middle: np.ndarray, along: np.ndarray, length: float
 def _crossed(stands: Any, at: np.ndarray, across: np.ndarray, near_m: float = BESIDE_M) -> list[np.ndarray]:
     """(2,) m along (2,) unit `across` from (2,) `at`: where each wall begins and ends that the line meets near it."""
     parts = shapely.get_parts(shapely.intersection(shapely.LineString([at - across, at + across]), stands))
-    ends = [np.sort((shapely.get_coordinates(part)[[0, -1]] - at) @ across) for part in parts]
+    ends = [np.sort((shapely.get_coordinates(p)[[0, -1]] - at) @ across) for p in parts if not p.is_empty]
     return [end for end in ends if end[0] < near_m and end[1] > -near_m]
 
 

@@ -107,6 +107,8 @@ def test_the_timeout_is_an_option(gibson_raw, tmp_path, monkeypatch):
         (lambda r: (r / "mesh_z_up.obj").write_bytes(b"\xff\xfe\x00garbage"), "mesh_z_up.obj"),
         (lambda r: (r / "mesh_z_up.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "not finite"),
         (lambda r: (r / "floors.txt").write_text("0.3 0.4"), "less than 1 m apart"),
+        (lambda r: (r / "windows.txt").write_text("0 0 0 1 1"), "a lower and an upper corner a line"),
+        (lambda r: (r / "windows.txt").write_text("0 0 0 1 0.1 -1"), "a box without volume"),
         (lambda r: (r / "alignments.json").write_text("[" * 100000), "not readable as JSON"),
         (lambda r: (r / "floor_trav_0.png").write_bytes(b"x"), "not readable as an image"),
         (lambda r: shutil.rmtree(r / "cad"), "put the model there"),

@@ -296,6 +296,20 @@ def test_windows_come_back_where_they_were(tmp_path, hull_cache):
                 assert (depth.max() < 0.01) == passes, (yaw, out)  # a pane in the middle, and no wall before it
 
 
+def test_windows_of_a_scan_are_drawn_where_its_file_says(gibson_raw, tmp_path, hull_cache):
+    """The floor is at 0.3 m; one window lies along x, one along y."""
+    (gibson_raw / "windows.txt").write_text("0.6 2.45 0.9 1.4 2.55 1.5\n-0.05 0.5 0.9 0.05 1.5 1.5\n")
+    made = convert(gibson_raw, tmp_path / "out", ConvertConfig(structure_texture=64), cache=hull_cache)
+    there = [[1.0, 2.5, 0.9, 0.4, 0.05, 0.3, 0.0], [0.0, 1.0, 0.9, 0.5, 0.05, 0.3, np.pi / 2]]
+    assert openings(made.folder) == pytest.approx(np.array(there), abs=1e-6)
+    export_sh3d(made.folder, tmp_path / "room.sh3d")
+    with zipfile.ZipFile(tmp_path / "room.sh3d") as archive:
+        drawn = [e for e in ElementTree.fromstring(archive.read("Home.xml")).iter("doorOrWindow")]
+    assert [(float(e.get("width")), float(e.get("height")), float(e.get("elevation"))) for e in drawn] == [
+        (pytest.approx(80), pytest.approx(60), pytest.approx(60)), (pytest.approx(100), pytest.approx(60), pytest.approx(60)),
+    ]  # fmt: skip
+
+
 def test_each_side_of_a_wall_has_its_own_colour(tmp_path, hull_cache):
     root = tmp_path / "two"
     made = convert(write_home(root, PLAIN), root / "out", ConvertConfig(structure_texture=256), cache=hull_cache)
