@@ -56,7 +56,7 @@ class SceneSet:
 
 def scene_digest(folder: Path) -> str:
     """SHA-256 of what a scene is made of, the same on every machine that makes it: its map, and its bodies, joints and
-    geoms (where windows are is left out) with numbers rounded to 0.1 mm (the last digits of fitted boxes differ between processors).
+    geoms with numbers rounded to 0.1 mm (the last digits of fitted boxes differ between processors), but no windows.
 
     Raises:
         SceneError: the folder's files cannot be read.
@@ -68,7 +68,8 @@ def scene_digest(folder: Path) -> str:
     maps = load_maps(folder)
     parts: list[Any] = [maps.traversable.shape, np.packbits(maps.traversable).tobytes().hex()]
     parts += [[element.tag, {k: _rounded(v) for k, v in sorted(element.attrib.items())}]
-              for body in tree.iter("worldbody") for element in body.iter() if not element.get("name", "").startswith("window_")]  # fmt: skip
+              for body in tree.iter("worldbody") for element in body.iter()
+              if not element.get("name", "").startswith("window_")]  # fmt: skip
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 

@@ -305,9 +305,8 @@ def test_windows_of_a_scan_are_drawn_where_its_file_says(gibson_raw, tmp_path, h
     export_sh3d(made.folder, tmp_path / "room.sh3d")
     with zipfile.ZipFile(tmp_path / "room.sh3d") as archive:
         drawn = [e for e in ElementTree.fromstring(archive.read("Home.xml")).iter("doorOrWindow")]
-    assert [(float(e.get("width")), float(e.get("height")), float(e.get("elevation"))) for e in drawn] == [
-        (pytest.approx(80), pytest.approx(60), pytest.approx(60)), (pytest.approx(100), pytest.approx(60), pytest.approx(60)),
-    ]  # fmt: skip
+    sizes_cm = [float(e.get(name)) for e in drawn for name in ("width", "height", "elevation")]
+    assert sizes_cm == pytest.approx([80, 60, 60, 100, 60, 60])
 
 
 def test_each_side_of_a_wall_has_its_own_colour(tmp_path, hull_cache):
