@@ -152,8 +152,9 @@ def _write(
 ) -> None:
     write_scan(folder, scan, atlas, building.floor_height_m)
     (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
-    corners = np.array([(w.low, w.high) for w in building.plan.windows]) + [0.0, 0.0, building.floor_height_m]
-    np.savetxt(folder / WINDOWS, corners.reshape(-1, 6), "%.4f")
+    if building.plan.windows:
+        corners = np.array([(w.low, w.high) for w in building.plan.windows]) + [0.0, 0.0, building.floor_height_m]
+        np.savetxt(folder / WINDOWS, corners.reshape(-1, 6), "%.4f")
     obstacles, traversable = floor_maps(building.plan)
     write_png(folder / "floor_0.png", obstacles)
     write_png(folder / "floor_trav_0.png", traversable)

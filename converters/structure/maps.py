@@ -191,11 +191,14 @@ def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) ->
 def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.ndarray:
     """Adds unseen regions, up to `BRIDGE_M` wide, in which nothing stands and which part two pieces of floor."""
     line = np.ones((1, round(BRIDGE_M / resolution_m) + 1))
-    between = ndimage.binary_closing(floor, line) | ndimage.binary_closing(floor, line.T)
+    between = np.logical_or(ndimage.binary_closing(floor, line), ndimage.binary_closing(floor, line.T))
     pieces, _ = label_pieces(_drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2)), np.ones((3, 3)))
     gaps, count = label_pieces(between & ~floor & ~occupied)
-    around = (np.unique(pieces[ndimage.binary_dilation(gaps == k, np.ones((3, 3)))]) for k in range(1, count + 1))
-    return floor | np.isin(gaps, [k for k, beside in enumerate(around, 1) if np.count_nonzero(beside) > 1])
+    for k in range(1, count + 1):
+        beside = pieces[np.asarray(ndimage.binary_dilation(gaps == k, np.ones((3, 3))), bool)]
+        if np.count_nonzero(np.unique(beside)) > 1:
+            floor = floor | (gaps == k)
+    return floor
 
 
 def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np.ndarray:
