@@ -24,6 +24,7 @@ from markdown_it import MarkdownIt
 from interactive_nav.config import make_config
 
 ROOT = Path(__file__).parents[1]
+README_WORDS = 700
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 NOT_RUN = re.compile(r"<!--\s*not run:\s*(.+?)\s*-->", re.DOTALL)
 HOUSE = ("interactive_nav", "train", "converters", "topological_nav", "benchmarks", "docs")
@@ -170,3 +171,7 @@ def test_options_that_the_benchmarks_page_names_exist():
 def test_links_lead_to_files(page):
     links = re.findall(r"\]\((?!https?://|#)([^)#\s]+)", page.read_text(encoding="utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_the_readme_is_read_in_three_minutes():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README_WORDS

@@ -78,8 +78,9 @@ def test_the_topological_tables_are_those_of_their_rows(size, rows, table):
     folder = ROOT / "results" / "topological" / size
     played = read_rows(sorted((folder / rows).glob("*.parquet")))
     assert markdown(summary(played), differences(played)) == (folder / table).read_text()
-    # docs/topological.md has what they say of all scenes together, and the baseline's rows of the full size.
-    told, lines = (ROOT / "docs" / "topological.md").read_text(), (folder / table).read_text().splitlines()
+    # The page has what they say of all scenes together, and the baseline's rows of the full size.
+    page = {"cpu": "topological-log.md", "full": "topological-results.md"}[size]
+    told, lines = (ROOT / "docs" / page).read_text(), (folder / table).read_text().splitlines()
     everywhere = [cells for line in lines if (cells := line.strip("| ").split(" | "))[1:2] == ["all"]]
     assert "dense" in [cells[0] for cells in everywhere]
     for who, _, _, success, spl, rc, *_ in everywhere:
@@ -97,8 +98,8 @@ def test_the_further_topological_tables_are_those_of_their_rows(name):
     folder = ROOT / "results" / "topological" / "full"
     played = read_rows(sorted((folder / f"rows-{name}").glob("*.parquet")))
     assert markdown(summary(played), differences(played)) == (folder / f"summary-{name}.md").read_text()
-    # docs/topological.md has the means over ten scenes, but a line for each of two: their mean's interval says nothing.
-    told, found = (ROOT / "docs" / "topological.md").read_text(), summary(played)
+    # docs/topological-results.md has the means over ten scenes, but a line for each of two: their mean's interval says nothing.
+    told, found = (ROOT / "docs" / "topological-results.md").read_text(), summary(played)
     scenes = [line for line in found if line.group not in ("seen", "unseen", "all")]
     for line in scenes if len(scenes) == 2 else found[-1:]:
         assert " | ".join(str(line.scores[score]) for score in ("success", "spl", "rc")) in told, line
