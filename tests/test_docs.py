@@ -175,3 +175,28 @@ def test_links_lead_to_files(page):
 
 def test_the_readme_is_read_in_three_minutes():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README_WORDS
+
+
+def words_a_sentence(text: str) -> float:
+    """Mean over a page's sentences; code, tables and fragments of three words do not count."""
+    lengths, table = [], False
+    for token in MarkdownIt().enable("table").parse(text):
+        table = token.type == "table_open" or (table and token.type != "table_close")
+        if token.type == "inline" and not table:
+            line = re.sub(r"`[^`]*`", "x", re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", token.content)).replace("\n", " ")
+            lengths += [
+                len(re.findall(r"\w+(?:[.,'/-]\w+)*", s)) for s in re.split(r"(?<=[.!?])\s+(?=[A-Z*`x\d\[(])", line)
+            ]
+    lengths = [n for n in lengths if n > 3]
+    return sum(lengths) / max(len(lengths), 1)
+
+
+def test_words_of_a_sentence_are_counted():
+    assert words_a_sentence("One two three four five. One two three `a b` four.\n\n| a b c d e |\n|---|\n| x |\n") == 5
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "benchmarks" / "README.md", ROOT / "scenes_mjcf" / "README.md"], ids=str
+)
+def test_sentences_are_short(page):
+    assert words_a_sentence(page.read_text(encoding="utf-8")) <= 22
