@@ -215,15 +215,7 @@ def _beside(settled: Settled, annotated: tuple[PlacedObject, ...]) -> dict[int, 
 
 
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
-    """Every stage after reading; writes into `folder`, which exists and is empty.
-
-    Args:
-        raw: one floor.
-        folder: of the scene.
-        config: choices.
-        clock: of the stages.
-        cache: folder of hulls and stage results by content.
-    """
+    """Every stage after reading, of one floor; writes into `folder`, which exists and is empty."""
     stages = StageCache(cache)
     with clock.stage("align") as progress:
         raw = with_retrieved(raw, config.library, progress) if config.auto_align else raw

@@ -179,10 +179,6 @@ def missed(building: BuildingConfig | HomeConfig, made: Converted) -> str:
     """Which share a converted home was asked for and does not have, or which gate it fails; empty: none.
 
     Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
-
-    Args:
-        building: as it was asked for.
-        made: the scene, measured.
     """
     asked = building.must_push if isinstance(building, HomeConfig) else {}
     if failed := [gate.name for gate in made.gates if not gate.passed and isinstance(building, HomeConfig)]:

@@ -86,11 +86,6 @@ _FILES = Reader(EpisodeFileError, "make it again")
 def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     """Draws episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
 
-    Args:
-        env: not batched.
-        episodes: how many, at least 1.
-        seed: of the draw.
-
     Raises:
         ConfigError: fewer than one episode.
     """

@@ -66,13 +66,7 @@ def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
 
 
 def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
-    """Draws one replay.
-
-    Args:
-        axis: to draw into.
-        replay: the episode.
-        scene: the folder that it was played in.
-        colour_by: "time" (first step dark, last bright) or "contact".
+    """Draws one replay, its path coloured by "time" (first step dark, last bright) or "contact".
 
     Raises:
         ReplayError: the scene is not the one that the replay was recorded in.

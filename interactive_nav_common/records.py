@@ -91,11 +91,7 @@ class Reader:
     def record(self, data: Any, cls: type[Record], where: str, others: bool = False) -> Record:
         """A decoded mapping as a record: lists become tuples, mappings records where the types say so.
 
-        Args:
-            data: decoded.
-            cls: dataclass.
-            where: named in errors.
-            others: keys that the record lacks are passed over.
+        `where` is named in errors; with `others`, keys that the record lacks are passed over.
 
         Raises:
             UserError: no mapping, an unknown or missing key, a value of another type or out of bounds.

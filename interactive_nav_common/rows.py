@@ -23,12 +23,7 @@ def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 
 def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = None) -> None:
-    """Writes rows whole or not at all.
-
-    Args:
-        table: the rows.
-        path: of the file.
-        notes: kept in the file beside them.
+    """Writes rows, with notes beside them in the file, whole or not at all.
 
     Raises:
         FileError: the file cannot be written.

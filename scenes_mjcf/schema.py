@@ -92,11 +92,7 @@ class SceneMaps:
 
 
 def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
-    """Builds a manifest from decoded JSON.
-
-    Args:
-        data: the decoded object.
-        where: file named in errors.
+    """Builds a manifest from decoded JSON; `where` is the file named in errors.
 
     Raises:
         SceneError: no JSON object, unknown or missing key, a value of another type, unknown category or split,

@@ -94,12 +94,7 @@ def sample_surface(scan: ScanMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
 
 
 def voxelise(surface: Surface, floor_m: float) -> Voxels:
-    """Means over the points of each voxel.
-
-    Args:
-        surface: of the scan.
-        floor_m: height of the floor.
-    """
+    """Means over the points of each voxel."""
     low = surface.points[:, :2].min(axis=0) if len(surface.points) else np.zeros(2)
     origin = np.array([*low, floor_m - BELOW_M])
     index = np.floor((surface.points - origin) / VOXEL_M).astype(np.int64)

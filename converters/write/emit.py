@@ -187,11 +187,7 @@ def _scale_between(first: VisualMesh, other: VisualMesh) -> tuple[float, float, 
 
 
 def share_assets(parts: SceneParts) -> Assets:
-    """Which files show and bound each body: equal ones are written once, under the first body's name.
-
-    Args:
-        parts: with visuals.
-    """
+    """Which files show and bound each body: equal ones are written once, under the first body's name."""
     looks, meshes, images, solids, hulls = {}, {}, {}, {}, {}
     drawn = [(o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
     for name, visual in [*drawn, *([("structure", parts.structure_visual)] if parts.structure_visual else [])]:
@@ -354,13 +350,7 @@ def write_obj(
 
 
 def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
-    """Writes `scene.xml` and `assets/` into an existing folder.
-
-    Args:
-        parts: with visuals.
-        folder: of the scene.
-        palette: colours of a texture.
-    """
+    """Writes `scene.xml` and `assets/` into an existing folder, textures in `palette` colours."""
     parts = dataclasses.replace(parts, object_visuals=tuple(map(share_plain, parts.object_visuals)))
     assets, shared = folder / "assets", share_assets(parts)
     assets.mkdir()

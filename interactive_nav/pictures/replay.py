@@ -133,13 +133,7 @@ class EpisodePlayer:
         self._step = jax.jit(functools.partial(_play_step, env))
 
     def play(self, key: jax.Array, episode: int = 0, on_progress: Callable[[int], None] = lambda step: None) -> Replay:
-        """Plays one episode to its end.
-
-        Args:
-            key: the episode is drawn from it, and the policy's chances follow from it.
-            episode: its number, for captions.
-            on_progress: told the number of steps taken, after each.
-        """
+        """Plays one episode, drawn from the key, to its end; `on_progress` is told the number of steps after each."""
         state = self._reset(key[None])
         policy_key = policy_key_of(key)
         first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])

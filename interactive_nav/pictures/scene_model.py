@@ -227,14 +227,7 @@ def cast(
 def trace(
     model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens, groups: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What the pixels of a camera show.
-
-    Args:
-        model: what is there.
-        data: where it is.
-        pose: of one camera.
-        lens: its.
-        groups: geom groups that are seen.
+    """What the pixels of a camera show of some geom groups.
 
     Returns:
         [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 where nothing is met; [H, W] depths along the optical axis,

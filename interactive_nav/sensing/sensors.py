@@ -126,13 +126,7 @@ class Sensors:
         return shapes
 
     def observe(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array | dict[str, jax.Array]:
-        """The observation of one environment.
-
-        Args:
-            physics: its state.
-            nav: its task memory, up to date with it.
-            rng: the episode's key, read for sensor noise and not consumed.
-        """
+        """The observation of one environment; the episode's key is read for sensor noise and not consumed."""
         vector = self._vector(physics, nav, rng)
         if not self._images:
             return vector

@@ -141,12 +141,7 @@ class InteractiveNav(Env):
         )
 
     def strew(self, key: jax.Array, start: EpisodeStart) -> EpisodeStart:
-        """A given episode with its small objects drawn: clear of start, goal and each other.
-
-        Args:
-            key: consumed.
-            start: leaves of one environment.
-        """
+        """One environment's given episode with its small objects drawn: clear of start, goal and each other."""
         key_place, key_turn = jax.random.split(key)
         free, scene = [start.start_xy_w, start.goal_xy_w], start.scene_index
         xy, ok = place_small(key_place, self.tables, scene, self._small_radius_m, free, self.robot.footprint_radius_m)

@@ -73,14 +73,7 @@ def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple
 def make_adapting(
     network: Network, variables: dict[str, Any], size: int, config: AdaptConfig
 ) -> tuple[Adapting, Critic]:
-    """The target's extractor as the source's, and a fresh critic.
-
-    Args:
-        network: of the source.
-        variables: its own.
-        size: numbers of an embedding.
-        config: settings.
-    """
+    """The target's extractor as the source's, and a fresh critic."""
     critic = Critic(config.hidden)
     shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
     weights = initial(shapes, config.seed)["params"]

@@ -102,10 +102,6 @@ class Drives:
 def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np.ndarray, Terrain]:
     """Decides on all drives.
 
-    Args:
-        scenes: with different names.
-        config: of the drives.
-
     Returns:
         The n drives, scene by scene, [n] bool which of them are for testing, and what the expert knows of the scenes.
 

@@ -46,14 +46,7 @@ class NavigatorPlayer:
         camera: Camera,
         watch: Callable[[float, Seen, State, Events], None] = lambda *_: None,
     ):
-        """Takes its parts.
-
-        Args:
-            navigator: of the scene.
-            simulator: of the scene.
-            camera: what the navigator's sight understands.
-            watch: told time, poses, new state and events of every step.
-        """
+        """Takes its parts; `watch` is told time, poses, new state and events of every step."""
         self._navigator, self._simulator, self._camera = navigator, simulator, camera
         self._watch = watch
         self.state: State | None = None

@@ -113,12 +113,7 @@ def _shares(axes: Any, drives: Any) -> None:
 
 
 def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> Figure:
-    """Curves of a policy's run, and how its commands on held-out drives compare with the expert's.
-
-    Args:
-        lines: of metrics.jsonl.
-        results: of results.json.
-    """
+    """Curves of a policy's run, and how its commands on held-out drives compare with the expert's."""
     figure, (axes,) = panels((15, 3.6), 1, 4)
     curves(axes[0], lines, {"forward": "forward", "consistency": "consistency"})
     axes[0].set_yscale("log")

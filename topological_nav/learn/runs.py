@@ -187,11 +187,6 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
 def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
     """Variables of a finished run, in the template's precision.
 
-    Args:
-        run: its folder.
-        template: tree of arrays or shapes.
-        about: content of network.json.
-
     Raises:
         RunError: weights.msgpack is damaged, another network's, or not what an export wrote.
     """

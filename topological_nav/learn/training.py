@@ -139,15 +139,7 @@ def train(
     tell: Callable[[str], None] = lambda _: None,
     should_stop: Asked = go_on,
 ) -> dict[str, Any]:
-    """Trains a network, or goes on with it.
-
-    Args:
-        task: rooms or passages.
-        dataset: a dataset folder.
-        out: the run folder.
-        config: settings.
-        tell: told one line an epoch.
-        should_stop: asked after every epoch.
+    """Trains a network for rooms or passages, or goes on with it; tells a line, and asks whether to stop, each epoch.
 
     Returns:
         The content of results.json.

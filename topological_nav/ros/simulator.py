@@ -63,10 +63,6 @@ class RosSimulator:
     def __init__(self, scene: Path, config: SimulatorConfig):
         """Builds the world and places the robot; compiles.
 
-        Args:
-            scene: folder.
-            config: settings.
-
         Raises:
             SceneError: the scene cannot be used.
             UserError: the start is not free, or the engine is not installed.

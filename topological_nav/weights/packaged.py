@@ -100,11 +100,6 @@ def choose(
 def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
     """The first map of a scene that these networks can use; None: there is none.
 
-    Args:
-        choice: networks, and where maps lie.
-        scene: its name.
-        digest: of its files.
-
     Raises:
         RunError: a run is not finished, or damaged.
     """

@@ -59,11 +59,7 @@ Cell = tuple[str, str, float]
 
 
 class Looks:
-    """What stands for what in a figure of some cells.
-
-    Args:
-        cells: with their runs.
-    """
+    """What stands for what in a figure of some cells."""
 
     def __init__(self, cells: Mapping[Cell, Sequence[Any]]):
         self.robots = sorted({robot for robot, _, _ in cells}, reverse=True)

@@ -231,11 +231,7 @@ def hang_doors(
 ) -> tuple[list[tuple[Instance, int]], list[shapely.Polygon]] | None:
     """Hangs as many leaves as a plan has doorways for, up to the higher number of `cfg.n_doors`.
 
-    Args:
-        plan: the floor plan.
-        cfg: leaves and how they hang.
-        rng: random stream.
-        first: rooms whose doorways get theirs before others.
+    Doorways of the rooms `first` get theirs before others.
 
     Returns:
         Each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.

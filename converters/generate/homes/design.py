@@ -38,14 +38,7 @@ class Furnished:
 
 
 def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Furnished:
-    """Draws and furnishes a home.
-
-    Args:
-        cfg: what kind of home.
-        rng: random stream.
-
-    Returns:
-        The home, its shares as asked for.
+    """Draws and furnishes a home, its shares as asked for.
 
     Raises:
         GenerationError: no plan for such rooms, or none of several takes as much furniture as asked for, or stands as

@@ -291,16 +291,7 @@ def grow(home: Home) -> None:
 
 
 def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Generator) -> Home:
-    """Furnishes a home.
-
-    Args:
-        plan: the floor plan.
-        uses: of its rooms.
-        cfg: how full it is.
-        rng: random stream.
-
-    Returns:
-        The home, its furniture on its floor.
+    """Furnishes a plan, whose rooms have these uses; the home has its furniture on its floor.
 
     Raises:
         GenerationError: too few doors hang, a room lacks what it needs, or the share is not met.

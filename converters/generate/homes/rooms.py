@@ -109,14 +109,7 @@ def assign_uses(plan: Plan, wanted: list[str]) -> tuple[list[str], float]:
 
 
 def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list[str]]:
-    """Draws the plan of a home.
-
-    Args:
-        cfg: areas, rooms, walls and doorways.
-        rng: random stream.
-
-    Returns:
-        The plan, and the use of each of its rooms.
+    """The plan of a home, and the use of each of its rooms.
 
     Raises:
         GenerationError: that many rooms do not fit into that area.

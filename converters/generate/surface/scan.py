@@ -159,17 +159,7 @@ def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.1
 
 
 def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: np.random.Generator) -> Scan:
-    """Reconstructs the building.
-
-    Args:
-        plan: the floor plan.
-        items: the furniture.
-        cfg: voxel size, noise levels, face budget.
-        rng: random stream.
-
-    Returns:
-        The mesh with a label for each vertex.
-    """
+    """Reconstructs the building: a mesh with a label for each vertex."""
     solids = building_solids(plan, items)
     o = plan.outer
     pad = 4 * cfg.voxel_m

@@ -232,14 +232,7 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
 
 def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m: float,
                rng: np.random.Generator) -> Atlas:  # fmt: skip
-    """Unwraps and paints a scan.
-
-    Args:
-        scan: the mesh.
-        rooms: x0, y0, x1, y1 of each.
-        uses: of the rooms, as `finishes` takes them.
-        texels_per_m: wanted resolution.
-        rng: random stream.
+    """Unwraps and paints a scan; `uses` of its rooms as `finishes` takes them.
 
     Returns:
         The atlas.
