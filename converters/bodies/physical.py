@@ -45,7 +45,7 @@ def mass_moments(hulls: tuple[Hull, ...]) -> tuple[float, np.ndarray, np.ndarray
 
 
 def physical_properties(category: str, hulls: tuple[Hull, ...]) -> Physical:
-    """Mass = density x summed hull volume, clipped to the category's range; moments from them (body frame, scaled, m)."""
+    """Mass = density x summed hull volume, clipped to the category's range; moments from them (body frame, m, kg)."""
     material = MATERIALS[category]
     volume, com, inertia = mass_moments(hulls)
     wanted = material.density_kg_m3 * volume

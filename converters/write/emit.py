@@ -187,7 +187,7 @@ def _scale_between(first: VisualMesh, other: VisualMesh) -> tuple[float, float, 
 
 
 def share_assets(parts: SceneParts) -> Assets:
-    """Which files show and bound each body: equal ones are written once, under the first body's name."""
+    """Which files show and bound each body, with visuals: equal ones are written once, under the first body's name."""
     looks, meshes, images, solids, hulls = {}, {}, {}, {}, {}
     drawn = [(o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
     for name, visual in [*drawn, *([("structure", parts.structure_visual)] if parts.structure_visual else [])]:

@@ -232,7 +232,7 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
 
 def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m: float,
                rng: np.random.Generator) -> Atlas:  # fmt: skip
-    """Unwraps and paints a scan; `uses` of its rooms as `finishes` takes them.
+    """Unwraps and paints a scan; rooms are x0, y0, x1, y1 (m), their `uses` as `finishes` takes them.
 
     Returns:
         The atlas.
