@@ -84,7 +84,9 @@ _FILES = Reader(EpisodeFileError, "make it again")
 
 
 def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
-    """Draws episodes of an environment that is not batched: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
+    """Draws episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
+
+    The environment is not batched.
 
     Raises:
         ConfigError: fewer than one episode.
