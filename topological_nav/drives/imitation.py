@@ -44,7 +44,7 @@ from topological_nav.learn.runs import claimed, run_epochs, write_network, write
 from topological_nav.learn.training import class_scores
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
-"""alpha and lambda of the report's table."""
+"""All pairs of the alphas and lambdas in the report's table II, which has three of them."""
 LEAST_SPREAD = 0.3
 """Features are scaled by their standard deviation, at least this share of the mean one."""
 
