@@ -68,8 +68,8 @@ def test_artefacts_are_a_checked_setting_of_homes_that_recipes_reach():
     assert HomeConfig().artefacts == "none" and home_config("furnished", {"artefacts": "phone"}).artefacts == "phone"
     made_of = building_of("cluttered", {"artefacts": "phone"}, "train", "here")
     assert isinstance(made_of, HomeConfig) and made_of.artefacts == "phone"
-    for wrong in ("fone", 3):
-        with pytest.raises(GenerationError, match=r"here: artefacts is '?\w+'?: expected one of none, phone"):
+    for wrong, told in (("fone", "'fone': expected one of none, phone"), (3, "3, expected a string")):
+        with pytest.raises(GenerationError, match=f"here: artefacts is {told}"):
             building_of("cluttered", {"artefacts": wrong}, "train", "here")
     with pytest.raises(GenerationError, match="did you mean 'phone'"):
         home_config("furnished", {"artefacts": "phon"})

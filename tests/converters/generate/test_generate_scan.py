@@ -76,7 +76,7 @@ def test_the_folder_is_complete_and_small(raw):
     names = {p.name for p in raw.folder.iterdir()}
     assert names == {
         "mesh_z_up.obj", "mesh_z_up.mtl", "mesh_z_up_texture.png", "mesh_z_up.labels.npz", "floors.txt",
-        "floor_0.png", "floor_trav_0.png", "alignments.json", "cad", "generator.json", "LICENCE",
+        "floor_0.png", "floor_trav_0.png", "alignments.json", "cad", "generator.json", "LICENCE", "windows.txt",
     }  # fmt: skip
     assert sum(p.stat().st_size for p in raw.folder.rglob("*") if p.is_file()) < 12 * 2**20
     assert not [p for p in raw.folder.parent.iterdir() if p != raw.folder]
