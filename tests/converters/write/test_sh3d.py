@@ -305,7 +305,7 @@ def test_windows_of_a_scan_are_drawn_where_its_file_says(gibson_raw, tmp_path, h
     export_sh3d(made.folder, tmp_path / "room.sh3d")
     with zipfile.ZipFile(tmp_path / "room.sh3d") as archive:
         drawn = [e for e in ElementTree.fromstring(archive.read("Home.xml")).iter("doorOrWindow")]
-    sizes_cm = [float(e.get(name)) for e in drawn for name in ("width", "height", "elevation")]
+    sizes_cm = [float(e.get(name, "nan")) for e in drawn for name in ("width", "height", "elevation")]
     assert sizes_cm == pytest.approx([80, 60, 60, 100, 60, 60])
 
 
