@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -13,55 +14,58 @@ from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.progress import stage_progress
 
 
-def _labels_of(source: Path) -> Path:
-    """Where the readers look for a source's labels."""
-    from converters.read.gibson import LABELS
-    from converters.read.meshes import labels_beside
-
-    if source.is_file():
-        return labels_beside(source)
+def _beside(source: Path, ending: str) -> Path:
+    """Of a file beside a source's mesh: labels, where the readers look for them, or proposals."""
+    from converters.read.gibson import MESH
     from converters.read.source import detect_format
 
-    layout = detect_format(source)
-    if layout != "gibson":
+    if not source.is_file() and (layout := detect_format(source)) != "gibson":
         raise SceneRejected(f"{source}: is of layout {layout}, expected a mesh file or a folder of layout gibson")
-    return source / LABELS
+    mesh = source if source.is_file() else source / MESH
+    return mesh.with_name(f"{mesh.stem}.{ending}")
+
+
+def _read(arguments: argparse.Namespace) -> Any:
+    from converters.read.source import read_source
+
+    words = {"layout": "format", "strict": "strict", "up": "up", "unit": "unit", "within": "root", "mirror": "mirror"}
+    return read_source(arguments.source, **{k: getattr(arguments, w) for k, w in words.items() if w in arguments})
 
 
 def _segment(arguments: argparse.Namespace, console: Console) -> int:
-    target = _labels_of(arguments.source)
+    arguments.output = target = _beside(arguments.source, "labels.npz")
     if target.exists() and not arguments.overwrite:
         raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
-    arguments.output = target
     _label(arguments, target, arguments.weights, console)
     return 0
 
 
 def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
     """The step of `convert --segment`: labels the source beside it, unless it has labels, perhaps edited ones."""
-    target = _labels_of(arguments.source)
-    if target.exists():
-        console.print(f"{target}: is there, kept", soft_wrap=True)
-    else:
-        _label(arguments, target, None, console)
+    target = _beside(arguments.source, "labels.npz")
+    if not target.exists():
+        return _label(arguments, target, None, console)
+    console.print(f"{target}: is there, kept", soft_wrap=True)
 
 
 def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path | None:
-    """The next step of it: beside a mesh file, the models that fit, unless they are there; None for a folder."""
+    """The next step of it: beside the mesh, the models that fit, unless they are there; None where alignments are."""
     from converters.propose.proposals import as_scan2cad
     from converters.propose.report import retrieve_sure
-    from converters.read.source import read_source
+    from converters.read.gibson import ALIGNMENTS
+    from converters.read.storeys import split_storeys
 
-    source = arguments.source
-    if not source.is_file():
+    source, target = arguments.source, _beside(arguments.source, "proposals.json")
+    if (source / ALIGNMENTS).exists():
         return None
-    target = source.with_name(f"{source.stem}.proposals.json")
     if target.exists():
         console.print(f"{target}: is there, kept", soft_wrap=True)
         return target
-    about = (getattr(arguments, word) for word in ("format", "strict", "up", "unit", "root", "mirror"))
+    library = arguments.library or (source if (source / "cad").is_dir() else None)
     with stage_progress(console) as report:
-        found, models = retrieve_sure(read_source(source, *about), arguments.library, lambda x: report("propose", x))
+        floors = split_storeys(_read(arguments))
+        fitted = [retrieve_sure(floor, library, lambda share: report("propose", share)) for floor in floors]
+    found, models = (sum(part, ()) for part in zip(*fitted, strict=True))
     text = json.dumps(as_scan2cad(source.stem, found, dict(enumerate(models))), indent=1, allow_nan=False)
     write_text(target, text + "\n")
     console.print(f"{target}: {len(models)} models", soft_wrap=True)
@@ -69,16 +73,12 @@ def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path 
 
 
 def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, console: Console) -> None:
-    import numpy as np
-
-    from converters.read.source import read_source
     from converters.segment.labelling import label_scan, load_scores
-    from converters.segment.network import WEIGHTS
 
-    scores = load_scores(weights or WEIGHTS)
+    scores = load_scores(weights)
     with stage_progress(console) as report:
-        labels = label_scan(read_source(arguments.source, up=arguments.up, unit=arguments.unit), scores, report)
-    write_arrays(target, label=labels.astype(np.uint8))
+        labels = label_scan(_read(arguments), scores, report)
+    write_arrays(target, label=labels.astype("uint8"))
     console.print(f"{target}: labels of {len(labels)} vertices", soft_wrap=True)
 
 
@@ -96,10 +96,9 @@ def _train(arguments: argparse.Namespace, console: Console) -> int:
 def _score(arguments: argparse.Namespace, console: Console) -> int:
     from converters.read.source import read_source
     from converters.segment.labelling import load_scores, score_homes, score_source
-    from converters.segment.network import WEIGHTS
     from converters.segment.train import HELD_OUT_SEED
 
-    scores = load_scores(arguments.weights or WEIGHTS)
+    scores = load_scores(arguments.weights)
     with stage_progress(console) as report:
         for source in arguments.sources:
             found = score_source(read_source(source), scores, report)

@@ -33,13 +33,13 @@ FOUND_IOU = 0.5
 Report = Callable[[str, float], None]
 
 
-def load_scores(weights: Path = WEIGHTS) -> Scores:
-    """The network with weights, for `label_scan`.
+def load_scores(weights: Path | None = None) -> Scores:
+    """The network with weights, for `label_scan`; None: the packaged ones.
 
     Raises:
         SceneRejected: there are none, or damaged ones.
     """
-    return make_scores(*read_weights(weights))
+    return make_scores(*read_weights(weights or WEIGHTS))
 
 
 def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:

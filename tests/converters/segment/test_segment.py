@@ -35,6 +35,7 @@ from converters.segment.voxels import (
     sample_surface,
     voxelise,
 )
+from tests.converters import tiny_raw
 
 TINY = SegmentConfig(widths=(16, 24), side=16, most_voxels=1200, batch=1)
 FLOOR, WALL, OTHER = (NAMES.index(name) for name in ("floor", "wall", "other"))
@@ -236,6 +237,35 @@ def test_models_that_one_command_fitted_are_kept_and_edited(room, tmp_path, caps
         model["proposal"] = {"retrieval_confidence": wrong}
         kept.write_text(json.dumps([scan | {"aligned_models": [model]}]))
         assert main(words) == 2 and "aligned_models[0]" in capsys.readouterr().err
+
+
+def test_models_fitted_in_a_building_stand_beside_its_mesh_floor_by_floor(tmp_path, hull_cache, monkeypatch, capsys):
+    monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
+    house = tiny_raw.write_two_floors(tmp_path / "house")
+    (people,) = json.loads((house / "alignments.json").read_text())
+    (house / "alignments.json").unlink()
+    words = ["convert", str(house), str(tmp_path / "scene"), "--segment", "--overwrite", "structure_texture=64"]
+    main(words)
+    kept = house / "mesh_z_up.proposals.json"
+    (scan,) = json.loads(kept.read_text())
+    found = sorted((m["id_cad"], *m["trs"]["translation"]) for m in scan["aligned_models"])
+    known = sorted((m["id_cad"], *m["trs"]["translation"]) for m in people["aligned_models"])
+    # Upstairs stands a table too, which people left out.
+    assert [row[0] for row in found] == ["basket-a", "basket-a", "table-a", "table-a"]
+    from_scan = people["trs"]["translation"]
+    assert np.allclose([row[1:] for row in found[:3]], np.array([row[1:] for row in known]) - from_scan, atol=0.05)
+    assert made_of(tmp_path) == [["basket_0", "table_0"]] * 2
+    baskets = [m for m in scan["aligned_models"] if m["id_cad"] == "basket-a"]
+    kept.write_text(json.dumps([scan | {"aligned_models": baskets}]))
+    main(words)
+    assert f"{kept.name}: is there, kept" in capsys.readouterr().out.replace("\n", "")
+    assert made_of(tmp_path) == [["basket_0"]] * 2
+
+
+def made_of(folder):
+    """Names of what moves on each floor."""
+    scenes = [json.loads((folder / f"scene_{k}" / "scene.json").read_text()) for k in range(2)]
+    return [sorted(row["name"] for row in scene["objects"]) for scene in scenes]
 
 
 @pytest.mark.slow
