@@ -1,12 +1,13 @@
 """`python -m topological_nav.ros all|sim|navigator|check`: the simulator and the navigator as ROS nodes.
 
-Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop.
+Exit codes: 0 done, 2 on a user's error or a failed node of `all` (one line on stderr), 128 + signal when asked to stop.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import json
 import os
 import re
@@ -14,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
@@ -101,12 +103,27 @@ def _seeing(arguments: argparse.Namespace) -> Any:
 
 
 def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
-    del stops
+    """roslaunch from within: its program ends with 0 whatever became of its nodes."""
     debian.load()
+    roslaunch: Any = importlib.import_module("roslaunch")
     here = Path(__file__).parent
-    words = ("roslaunch", str(here / "episode.launch"), f"python:={sys.executable}", *arguments.words)
-    path = os.pathsep.join((str(here), os.environ.get("ROS_PACKAGE_PATH") or "/usr/share"))
-    os.execvpe(words[0], words, {**os.environ, "ROS_PACKAGE_PATH": path, "PWD": os.getcwd()})
+    os.environ["PWD"] = os.getcwd()  # told to episode.launch
+    os.environ["ROS_PACKAGE_PATH"] = f"{here}{os.pathsep}{os.environ.get('ROS_PACKAGE_PATH') or '/usr/share'}"
+    launched = str(here / "episode.launch"), [f"python:={sys.executable}", *arguments.words]
+    run = roslaunch.rlutil.get_or_generate_uuid(None, False)
+    roslaunch.configure_logging(run)
+    codes: dict[str, int | None] = {}  # of what ended by itself
+    try:
+        parent = roslaunch.parent.ROSLaunchParent(run, [launched])
+        parent.pm = roslaunch.pmon.start_process_monitor()  # before the launch: a node may fail at once
+        parent.pm.add_process_listener(SimpleNamespace(process_died=codes.__setitem__))
+        parent.start()
+        parent.spin()
+    except roslaunch.RLException as error:
+        raise debian.RosError(" ".join(str(error).split())) from None
+    failed = [f"{node} ended with exit code {code}" for node, code in codes.items() if code != 0]
+    if failed and not stops:
+        raise debian.RosError(f"{', '.join(failed)}; what it said is above")
 
 
 def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -30,6 +31,17 @@ def ros_or_skip():
     return pytest.importorskip("rosbags.rosbag1", reason="rosbags is not installed (pip install rosbags)")
 
 
+def run_all(base, *words):
+    """`all` in `base`, with a master of its own."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        master = f"http://localhost:{free.getsockname()[1]}"
+    environment = {**os.environ, "ROS_LOG_DIR": str(base / "log"), "ROS_MASTER_URI": master}
+    for name in ("ROS_IP", "ROS_HOSTNAME", "ROS_PACKAGE_PATH"):
+        environment.pop(name, None)
+    return subprocess.run([*PROGRAM, "all", *words], capture_output=True, text=True, env=environment, cwd=base)
+
+
 @pytest.fixture(scope="module")
 def episode(tmp_path_factory):
     rosbag1 = ros_or_skip()
@@ -40,16 +52,8 @@ def episode(tmp_path_factory):
     bag = base / "episode.bag"
     simulator = f"--lockstep engine=rays width=64 height=48 supersample=1 start={list(START)}".replace(", ", ",")
     words = [f"scene:={room.name}", f"sim:={simulator}", "navigator:=drive_s=2 heading_rad=0 linear_mps=0.5"]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        master = f"http://localhost:{free.getsockname()[1]}"
-    environment = {**os.environ, "ROS_LOG_DIR": str(base / "log"), "ROS_MASTER_URI": master}
-    for name in ("ROS_IP", "ROS_HOSTNAME", "ROS_PACKAGE_PATH"):
-        environment.pop(name, None)
     # What is relative is so to where the command was given.
-    ran = subprocess.run(
-        [*PROGRAM, "all", f"bag:={bag.name}", *words], capture_output=True, text=True, env=environment, cwd=base
-    )
+    ran = run_all(base, f"bag:={bag.name}", *words)
     assert ran.returncode == 0 and bag.is_file(), ran.stdout + ran.stderr
     told = next(line for line in ran.stdout.splitlines() if line.startswith("{"))
     store, read = get_typestore(Stores.ROS1_NOETIC), {}
@@ -118,6 +122,22 @@ def test_pictures_scans_and_clock_hold_what_was_sensed(episode):
     assert stamps == pytest.approx(sorted({m.clock.sec + 1e-9 * m.clock.nanosec for _, m in read[topics.CLOCK]}))
     # rosbag has its time from the clock, which goes its own way to it.
     assert [at for at, _ in read[topics.IMAGE]] == pytest.approx(stamps, abs=0.101)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["scene:=nowhere", "python:=nowhere"], "ended with exit code 127"),
+        (["scene:=nowhere"], r"simulator-\d+ ended with exit code 2; "),
+        ([], "requires the 'scene' arg to be set"),
+    ],
+)
+def test_a_failed_node_is_in_the_exit_code(words, told, tmp_path):
+    ros_or_skip()
+    ran = run_all(tmp_path, *words)
+    last = ran.stderr.splitlines()[-1]
+    assert ran.returncode == 2 and last.startswith("topological_nav.ros: ") and re.search(told, last), ran.stderr
 
 
 def test_without_a_master_the_navigator_says_so(monkeypatch, tmp_path, capfd):
