@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import mujoco
@@ -342,6 +343,7 @@ def write_obj(
         pairs, of = np.unique(np.stack([faces, uv_faces], axis=2).reshape(-1, 2), axis=0, return_inverse=True)
         lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
         lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv]
+        lines = [re.sub(r"\b0\.", ".", line) for line in lines]  # -0.25: every reader takes -.25
         names = [f"{v}/{t}" for v, t in pairs + 1]
         steps = np.hstack([vertices[pairs[:, 0]] * 10**decimals, uv[pairs[:, 1]] * 10**uv_decimals])
         for polygon in paired(of.reshape(-1, 3), steps):

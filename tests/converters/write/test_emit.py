@@ -69,7 +69,9 @@ def test_two_triangles_are_a_quad_where_every_reader_finds_the_same_two(tmp_path
     uv = vertices[:, :2] / 10
     assert paired(faces, 1e4 * np.hstack([vertices, uv])) == [[0, 1, 2, 3], [5, 6, 4, 7], [8, 9, 10], [9, 8, 11]]
     write_obj(tmp_path / "mesh.obj", vertices, faces, uv, faces)
-    polygons = [line.split()[1:] for line in (tmp_path / "mesh.obj").read_text().splitlines() if line[0] == "f"]
+    written = (tmp_path / "mesh.obj").read_text().splitlines()
+    assert "v .5 3 0" in written and "vt .1 .1" in written
+    polygons = [line.split()[1:] for line in written if line[0] == "f"]
     assert [len(polygon) for polygon in polygons] == [4, 4, 3, 3]
     own = trimesh.load(tmp_path / "mesh.obj", process=False)
     spec = mujoco.MjSpec()
