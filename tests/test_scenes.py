@@ -13,8 +13,8 @@ from PIL import Image
 
 from converters.check.gates import LIMITS, eroded, free_space_values, judge
 from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS, cad_model
+from converters.geometry.density import label_pieces
 from converters.recipes import load_recipes
-from converters.structure.maps import label_pieces
 from scenes_mjcf.schema import SceneManifest, load_manifest, load_maps
 
 ROOT = Path(__file__).parents[1]

@@ -15,9 +15,8 @@ from scipy.spatial.distance import pdist
 
 from converters.check.agreement import manifest_values, wall_values
 from converters.check.surfaces import surface_values
-from converters.geometry.density import clearance_m
+from converters.geometry.density import clearance_m, label_pieces
 from converters.records.gate import Gate, Limit
-from converters.structure.maps import label_pieces
 from interactive_nav_common.records import read_packaged
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
 

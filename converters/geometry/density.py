@@ -35,11 +35,12 @@ def clearance_m(free: np.ndarray, cell_m: float) -> np.ndarray:
     return distance * cell_m - cell_m / 2 * free
 
 
-def regions(mask: np.ndarray) -> np.ndarray:
-    """Connected regions, numbered from 1; 0 where the mask is False."""
-    out = np.zeros(mask.shape, np.int32)
-    ndimage.label(mask, output=out)
-    return out
+def label_pieces(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, int]:
+    """Numbered connected pieces and how many there are (`scipy.ndimage.label`, its type stated)."""
+    numbered = np.zeros(mask.shape, np.int32)
+    count = ndimage.label(mask, structure, output=numbered)
+    assert isinstance(count, int)
+    return numbered, count
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Ways:
     @classmethod
     def of(cls, static_free: np.ndarray, cell_m: float, radius_m: float) -> Ways:
         """Of a floor with nothing on it but what is fixed."""
-        return cls(cell_m, radius_m, regions(clearance_m(static_free, cell_m) >= radius_m))
+        return cls(cell_m, radius_m, label_pieces(clearance_m(static_free, cell_m) >= radius_m)[0])
 
     def must_push_share(self, room_m: np.ndarray) -> float:
         """Share of the pairs of places between which the disc finds no way that avoids everything.
@@ -67,7 +68,7 @@ class Ways:
         Returns:
             0 where nothing is in the way; 0 too where the disc fits nowhere.
         """
-        now = regions((room_m >= self.radius_m) & (self.region > 0))
+        now = label_pieces((room_m >= self.radius_m) & (self.region > 0))[0]
         here = now > 0
         with_movables = np.bincount(now[here]).astype(float)
         without = np.bincount(self.region[here]).astype(float)

@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.density import label_pieces
 from converters.geometry.faces import (
     count_samples,
     face_areas,
@@ -29,7 +30,7 @@ from converters.records.limits import CLOUD
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
 from converters.records.visual import ColourCloud
 from converters.structure.floor import LIFT_M
-from converters.structure.maps import FloorPlan, label_pieces
+from converters.structure.maps import FloorPlan
 from interactive_nav_common.rotations import yaw_matrix
 
 WALL_TOLERANCE_M, FLOOR_TOLERANCE_M = 0.04, 0.05

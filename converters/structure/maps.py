@@ -17,6 +17,7 @@ from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.density import label_pieces
 from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled, unit_normals
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
@@ -153,14 +154,6 @@ def swept_by_door(grid: Grid, placed: PlacedObject, margin_m: float = LEAF_MARGI
         turned = (flat - placed.hinge.origin_b) @ yaw_matrix(angle).T + placed.hinge.origin_b
         grid.add_below(mask, to_world(placed, turned), margin_m)
     return mask
-
-
-def label_pieces(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, int]:
-    """Numbered connected pieces and how many there are (`scipy.ndimage.label`, its type stated)."""
-    numbered = np.zeros(mask.shape, np.int32)
-    count = ndimage.label(mask, structure, output=numbered)
-    assert isinstance(count, int)
-    return numbered, count
 
 
 def _drop_small(mask: np.ndarray, least_cells: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import shapely
 from converters.generate.design.instance import Instance
 from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, Rect
-from converters.geometry.density import clearance_m, regions
+from converters.geometry.density import clearance_m, label_pieces
 
 GRID_M = 0.05
 
@@ -60,7 +60,7 @@ def room_mask(grid: np.ndarray, room: Rect) -> np.ndarray:
 
 def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float = 0.4) -> bool:
     """True where a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
-    region = regions(clearance_m(grid, GRID_M) >= radius_m)
+    region = label_pieces(clearance_m(grid, GRID_M) >= radius_m)[0]
     if not region.any():
         return False
     main = region == 1 + np.argmax(np.bincount(region.ravel())[1:])
@@ -75,5 +75,5 @@ def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
         masks: two of (n, n) bool.
         width_m: the disc's diameter.
     """
-    region = regions(room_m >= width_m / 2)
+    region = label_pieces(room_m >= width_m / 2)[0]
     return bool(set(np.unique(region[masks[0]])) & set(np.unique(region[masks[1]])) - {0})

@@ -16,7 +16,7 @@ from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.homes.arrange import Arrangement
 from converters.generate.homes.groups import LOW_M
-from converters.geometry.density import ROBOTS, clearance_m, regions
+from converters.geometry.density import ROBOTS, clearance_m, label_pieces
 from scenes_mjcf.categories import CATEGORIES
 
 CELL_M = 0.025
@@ -298,7 +298,7 @@ class Floor:
         free &= ~own | (self.covered[rows, columns] == 0)
         for box in boxes or []:
             free[here(box)] = False
-        region = regions(clearance_m(free, CELL_M) >= radius_m)
+        region = label_pieces(clearance_m(free, CELL_M) >= radius_m)[0]
         at = []
         for doorway in doorways:
             x, y = doorway.rect.centre
