@@ -1,6 +1,6 @@
 """Episode totals in, the Interactive Navigation Score out: pure functions on NumPy or JAX arrays.
 
-Interactive Gibson (Xia et al. 2019), section IV. Every function takes any leading batch axes and
+Interactive Gibson (Xia et al. 2020), section IV. Every function takes any leading batch axes and
 returns arrays of those axes; nothing here reads a simulator.
 """
 

@@ -173,6 +173,49 @@ def test_links_lead_to_files(page):
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+ROOMS = (*HOUSE, "interactive_nav_common", "results", "scenes_mjcf", "tests")
+A_PATH = re.compile(rf"(?<![\w./$-])(?:{'|'.join(ROOMS)})/[\w./-]*\w(?![\w$<{{*-])")
+MADE = re.compile(r"scenes_mjcf/(?:furnished|cluttered)/\w+_\d|scenes_mjcf/my_|docs/_build|/[A-Z]+(?:/|$)")
+"""Made by a command, or a place that the reader fills: `scenes_mjcf/NAME`."""
+FOREIGN = {"benchmarks/kitchen"}
+"""In the repository of `mujoco_warp`."""
+PROSE = [
+    *PAGES,
+    *(
+        ROOT / name
+        for name in ("CONTRIBUTING.md", "benchmarks/README.md", "scenes_mjcf/README.md", "scenes_mjcf/recipes.yaml")
+    ),
+    *sorted(p for room in ROOMS if room != "tests" for p in ROOT.glob(f"{room}/**/*.py")),
+]
+
+
+def missing_paths(text: str, page: Path) -> list[str]:
+    """Files and folders of this repository that a text names, from the root or its folder, and that do not exist."""
+    named = {path for path in A_PATH.findall(text) if not MADE.search(path)} - FOREIGN
+    places = {path: (ROOT / path, page.parent / path, ROOT / f"{path}.py") for path in named}
+    return sorted(path for path, tried in places.items() if not any(place.exists() for place in tried))
+
+
+def test_paths_that_are_named_exist():
+    wrong = {p.relative_to(ROOT): missing_paths(p.read_text(encoding="utf-8"), p) for p in PROSE}
+    assert {page: paths for page, paths in wrong.items() if paths} == {}
+
+
+def test_a_path_that_is_gone_is_found():
+    text = (
+        "`tests/test_docs.py`, `tests/gone/test_docs.py::test_a`, `train/configs`, `train/a.yaml`, `scenes_mjcf/NAME`"
+    )
+    assert missing_paths(text, ROOT / "README.md") == ["tests/gone/test_docs.py", "train/a.yaml"]
+
+
+def test_tests_that_are_named_exist():
+    defined = "\n".join(p.read_text(encoding="utf-8") for p in ROOT.glob("tests/**/test_*.py"))
+    pages = "\n".join(p.read_text(encoding="utf-8") for p in [*PAGES, ROOT / "CONTRIBUTING.md"])
+    named = set(re.findall(r"`(test_\w+_\w+)`", pages))
+    assert len(named) > 3
+    assert {name for name in named if f"def {name}(" not in defined} == set()
+
+
 def test_the_readme_is_read_in_three_minutes():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README_WORDS
 

@@ -1,6 +1,6 @@
 """A raw Gibson folder in, `RawScene` out; labels, alignments and maps are taken where they are.
 
-Files of the release: `docs/dataset.md` of iGibson 0.0.4; z up, metres, maps of 0.01 m a pixel whose middle is
+Files of the release: iGibson 0.0.4, `dataset.md`; z up, metres, maps of 0.01 m a pixel whose middle is
 the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest.
 """
 

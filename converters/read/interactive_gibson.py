@@ -1,6 +1,6 @@
 """A folder of the released interactive Gibson set in, `RawScene` out.
 
-Layout (`docs/dataset.md` of iGibson 0.0.4): `mesh_z_up_cleaned.obj` is the scan without the annotated furniture,
+Layout (iGibson 0.0.4, `dataset.md`): `mesh_z_up_cleaned.obj` is the scan without the annotated furniture,
 `plane_z_up_<f>.obj` floor for the holes it left, `alignment_centered_<i>_<synset>.urdf` a piece of furniture
 whose orientation and scale are baked into its mesh, `pos_<i>_<synset>.txt` the x y z of its origin; maps and
 `floors.txt` as in `gibson`.

@@ -1,7 +1,7 @@
 """InteractiveNav, a Brax environment: keys and actions in, states out; wiring only.
 
 `reset` and `step` are pure, jit-able and vmap-able; every constant is made in `__init__`. Episodes follow
-section IV of Interactive Gibson (Xia et al. 2019); where paper and code differ, `docs/design.md` says which
+section IV of Interactive Gibson (Xia et al. 2020); where paper and code differ, `docs/design.md` says which
 is meant.
 """
 

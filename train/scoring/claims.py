@@ -142,7 +142,7 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
 
     Args:
         rows: of `train.evaluate`.
-        split: of the scenes for all but the train/test claim; None: all.
+        split: of the scenes for all but the train and test claim; None: all.
     """
     means = run_means(rows, split)
     robots = sorted({run.robot for run in means})
