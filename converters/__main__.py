@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from converters.furniture_library import LIBRARY
 from converters.generating import GENERATING
 from converters.records.errors import StageFailed
 from converters.segmenting import SEGMENTING, label_unlabelled, propose_unproposed
@@ -216,7 +215,6 @@ RUNS: dict[str, Any] = {
     "check": _check,
     **GENERATING,
     **SEGMENTING,
-    "library": LIBRARY,
     "preview": _preview,
     "export": _export,
 }

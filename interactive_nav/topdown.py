@@ -76,9 +76,7 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
         raise ConfigError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
     check_scene(replay, scene)
     maps = scene.maps
-    rows, columns = maps.traversable.shape
-    x0, y0 = maps.origin_w
-    extent = (x0, x0 + columns * maps.resolution_m, y0, y0 + rows * maps.resolution_m)
+    extent = maps.extent_w
     axis.imshow(
         maps.traversable, origin="lower", extent=extent, cmap=ListedColormap(["0.75", "1.0"]), interpolation="nearest"
     )
@@ -111,9 +109,7 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
         f"P_eff {s['path_efficiency']:.2f}  E_eff {s['effort_efficiency']:.2f}  INS_0.5 {s['ins_0.5']:.2f}",
         fontsize=8,
     )
-    axis.set_xlim(extent[:2])
-    axis.set_ylim(extent[2:])
-    axis.set_aspect("equal")
+    axis.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
     axis.tick_params(labelsize=6)
     axis.set_xlabel("x [m]", fontsize=7)
     axis.set_ylabel("y [m]", fontsize=7)

@@ -32,19 +32,9 @@ def progress_bar(
 
 @contextlib.contextmanager
 def stage_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """One bar over the whole work, with the stage's name and the time left."""
-    with Progress(
-        TextColumn("{task.description:<16}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=False,
-    ) as bar:
-        task = bar.add_task("starting", total=1.0)
-        yield lambda stage, share: bar.update(task, description=stage, completed=share)
+    """One `progress_bar` over the whole work, with the stage's name."""
+    with progress_bar(console, "starting", 1.0) as update:
+        yield lambda stage, share: update(description=stage, completed=share)
 
 
 def warn_once(console: Console) -> Callable[[str], None]:

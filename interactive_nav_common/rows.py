@@ -1,9 +1,11 @@
-"""Tables of rows in, Parquet files out, whole or not at all, and back; Markdown."""
+"""Records of arrays taken in part and joined; tables of rows as Parquet files, whole or not at all, and as Markdown."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
@@ -71,3 +73,20 @@ def read_rows(paths: Sequence[Path]) -> pa.Table:
     order = rows.select(list(IDENTITY)).append_column("at", pa.array(np.arange(len(rows))))
     last = order.group_by(list(IDENTITY)).aggregate([("at", "max")])["at_max"].to_numpy()
     return rows.take(np.sort(last))
+
+
+class Rows:
+    """A dataclass all of whose fields are arrays of as many rows."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, dataclasses.fields(self)[0].name))  # type: ignore[arg-type]
+
+    def take(self, which: Any) -> Self:
+        """Some of the rows, by index or mask."""
+        return type(self)(*(getattr(self, f.name)[which] for f in dataclasses.fields(self)))  # type: ignore[arg-type]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The rows of all parts, one part after the other."""
+        names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -90,6 +90,12 @@ class SceneMaps:
     floor_height_m: float
     """Height of the floor in the scan's own frame (0 in the scene's)."""
 
+    @property
+    def extent_w(self) -> tuple[float, float, float, float]:
+        """Least and largest x, then y, m: what Matplotlib calls an image's extent."""
+        (x, y), (rows, columns) = self.origin_w, self.traversable.shape
+        return x, x + columns * self.resolution_m, y, y + rows * self.resolution_m
+
 
 def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
     """Builds a manifest from decoded JSON; `where` is the file named in errors.

@@ -71,19 +71,10 @@ class _Scene:
     surfaces: dict[str, TexturedMesh]
     """What is drawn, by body, in the world."""
 
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom, top of the map, m."""
-        x, y = self.maps.origin_w
-        rows, columns = self.maps.traversable.shape
-        return x, x + columns * self.maps.resolution_m, y, y + rows * self.maps.resolution_m
-
 
 def _frame(axes: Axes, scene: _Scene, title: str) -> None:
-    left, right, bottom, top = scene.extent
-    axes.set_xlim(left - MARGIN_M, right + MARGIN_M)
-    axes.set_ylim(bottom - 0.5, top + MARGIN_M)
-    axes.set_aspect("equal")
+    left, right, bottom, top = scene.maps.extent_w
+    axes.set(xlim=(left - MARGIN_M, right + MARGIN_M), ylim=(bottom - 0.5, top + MARGIN_M), aspect="equal")
     axes.set_title(title, fontsize=10)
     axes.axis("off")
     axes.plot([left, left + 1.0], [bottom - 0.3] * 2, color="black", linewidth=3, solid_capstyle="butt")
@@ -92,7 +83,7 @@ def _frame(axes: Axes, scene: _Scene, title: str) -> None:
 
 def _draw_surface(axes: Axes, scene: _Scene, surface: TexturedMesh, title: str) -> None:
     """What looks up of a surface, from above."""
-    left, right, bottom, top = scene.extent
+    left, right, bottom, top = scene.maps.extent_w
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     pixel_m = float((high - low).max()) / SURFACE_PIXELS
     image = from_above(surface, low, high, pixel_m)
@@ -112,7 +103,7 @@ def _scan_surface(scan: ScanMesh, vertices_w: np.ndarray, chosen: np.ndarray) ->
 
 def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float) -> None:
     """Everything at rest, seen from the south and by somebody who stands there."""
-    left, right, bottom, top = scene.extent
+    left, right, bottom, top = scene.maps.extent_w
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     wide = int(SLANTWISE * width_in * DPI)
     slantwise.imshow(from_the_south(scene.surfaces, scene.maps, low, high, wide), interpolation="nearest")
@@ -128,7 +119,7 @@ def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float)
 def _draw_ground(axes: Axes, scene: _Scene) -> None:
     """Traversable area and wall boxes."""
     shade = np.where(scene.maps.traversable[..., None], TRAVERSABLE, 1.0)
-    axes.imshow(shade, origin="lower", extent=scene.extent, interpolation="nearest")
+    axes.imshow(shade, origin="lower", extent=scene.maps.extent_w, interpolation="nearest")
     for name, _, geom in _geoms(scene.model):
         if name.startswith("wall_"):
             outline = geom_outline(scene.model, scene.data, geom, np.eye(3))
@@ -225,7 +216,7 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
 
 def draw(scene: _Scene, raw: RawScene | None) -> Figure:
     """Draws two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes."""
-    left, right, bottom, top = scene.extent
+    left, right, bottom, top = scene.maps.extent_w
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
     rows = 2 if raw is not None else 1
     width = max(COLUMNS * PANEL_IN * ratio, LEAST_WIDTH_IN)

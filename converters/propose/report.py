@@ -115,9 +115,7 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
     handles = [Patch(facecolor="none", edgecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
     handles.append(Patch(facecolor="none", edgecolor="black", linestyle=":", label="annotated model"))
     axes.legend(handles=handles, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, m (scan frame)")
-    axes.set_ylabel("y, m (scan frame)")
+    axes.set(aspect="equal", xlabel="x, m (scan frame)", ylabel="y, m (scan frame)")
     axes.set_title(f"{raw.name}: {len(found.proposals)} proposals, class and confidence")
     figure.tight_layout()
     figure.savefig(target, metadata={"Software": None})

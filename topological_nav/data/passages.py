@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from interactive_nav_common.rows import Rows
 from topological_nav.config import DataConfig
-from topological_nav.rows import Rows
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.space import FreeSpace
 

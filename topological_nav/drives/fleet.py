@@ -14,9 +14,9 @@ import numpy as np
 import interactive_nav
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rows import Rows
 from topological_nav.config import DriveConfig
 from topological_nav.drives.expert import CONTROL_S, Terrain, command, scan_points
-from topological_nav.rows import Rows
 from topological_nav.scenes.rendering import need_engine
 from topological_nav.scenes.simulation import episode_starts
 

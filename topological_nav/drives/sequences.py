@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
+from interactive_nav_common.rows import Rows
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
 from topological_nav.drives.expert import CONTROL_S
-from topological_nav.rows import Rows
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,9 +9,9 @@ from scipy.ndimage import label as components
 
 from interactive_nav.navigation.ways import PathGrid
 from interactive_nav.scenes.scene import Scene
+from interactive_nav_common.rows import Rows
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import SpaceError
-from topological_nav.rows import Rows
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.space import FreeSpace
 

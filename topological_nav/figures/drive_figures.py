@@ -136,7 +136,6 @@ def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
         values = [f"{v:+.2f}" for v in results["classes"][name]]
         axis.set_xticks(range(len(values)), values, fontsize=7)
         axis.set_yticks(range(len(values)), values, fontsize=7)
-        axis.set_xlabel(f"policy, {unit}")
-        axis.set_ylabel("expert")
+        axis.set(xlabel=f"policy, {unit}", ylabel="expert")
         axis.set_title(f"{name}, held-out steps", fontsize=9)
     return figure

@@ -60,11 +60,8 @@ def floor_plan(axis: Axes, space: FreeSpace) -> None:
         interpolation="nearest",
     )
     free = space.centres(0.0)
-    axis.set_xlim(free[:, 0].min() - 0.4, free[:, 0].max() + 0.4)
-    axis.set_ylim(free[:, 1].min() - 0.4, free[:, 1].max() + 0.4)
-    axis.set_aspect("equal")
-    axis.set_xticks([])
-    axis.set_yticks([])
+    (left, bottom), (right, top) = free.min(0) - 0.4, free.max(0) + 0.4
+    axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 
 
 def room_points(axis: Axes, points_w: np.ndarray, labels: np.ndarray, **style: Any) -> None:

@@ -41,8 +41,7 @@ def features_figure(
     for x, (kind, _) in enumerate(kinds):
         best = results["source"]["mean"][kind]
         scores.plot([x - 0.45, x + 0.45], [best, best], "k--", linewidth=1, label="in the source" if not x else None)
-    scores.set_xticks([0, 1], [label for _, label in kinds])
-    scores.set_ylim(0, 1)
+    scores.set(xticks=[0, 1], xticklabels=[label for _, label in kinds], ylim=(0, 1))
     scores.set_title("share of the target's held-out images localised", fontsize=9)
     scores.legend(fontsize=7)
     return figure
@@ -55,15 +54,13 @@ def passages_figure(
     figure, course, scores = _domains(source, target)
     for name, label in (("B", "B: fresh weights"), ("D", "D: the source's")):
         curves(course, [line for line in lines if line["phase"] == name], {"accuracy": label}, marker=".")
-    course.set_xlabel("epoch of fine-tuning")
-    course.set_ylim(0, 1)
+    course.set(xlabel="epoch of fine-tuning", ylim=(0, 1))
     course.set_title("accuracy on the images learned from", fontsize=9)
     names = ("A", "B", "C", "D")
     _bars(scores, np.arange(4), [results[name]["accuracy"] for name in names], 0.6, "tab:blue", None)
     scores.axhline(0.5, color="0.5", linewidth=0.8)
     words = ("A\nfresh", "B\nfresh,\nfine-tuned", "C\nsource", "D\nsource,\nfine-tuned")
-    scores.set_xticks(range(4), words)
-    scores.set_ylim(0, 1)
+    scores.set(xticks=range(4), xticklabels=words, ylim=(0, 1))
     scores.set_title(f"accuracy on {results['tested_on']} held-out target images", fontsize=9)
     return figure
 

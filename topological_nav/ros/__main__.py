@@ -19,10 +19,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import add_words, read_commands
-from scenes_mjcf.schema import SceneError
+from topological_nav.commands.progress import say
 from topological_nav.config import RUNS, NavigatorConfig
 from topological_nav.ros import debian
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
@@ -62,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+@reports_errors("topological_nav.ros")
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -72,12 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.settings = settings
     run = {"all": _all, "sim": _sim, "navigator": _navigator, "check": _check}
     with stop_signals() as stops:
-        try:
-            _refuse_unused(arguments)
-            run[arguments.command](arguments, stops)
-        except (UserError, SceneError) as error:
-            print(f"topological_nav.ros: {error}", file=sys.stderr)
-            return 2
+        _refuse_unused(arguments)
+        run[arguments.command](arguments, stops)
         return 128 + stops[0] if stops else 0
 
 
@@ -98,7 +95,7 @@ def _seeing(arguments: argparse.Namespace) -> Any:
         raise UserError("--driver topological needs a map: --map PATH")
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
     if chosen.told:
-        _tell(chosen.told)
+        say(chosen.told)
     return chosen
 
 
@@ -137,7 +134,7 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
         with contextlib.redirect_stdout(sys.stderr):  # Warp tells of its kernels there
             simulator = RosSimulator(arguments.scene, config)
             pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.recorded)
-            tally = SimulatorNode(ros, simulator, pace, _tell).run(lambda: bool(stops))
+            tally = SimulatorNode(ros, simulator, pace, say).run(lambda: bool(stops))
         print(json.dumps(tally.row()), flush=True)
 
 
@@ -157,18 +154,14 @@ def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
 
             goal = tuple(arguments.goal), arguments.goal_heading or 0.0
             driver = topological_driver(arguments.map, seeing, *goal, config)
-        node = NavigatorNode(ros, driver, arguments.heading_from, arguments.heading_offset, _tell)
+        node = NavigatorNode(ros, driver, arguments.heading_from, arguments.heading_offset, say)
         done = node.run(lambda: bool(stops))
-        _tell(f"navigator: {'done' if done else 'stopped'}")
+        say(f"navigator: {'done' if done else 'stopped'}")
 
 
 def _check(arguments: argparse.Namespace, stops: list[int]) -> None:
     del arguments, stops
     print(f"rospy: {debian.load().rospy.__file__}")
-
-
-def _tell(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -59,10 +59,8 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
         axis.legend(loc="lower left", fontsize=8)
     low_x, low_y = axis.get_xlim()[0], axis.get_ylim()[0]
     equal_ins(axis)
-    axis.set_xlim(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.12)
-    axis.set_ylim(low_y, 1.02)
-    axis.set_xlabel("P$_{eff}$: shortest path over path driven, 0 on failure")
-    axis.set_ylabel("E$_{eff}$: effort efficiency")
+    axis.set(xlim=(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.12), ylim=(low_y, 1.02))
+    axis.set(xlabel="P$_{eff}$: shortest path over path driven, 0 on failure", ylabel="E$_{eff}$: effort efficiency")
     axis.set_title(f"{title}\ngrey: equal INS$_{{0.5}}$, steps of 0.1", fontsize=9)
     return figure
 
@@ -172,12 +170,9 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
         axis.set_title(
             f"{style.robot_name(robot)}\nr over runs: {over_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
         )
-        axis.set_xlabel("kinematic term of E$_{eff}$")
-        axis.set_ylabel("dynamic term of E$_{eff}$")
+        axis.set(xlabel="kinematic term of E$_{eff}$", ylabel="dynamic term of E$_{eff}$", aspect="equal")
         low = max(0.0, 0.1 * np.floor(10 * min(x.min(), y.min())))
-        axis.set_xlim(low - 0.02, 1.02)
-        axis.set_ylim(low - 0.02, 1.02)
-        axis.set_aspect("equal")
+        axis.set(xlim=(low - 0.02, 1.02), ylim=(low - 0.02, 1.02))
     kinds = ((FREE, "episode"), (WALLS, "episode that touched a wall"))[: 1 + bool(touched.any())]
     dots = [style.handle(name, color=c, marker=".", linestyle="", markersize=6) for c, name in kinds]
     style.legend(figure, [*looks.algorithm_handles(linestyle=""), *looks.k_int_handles(linestyle=""), *dots], 4)
@@ -200,12 +195,10 @@ def seen_and_unseen(rows: pa.Table) -> Figure:
             axis.errorbar(i + shift, e.mean, e.half, fillstyle=fill, **look)
             x = np.full(len(runs), i + shift + 0.09 * np.sign(shift))
             axis.scatter(x, [run.ins(0.5) for run in runs], s=5, color="0.5", linewidths=0, zorder=1)
-    axis.set_xticks(range(len(order)))
     robot_too = len(looks.robots) > 1
     labels = [f"{style.name_of(a)}\n{k:g}" + (f"\n{style.robot_name(r)}" if robot_too else "") for r, a, k in order]
-    axis.set_xticklabels(labels, fontsize=7)
-    axis.set_xlabel("algorithm, k$_{int}$" + (", robot" if robot_too else ""))
-    axis.set_ylabel("INS$_{0.5}$")
+    axis.set_xticks(range(len(order)), labels, fontsize=7)
+    axis.set(xlabel="algorithm, k$_{int}$" + (", robot" if robot_too else ""), ylabel="INS$_{0.5}$")
     axis.grid(axis="x", visible=False)
     p = "" if math.isnan(test.p_value) else f", one-sample t test p {p_text(test.p_value)}"
     axis.set_title(
@@ -311,9 +304,7 @@ def _finish_plane(*axes: Axes) -> float:
     step = 0.1 if x[1] - x[0] + y[1] - y[0] > 0.6 else 0.01
     for axis in axes:
         equal_ins(axis, step)
-        axis.set_xlim(max(-0.02, x[0] - more_x), min(1.03, x[1] + more_x))
-        axis.set_ylim(max(-0.02, y[0] - more_y), min(1.01, y[1] + more_y))
+        axis.set(xlabel=style.P_LABEL, xlim=(max(-0.02, x[0] - more_x), min(1.03, x[1] + more_x)))
+        axis.set(ylabel=style.E_LABEL, ylim=(max(-0.02, y[0] - more_y), min(1.01, y[1] + more_y)))
         axis.grid(visible=False)
-        axis.set_xlabel(style.P_LABEL)
-        axis.set_ylabel(style.E_LABEL)
     return step

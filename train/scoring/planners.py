@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from interactive_nav.navigation.ways import Ways
-from interactive_nav.robots.spec import TwistMap
+from interactive_nav.robots.spec import RobotSpec, TwistMap
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
 
@@ -47,6 +47,15 @@ def velocity_towards(
     most, cruise = min(MAX_TURN_RAD_S, twist.max_angular_rad_s), min(cruise_m_s, twist.max_linear_m_s)
     speed_m_s = xp.where(xp.abs(bearing_rad) < aligned_rad, cruise * xp.cos(bearing_rad), 0.0)
     return speed_m_s, xp.clip(TURN_GAIN_PER_S * bearing_rad, -most, most)
+
+
+def need_twist(robot: RobotSpec, who: str) -> None:
+    """Raises `UserError` where a robot's control mode takes no base velocity."""
+    if robot.twist is None:
+        raise UserError(
+            f"{who}: robot '{robot.name}' takes no base velocity in control mode '{robot.control_mode}', expected one "
+            "of its modes that does; leave it out of --policies"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,11 +101,7 @@ class Planner(HostPolicy):
     def __init__(self, env: Any, weight: float | None):
         if weight is not None and not 0.0 <= weight <= 1.0:
             raise UserError(f"policy namo: weight is {weight}, expected between 0 and 1, as in namo:0.5")
-        if env.robot.twist is None:
-            raise UserError(
-                f"planners: robot '{env.robot.name}' takes no base velocity in control mode "
-                f"'{env.robot.control_mode}', expected one of its modes that does; leave them out of --policies"
-            )
+        need_twist(env.robot, "policy avoider" if weight is None else "policy namo")
         self._env, self._weight = env, weight
         self._ways = Ways(env, weight)
         self._plans: dict[int, Plan] = {}

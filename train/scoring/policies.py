@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from interactive_nav.robots import RobotSpec
 from interactive_nav_common.errors import UserError
-from train.scoring.planners import Planner, velocity_towards
+from train.scoring.planners import Planner, need_twist, velocity_towards
 
 Observation = jax.Array | Mapping[str, jax.Array]
 PolicyFn = Callable[[Observation, jax.Array], jax.Array]
@@ -68,11 +68,7 @@ def make_follower(env: Any) -> PolicyFn:
         UserError: the observation has no waypoints, or the robot's control mode takes no base velocity.
     """
     config = env.config
-    if env.robot.twist is None:
-        raise UserError(
-            f"policy follower: robot '{env.robot.name}' takes no base velocity in control mode "
-            f"'{env.robot.control_mode}', expected one of its modes that does; leave it out of --policies"
-        )
+    need_twist(env.robot, "policy follower")
     if "waypoints" not in config.sensors.observations:
         raise UserError(
             f"policy follower: observations are {', '.join(config.sensors.observations)}, "

@@ -14,6 +14,7 @@ import numpy as np
 
 from interactive_nav.pictures.replay import policy_key_of
 from interactive_nav.types import OF_OBJECTS
+from interactive_nav_common.rows import Rows
 from train.scoring.planners import HostPolicy
 from train.scoring.policies import PolicyFn
 
@@ -25,7 +26,7 @@ compilation and saves stepping the rest. On an accelerator a step costs about th
 
 
 @dataclasses.dataclass(frozen=True)
-class Paths:
+class Paths(Rows):
     """Where the robot went and what it moved, in the first E episodes; world frame, m."""
 
     scene_index: np.ndarray
@@ -202,18 +203,15 @@ def _joined(parts: list[PlayedEpisodes]) -> PlayedEpisodes:
         return parts[0]
     longest = max(part.paths.robot_xy_w.shape[1] for part in parts)
 
-    def along(name: str) -> np.ndarray:
-        arrays = [getattr(part.paths, name) for part in parts]
-        if name == "robot_xy_w":
-            pads = [((0, 0), (0, longest - a.shape[1]), (0, 0)) for a in arrays]
-            arrays = [np.pad(a, pad, constant_values=np.nan) for a, pad in zip(arrays, pads, strict=True)]
-        return np.concatenate(arrays)
+    def padded(paths: Paths) -> Paths:
+        more = ((0, 0), (0, longest - paths.robot_xy_w.shape[1]), (0, 0))
+        return dataclasses.replace(paths, robot_xy_w=np.pad(paths.robot_xy_w, more, constant_values=np.nan))
 
     return PlayedEpisodes(
         np.concatenate([part.scene_index for part in parts]),
         {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
         {name: np.concatenate([part.of_objects[name] for part in parts]) for name in OF_OBJECTS},
-        Paths(**{field.name: along(field.name) for field in dataclasses.fields(Paths)}),
+        Paths.joined([padded(part.paths) for part in parts]),
     )
 
 

@@ -8,7 +8,6 @@ one aside pays.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,7 +18,7 @@ from converters.generate.design.doors import DOOR_BOTTOM_M, door_leaf, wall_behi
 from converters.generate.design.instance import Instance, place
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
-from converters.generate.models.cad import LIBRARY, CadModel, cad_model
+from converters.generate.models.cad import CadModel, Models
 from converters.geometry.density import clearance_m
 
 SIDE_WALL_M = 0.35
@@ -45,7 +44,7 @@ CHECK_PLACES = 25
 class _Room:
     """What is taken so far: mutable, private to one furnishing attempt."""
 
-    def __init__(self, plan: Plan, effort: Effort):
+    def __init__(self, plan: Plan, cfg: BuildingConfig, effort: Effort):
         self.plan = plan
         self.effort = effort
         self.rooms = [shapely.box(r.x0, r.y0, r.x1, r.y1) for r in plan.rooms]
@@ -53,18 +52,7 @@ class _Room:
         self.kept_free = [_poly(doorway_zone(d, 0.75)) for d in plan.doorways]
         self.placed: list[Instance] = []
         self.room_of: list[int] = []
-        self.drawn: Counter[str] = Counter()
-
-    def draw_model(
-        self, category: str, cfg: BuildingConfig, rng: np.random.Generator, among: tuple[str, ...] = ()
-    ) -> tuple[CadModel, np.ndarray]:
-        """One of the category's models that were drawn least so far, and its scale (CAD units -> metres)."""
-        names = [m for m in among or cfg.models if LIBRARY[m].category == category]
-        least = min(self.drawn[m] for m in names)
-        names = [m for m in names if self.drawn[m] == least]
-        model = cad_model(names[rng.integers(len(names))])
-        self.drawn[model.name] += 1
-        return model, model.unit_m * (1 + rng.uniform(-cfg.scale_jitter, cfg.scale_jitter, 3))
+        self.models = Models(cfg.models, cfg.scale_jitter)
 
     def fits(self, item: Instance, room: int, gap_m: float = 0.06, zones: bool = True) -> bool:
         shape = item.footprint
@@ -167,7 +155,7 @@ def _narrow(
             return None
         if int(k) in used or not passes(clearance_m(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
             continue
-        model, scale = state.draw_model("chair", cfg, rng, cfg.passage_chairs)
+        model, scale = state.models.draw("chair", rng, cfg.passage_chairs)
         for _ in range(25):
             side = int(rng.integers(2))
             xy = np.array(d.rect.centre)
@@ -190,7 +178,7 @@ def _narrow(
 def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generator) -> Instance | None:
     """Tries to hang a leaf into doorway k where its sweep meets nothing."""
     plan, d = state.plan, state.plan.doorways[k]
-    model, _ = state.draw_model("door", cfg, rng)
+    model, _ = state.models.draw("door", rng)
     for side, jamb in rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
         room = d.rooms[int(side)]
         if cfg.leaves_at_walls and (
@@ -236,7 +224,7 @@ def hang_doors(
     Returns:
         Each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.
     """
-    state = _Room(plan, Effort())
+    state = _Room(plan, cfg, Effort())
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
     if not _hang_leaves(state, high, cfg, rng, first) and len(state.placed) < low:
         return None
@@ -247,7 +235,7 @@ def _attempt(
     plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, effort: Effort
 ) -> tuple[list[Instance], list[Instance]] | None:
     """One try: all furniture, and the blockers among it."""
-    state = _Room(plan, effort)
+    state = _Room(plan, cfg, effort)
     ranges = {c: getattr(cfg, f"n_{c}s") for c in ("chair", "table", "desk", "sofa", "door")}
     count = {c: int(rng.integers(low, high + 1)) for c, (low, high) in ranges.items()}
     if not _hang_leaves(state, count["door"], cfg, rng):
@@ -256,7 +244,7 @@ def _attempt(
     hosts: list[tuple[Instance, int]] = []
     for category in ("sofa", "desk", "table"):
         for _ in range(count[category]):
-            model, scale = state.draw_model(category, cfg, rng)
+            model, scale = state.models.draw(category, rng)
             # Large pieces go first to large rooms that are still empty.
             score = {
                 i: plan.rooms[i].area_m2 * rng.uniform(0.6, 1.4) / (1 + 1.5 * state.room_of.count(i)) for i in roomy
@@ -280,7 +268,7 @@ def _attempt(
         return None
     desks_first = sorted(hosts, key=lambda h: h[0].model.category)
     for n in range(count["chair"] - cfg.n_bottlenecks - cfg.n_blockers):
-        model, scale = state.draw_model("chair", cfg, rng)
+        model, scale = state.models.draw("chair", rng)
         item, room = None, 0
         if hosts:
             for host, room in [desks_first[(n + i) % len(hosts)] for i in range(len(hosts))]:

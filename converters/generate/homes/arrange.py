@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
@@ -19,7 +18,7 @@ import shapely
 
 from converters.generate.design.instance import Instance, place
 from converters.generate.homes.groups import TABLES, Group, Satellite
-from converters.generate.models.cad import LIBRARY, CadModel, cad_model
+from converters.generate.models.cad import CadModel, Models
 from scenes_mjcf.categories import CATEGORIES
 
 WALL_GAP_M = (0.02, 0.06)
@@ -97,28 +96,8 @@ def stand(piece: Piece, origin: np.ndarray, facing_rad: float) -> Instance:
     return place(piece.model, piece.scale, xy, facing_rad + piece.turn_rad)
 
 
-class Showroom:
-    """The CAD models that a home may use: draws those first that were drawn least. Mutable, private to one home."""
-
-    def __init__(self, models: tuple[str, ...], jitter: float):
-        self.jitter = jitter
-        self.drawn: Counter[str] = Counter()
-        self.by_category: dict[str, list[str]] = {}
-        for name in models:
-            self.by_category.setdefault(LIBRARY[name].category, []).append(name)
-
-    def has(self, category: str) -> bool:
-        """True where there is a model of it."""
-        return category in self.by_category
-
-    def draw(self, category: str, rng: np.random.Generator) -> tuple[CadModel, np.ndarray]:
-        """A model and its scale (CAD units -> metres)."""
-        names = self.by_category[category]
-        least = min(self.drawn[m] for m in names)
-        names = [m for m in names if self.drawn[m] == least]
-        model = cad_model(names[rng.integers(len(names))])
-        self.drawn[model.name] += 1
-        return model, model.unit_m * (1 + rng.uniform(-self.jitter, self.jitter, 3))
+class Showroom(Models):
+    """The CAD models that a home may use, as pieces of its groups. Mutable, private to one home."""
 
     def piece(self, category: str, rng: np.random.Generator) -> Piece:
         """A piece at the origin, facing along v."""

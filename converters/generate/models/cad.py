@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+from collections import Counter
 
 import numpy as np
 
@@ -132,3 +133,27 @@ def cad_model(name: str) -> CadModel:
     return CadModel(
         name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m, surface
     )
+
+
+class Models:
+    """The CAD models that a building may use: draws those first that were drawn least. Mutable, private to one."""
+
+    def __init__(self, names: tuple[str, ...], jitter: float):
+        """Of keys of `LIBRARY`, each scaled per axis by up to a fraction."""
+        self._jitter, self._drawn = jitter, Counter[str]()
+        self._by_category: dict[str, list[str]] = {}
+        for name in names:
+            self._by_category.setdefault(LIBRARY[name].category, []).append(name)
+
+    def has(self, category: str) -> bool:
+        """True where there is a model of it."""
+        return category in self._by_category
+
+    def draw(self, category: str, rng: np.random.Generator, among: tuple[str, ...] = ()) -> tuple[CadModel, np.ndarray]:
+        """A model of a category, or one of those `among` it, and its scale (CAD units -> metres)."""
+        names = among or self._by_category[category]
+        least = min(self._drawn[name] for name in names)
+        names = [name for name in names if self._drawn[name] == least]
+        model = cad_model(names[rng.integers(len(names))])
+        self._drawn[model.name] += 1
+        return model, model.unit_m * (1 + rng.uniform(-self._jitter, self._jitter, 3))
