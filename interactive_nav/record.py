@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from interactive_nav.pictures.camera import clear_way, straight_down
+from interactive_nav.pictures.camera import BEHIND_M, clear_way, straight_down
 from interactive_nav.pictures.replay import Replay, ReplayError, load, replay_path
 from interactive_nav.pictures.scene_model import ROBOT, SCENE
 from interactive_nav.pictures.views import (
@@ -45,8 +45,6 @@ from interactive_nav_common.rotations import yaw_from_quat
 from interactive_nav_common.words import add_words, program, read_commands
 
 FORMATS = (".mp4", ".gif", ".webp")
-BEHIND_M = {"follow": (1.8, 1.8), "eye": (2.6, 1.5)}
-"""Textured views from behind the robot: how far away, how high."""
 VIEWS = (*BEHIND_M, "above")
 CAMERA_PIXELS = 68
 """Depth and mask are rendered at the resolution of the paper's policies (section V)."""

@@ -12,16 +12,19 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.navigation.tables import furniture_map
+from interactive_nav.pictures.camera import BEHIND_M
 from interactive_nav.pictures.scene_model import furnished_spec
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.sensing.base import look_along
 from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.words import program
 
@@ -132,6 +135,14 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
 
     if robot is not None:
         put(robot.base_body, places[0], robot.spawn_height_m)
+        for view, (back_m, high_m) in BEHIND_M.items():
+            eye = np.array([-back_m, 0.0, high_m - robot.spawn_height_m])
+            pose = look_along(eye, [0.0, 0.0, robot.height_m / 2 - robot.spawn_height_m] - eye)
+            camera = spec.body(robot.base_body).add_camera(name=view, pos=eye, fovy=60.0)
+            camera.alt.type, camera.alt.xyaxes = (
+                mujoco.mjtOrientation.mjORIENTATION_XYAXES,
+                pose.axes_w[:, 1:].T.ravel(),
+            )
     for name, obj, xy in zip(body_names(small), small, places[len(radii) :], strict=True):
         put(name, xy, 0.0)
         add_shapes(spec.body(name), obj, name)
@@ -155,10 +166,20 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def open_browser(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> None:
-    """Serves mjviser's page until Ctrl-C; it opens on the whole scene."""
+    """Serves mjviser's page until Ctrl-C; it opens on the whole scene, or looks through the model's first camera."""
     viser, mjviser = importlib.import_module("viser"), importlib.import_module("mjviser")
     model.stat.extent /= 3  # mjviser looks from three extents away, and follows a body of its choice
-    viewer = mjviser.Viewer(model, data, server=viser.ViserServer(port=port))
+    server, camera = viser.ViserServer(port=port), model.vis.global_.cameraid
+
+    def draw(scene: Any) -> None:
+        scene.update_from_mjdata(data)
+        for client in server.get_clients().values() if camera >= 0 else ():
+            with client.atomic():
+                client.camera.position = data.cam_xpos[camera]
+                client.camera.look_at = data.cam_xpos[camera] - data.cam_xmat[camera].reshape(3, 3)[:, 2]
+                client.camera.fov = np.radians(model.cam_fovy[camera])
+
+    viewer = mjviser.Viewer(model, data, render_fn=draw, server=server)
     viewer.scene.camera_tracking_enabled = False
     viewer.run()
 
@@ -171,7 +192,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = made.parse_args(argv)
     robot = get_robot(arguments.robot) if arguments.robot else None
     small = pick(arguments.objects, arguments.small_objects)
+    if arguments.view != "whole" and robot is None:
+        raise ViewError(f"--view {arguments.view} is of a robot, and none is in the scene; add --robot NAME")
     model = build_model(arguments.scene, robot, small, arguments.seed)
+    if arguments.view != "whole":
+        model.vis.global_.cameraid = model.camera(arguments.view).id
     viewer = choose_viewer(arguments.viewer)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -26,6 +26,8 @@ from interactive_nav_common.errors import ConfigError, UserError
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
 VIEWS = ("robot", "top", "follow")
+BEHIND_M = {"follow": (1.8, 1.8), "eye": (2.6, 1.5)}
+"""Views of films and viewers: how far behind the robot and how high a camera is, m; it looks at its middle."""
 ENGINES = ("auto", "gl", "warp", "rays")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import types
 
@@ -82,7 +83,7 @@ def test_the_browsers_page_opens_on_the_whole_scene(room, monkeypatch):
     seen = {}
 
     class Viewer:
-        def __init__(self, model, data, server):
+        def __init__(self, model, data, render_fn, server):
             self.scene = types.SimpleNamespace(camera_tracking_enabled=True)
             seen.update(distance_m=3 * model.stat.extent, server=server, time=data.time)
 
@@ -95,6 +96,53 @@ def test_the_browsers_page_opens_on_the_whole_scene(room, monkeypatch):
     extent = float(model.stat.extent)
     view.open_browser(model, mujoco.MjData(model), 8123)
     assert seen == {"distance_m": pytest.approx(extent), "server": "port 8123", "time": 0.0, "tracking": False}
+
+
+@pytest.mark.parametrize(("name", "back_m", "high_m"), [("follow", 1.8, 1.8), ("eye", 2.6, 1.5)])
+def test_views_from_behind_look_at_the_robots_middle_as_films_do(two_rooms, monkeypatch, name, back_m, high_m):
+    shown, robot = [], get_robot("turtlebot")
+    monkeypatch.setattr(view.choose_viewer, "__defaults__", (yes, no))
+    monkeypatch.setattr(view, "open_window", lambda model, data: shown.append((model, data)))
+    assert view.main([str(two_rooms), "--robot", "turtlebot", "--objects", "0", "--view", name]) == 0
+    model, data = shown[0]
+    assert model.camera(model.vis.global_.cameraid).name == name
+    base, camera = data.body(robot.base_body), data.camera(name)
+    ahead = base.xmat.reshape(3, 3)[:, 0]
+    at = base.xpos * [1, 1, 0] - back_m * ahead + [0, 0, high_m]
+    np.testing.assert_allclose(camera.xpos, at, atol=2e-3)
+    to_middle = base.xpos * [1, 1, 0] + [0, 0, robot.height_m / 2] - at
+    np.testing.assert_allclose(-camera.xmat.reshape(3, 3)[:, 2], to_middle / np.linalg.norm(to_middle), atol=2e-3)
+    assert abs(camera.xmat.reshape(3, 3)[2, 0]) < 2e-3  # no roll
+
+
+def test_a_view_of_a_robot_needs_one(room, capsys):
+    assert view.main([str(room), "--view", "eye"]) == 2
+    assert "--view eye is of a robot, and none is in the scene; add --robot NAME" in capsys.readouterr().err
+
+
+def test_the_browsers_page_looks_through_the_robots_camera(two_rooms, monkeypatch):
+    client = types.SimpleNamespace(camera=types.SimpleNamespace(), atomic=contextlib.nullcontext)
+    server = types.SimpleNamespace(get_clients=lambda: {0: client})
+
+    class Viewer:
+        def __init__(self, model, data, render_fn, server):
+            self.scene = types.SimpleNamespace(camera_tracking_enabled=True, update_from_mjdata=lambda data: None)
+            self._draw = render_fn
+
+        def run(self):
+            self._draw(self.scene)
+
+    monkeypatch.setitem(sys.modules, "viser", types.SimpleNamespace(ViserServer=lambda port: server))
+    monkeypatch.setitem(sys.modules, "mjviser", types.SimpleNamespace(Viewer=Viewer))
+    model = view.build_model(two_rooms, get_robot("turtlebot"), [])
+    model.vis.global_.cameraid = model.camera("eye").id
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    view.open_browser(model, data, 8123)
+    eye = data.camera("eye")
+    np.testing.assert_allclose(client.camera.position, eye.xpos)
+    np.testing.assert_allclose(client.camera.position - client.camera.look_at, eye.xmat.reshape(3, 3)[:, 2])
+    assert client.camera.fov == pytest.approx(np.pi / 3)
 
 
 def test_what_is_placed_stands_free_at_rest_and_is_seen(two_rooms):
