@@ -24,7 +24,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=f"settings (key=default):\n{config_io.help_text()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    known = ", ".join(config_io.presets())
+    known = ", ".join(config_io.known_in())
     source = made.add_mutually_exclusive_group(required=True)
     source.add_argument("--config", metavar="NAME|PATH", help=f"a preset ({known}) or a YAML file")
     source.add_argument("--resume", metavar="RUN_DIR", help="continue this run folder with its own config")

@@ -47,9 +47,9 @@ def _parsed(text: str, where: str) -> Any:
     return Reader(ConfigError, "expected settings, see --help", finite=False).decoded(text, "YAML", where)
 
 
-def presets() -> list[str]:
-    """Names that `--config` knows."""
-    return sorted(path.stem for path in PRESET_DIR.glob("*.yaml"))
+def known_in(folder: Path = PRESET_DIR) -> list[str]:
+    """Names of a folder's YAML files: those that `--config` knows, or of `SWEEP_DIR` those of sweeps."""
+    return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
 def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tuple[Path, Any]:
@@ -62,7 +62,7 @@ def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tup
     if path.suffix not in (".yaml", ".yml"):
         path = folder / f"{name_or_path}.yaml"
         if not path.is_file():
-            known = sorted(file.stem for file in folder.glob("*.yaml"))
+            known = known_in(folder)
             raise ConfigError(
                 f"{told}no {what} {name_or_path!r}{nearest(name_or_path, known)}; "
                 f"expected one of {', '.join(known)}, or the path of a .yaml file"

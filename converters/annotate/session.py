@@ -22,8 +22,7 @@ from converters.bodies.alignment import (
     apply_alignment,
     solve_alignment,
 )
-from converters.geometry.rotations import Y_UP_TO_Z_UP
-from converters.propose.proposals import Proposal, bounds, scan2cad_list, scan2cad_trs
+from converters.propose.proposals import Proposal, scan2cad_list, scan2cad_model
 from converters.propose.retrieval import read_library
 from converters.read.annotations import inside_scan, parse_annotations
 from converters.read.files import SourceFolder, read_json
@@ -181,23 +180,14 @@ def start(raw: RawScene, proposals: tuple[Proposal, ...]) -> Session:
 
 def as_annotations(session: Session, library: Mapping[str, CadModel]) -> list[dict[str, Any]]:
     """The accepted objects as Scan2CAD's annotation list."""
-    synset, models = {category: key for key, category in SYNSETS.items()}, []
+    models = []
     for item in session.items:
         if item.state != "accepted":
             continue
         cad, fit = library[item.cad_id], item.fit()
-        low, high = bounds(cad.vertices @ Y_UP_TO_Z_UP)
         clicked, seen = item.points()
-        points = {"keypoints_cad": apply_alignment(fit, clicked) @ Y_UP_TO_Z_UP, "keypoints_scan": seen @ Y_UP_TO_Z_UP}
-        models.append(
-            {"catid_cad": synset[item.category], "id_cad": item.cad_id, "sym": item.symmetry}
-            | {"trs": scan2cad_trs(fit.scale, fit.yaw, fit.translation)}
-            | {"bbox": np.round((high - low) / 2, 6).tolist(), "center": np.round((high + low) / 2, 6).tolist()}
-            | {
-                key: {"n_keypoints": item.pairs, "position": np.round(at, 6).ravel().tolist()}
-                for key, at in points.items()
-            }
-        )
+        pose, pairs = (fit.scale, fit.yaw, fit.translation), (apply_alignment(fit, clicked), seen)
+        models.append(scan2cad_model(item.category, item.cad_id, pose, cad.vertices, item.symmetry, pairs))
     return scan2cad_list(session.scan_id, models)
 
 

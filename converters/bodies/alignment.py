@@ -168,7 +168,7 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
             found = least_squares(p[keep], q[keep], round_model)
         except AlignmentError:
             return None
-        if best is None or found.rms_m < best[1].rms_m:
+        if len(keep) == k - count and (best is None or found.rms_m < best[1].rms_m):
             best = (keep, found)
         return found
 
@@ -180,12 +180,9 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
     for _ in range(RANDOM_STARTS):
         keep = np.sort(rng.choice(k, 5, replace=False))
         for _ in range(20):
-            found = offer(keep) if len(keep) == k - count else None
+            found = offer(keep)
             if found is None:
-                try:
-                    found = least_squares(p[keep], q[keep], round_model)
-                except AlignmentError:
-                    break
+                break
             closest = np.sort(np.argsort(_squared(found, p, q), kind="stable")[: k - count])
             if np.array_equal(closest, keep):
                 break

@@ -36,6 +36,7 @@ from interactive_nav_common.rotations import yaw_matrix
 
 VOXEL_M = 0.03
 """Chairs that touch at 0.05 m stay apart at 0.03 m in the sample scan."""
+NO_POINTS = np.zeros((0, 3))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,12 +128,40 @@ def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def scan2cad_trs(scale: np.ndarray, yaw: float, translation: np.ndarray) -> dict[str, list[float]]:
-    """Scan2CAD's scale, quaternion (w x y z) and translation in a y-up world; arguments are z up."""
+def scan2cad_model(
+    category: str,
+    cad_id: str,
+    pose: tuple[np.ndarray, float, np.ndarray],
+    vertices: np.ndarray,
+    symmetry: str = "__SYM_NONE",
+    pairs: tuple[np.ndarray, np.ndarray] = (NO_POINTS, NO_POINTS),
+) -> dict[str, Any]:
+    """One model of Scan2CAD's list, whose world is y up; arguments are z up.
+
+    Args:
+        category: its class.
+        cad_id: in its library; "" where none is chosen.
+        pose: scale (3,), yaw (rad) and translation (3,) m of the upright model.
+        vertices: (n, 3) of the model, CAD frame.
+        symmetry: Scan2CAD's word.
+        pairs: (k, 3) points of the model under its pose and of the scan, m, that were clicked.
+    """
+    (scale, yaw, translation), (low, high) = pose, bounds(vertices @ Y_UP_TO_Z_UP)
     return {
-        "scale": np.round([scale[0], scale[2], scale[1]], 6).tolist(),
-        "rotation": np.round([math.cos(yaw / 2), 0.0, math.sin(yaw / 2), 0.0], 9).tolist(),
-        "translation": np.round(Y_UP_TO_Z_UP.T @ translation, 6).tolist(),
+        "catid_cad": next(key for key, own in SYNSETS.items() if own == category),
+        "id_cad": cad_id,
+        "sym": symmetry,
+        "trs": {
+            "scale": np.round([scale[0], scale[2], scale[1]], 6).tolist(),
+            "rotation": np.round([math.cos(yaw / 2), 0.0, math.sin(yaw / 2), 0.0], 9).tolist(),
+            "translation": np.round(Y_UP_TO_Z_UP.T @ translation, 6).tolist(),
+        },
+        "bbox": np.round((high - low) / 2, 6).tolist(),
+        "center": np.round((high + low) / 2, 6).tolist(),
+        **{
+            f"keypoints_{side}": {"n_keypoints": len(at), "position": np.round(at @ Y_UP_TO_Z_UP, 6).ravel().tolist()}
+            for side, at in zip(("cad", "scan"), pairs, strict=True)
+        },
     }
 
 
@@ -147,39 +176,22 @@ def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int,
         proposals: of it.
         chosen: proposal's index -> `Retrieval` (model and pose), where one was found.
     """
-    synset = {category: key for key, category in SYNSETS.items()}
     models = []
-    empty = {"n_keypoints": 0, "position": []}
     for k, proposal in enumerate(proposals):
-        found = (chosen or {}).get(k)
-        entry: dict[str, Any] = {
-            "catid_cad": synset[proposal.category],
-            "id_cad": "",
-            "sym": "__SYM_NONE",
-            "trs": scan2cad_trs(proposal.extent_m, proposal.yaw, proposal.centre),
-            "bbox": [0.5, 0.5, 0.5],
-            "center": [0.0, 0.0, 0.0],
-            "keypoints_cad": empty,
-            "keypoints_scan": empty,
-            "proposal": {
-                "category": proposal.category,
-                "confidence": proposal.confidence,
-                "label": proposal.label,
-                "n_voxels": proposal.n_voxels,
-                "extent_m": np.round(proposal.extent_m, 4).tolist(),
-            },
+        about: dict[str, Any] = {
+            "category": proposal.category,
+            "confidence": proposal.confidence,
+            "label": proposal.label,
+            "n_voxels": proposal.n_voxels,
+            "extent_m": np.round(proposal.extent_m, 4).tolist(),
         }
-        if found is not None:
-            low, high = bounds(found.cad.vertices @ Y_UP_TO_Z_UP)
-            entry |= {
-                "catid_cad": synset[found.cad.category],
-                "id_cad": found.cad.cad_id,
-                "trs": scan2cad_trs(found.pose.scale, found.pose.yaw, found.pose.translation),
-                "bbox": np.round((high - low) / 2, 6).tolist(),
-                "center": np.round((high + low) / 2, 6).tolist(),
-            }
-            entry["proposal"] |= {"retrieval_confidence": found.confidence, "residual_m": found.residual_m}
-        models.append(entry)
+        cube, pose = np.array([[-0.5], [0.5]]).repeat(3, 1), (proposal.extent_m, proposal.yaw, proposal.centre)
+        entry = scan2cad_model(proposal.category, "", pose, cube)
+        if (found := (chosen or {}).get(k)) is not None:
+            pose = found.pose.scale, found.pose.yaw, found.pose.translation
+            entry = scan2cad_model(found.cad.category, found.cad.cad_id, pose, found.cad.vertices)
+            about |= {"retrieval_confidence": found.confidence, "residual_m": found.residual_m}
+        models.append(entry | {"proposal": about})
     return scan2cad_list(scan_id, models)
 
 

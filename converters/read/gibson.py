@@ -32,11 +32,6 @@ MAP_SHARE = 0.5
 """Of a map's traversable area that must lie inside the mesh, and of the mesh's floor that must lie on the map."""
 
 
-def looks_like(root: Path) -> bool:
-    """True when the folder has Gibson's z-up mesh."""
-    return (root / MESH).is_file()
-
-
 def read_gibson(root: Path, strict: bool = False) -> RawScene:
     """Reads mesh, texture, labels, floor heights, maps, alignments and CAD models.
 

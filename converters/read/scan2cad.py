@@ -19,11 +19,6 @@ ANNOTATION = "full_annotations.json"
 LICENCE = "ScanNet terms of use and ShapeNet terms of use: research only, no redistribution"
 
 
-def looks_like(root: Path) -> bool:
-    """True when the folder has Scan2CAD's annotation file."""
-    return (root / ANNOTATION).is_file()
-
-
 def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
     """Reads `full_annotations.json`, `scan/<id>_vh_clean_2.ply`, its `.labels.ply` and `cad/`.
 

@@ -15,14 +15,15 @@ from converters.records.raw import RawScene
 
 READERS = {
     "interactive-gibson": (interactive_gibson.looks_like, interactive_gibson.read_interactive_gibson),
-    "gibson": (gibson.looks_like, gibson.read_gibson),
-    "scan2cad": (scan2cad.looks_like, scan2cad.read_scan2cad),
-    "sdf": (sdf.looks_like, sdf.read_sdf),
-    "habitat": (habitat.looks_like, habitat.read_habitat),
-    "mjcf": (mjcf.looks_like, mjcf.read_mjcf),
-    "sh3d": (sh3d.looks_like, sh3d.read_sh3d),
+    "gibson": (lambda root: (root / gibson.MESH).is_file(), gibson.read_gibson),
+    "scan2cad": (lambda root: (root / scan2cad.ANNOTATION).is_file(), scan2cad.read_scan2cad),
+    "sdf": (sdf.worlds_of, sdf.read_sdf),
+    "habitat": (habitat.scenes_of, habitat.read_habitat),
+    "mjcf": (mjcf.mains_of, mjcf.read_mjcf),
+    "sh3d": (lambda root: len(list(root.glob(f"*{sh3d.ENDING}"))) == 1, sh3d.read_sh3d),
     **{name: (scanned.looks_like(name), scanned.reader(name)) for name in scanned.COLLECTIONS},
 }
+"""Layout -> what of a folder shows it, if anything does; its reader."""
 FILES = {
     (".world", ".sdf"): (sdf.root_of, sdf.read_sdf),
     (habitat.SCENE,): (habitat.root_of, habitat.read_habitat),
@@ -40,8 +41,8 @@ def detect_format(source: Path) -> str:
     Raises:
         SceneRejected: no known layout.
     """
-    for name, (looks_like, _) in READERS.items():
-        if looks_like(source):
+    for name, (shows, _) in READERS.items():
+        if source.is_dir() and shows(source):
             return name
     if not source.exists():
         raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")

@@ -29,7 +29,7 @@ def test_round_trip_of_every_kind_of_value():
     assert from_yaml("") == TrainConfig()
 
 
-@pytest.mark.parametrize("name", config_io.presets())
+@pytest.mark.parametrize("name", config_io.known_in())
 def test_presets_load_resolve_and_differ_only_where_they_say(name):
     config = load(name)
     resolved = resolve(config, "native")

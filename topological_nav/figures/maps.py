@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,22 +13,16 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from interactive_nav_common.files import whole_file
 from topological_nav.data.dataset import load_plan, load_rooms, read_header
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route
 from topological_nav.scenes.space import FreeSpace
+from train.figures import style
 from train.figures.style import panels, plt
 
 PALETTE = [*plt.get_cmap("tab20").colors[::2], *plt.get_cmap("tab20").colors[1::2]]  # type: ignore[attr-defined]
 """Colours of rooms; after twenty they repeat."""
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Writes a PNG whole or not at all, and forgets the figure."""
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=130, format="png")
-    plt.close(figure)
+save = functools.partial(style.save, dpi=130)
 
 
 def curves(axis: Axes, lines: Sequence[Mapping[str, Any]], labels: Mapping[str, str], **style: Any) -> None:

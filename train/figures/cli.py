@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 
 from interactive_nav_common.errors import FileError, readable, reports_errors
-from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from interactive_nav_common.words import program
@@ -24,7 +23,6 @@ from train.figures.tables import document
 from train.scoring.row_files import PATHS
 from train.scoring.statistics import run_means
 
-import matplotlib.pyplot as plt  # isort: skip
 from matplotlib.figure import Figure  # isort: skip
 
 SWEPT = {"run", "robot", "algorithm", "k_int", "seed", "policy", "split", "kinematic_effort", "dynamic_effort"}
@@ -180,9 +178,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, draw in figures_of(Path(arguments.results), split):
         path = Path(arguments.out) / f"{name}.{arguments.format}"
         with style.applied():
-            figure = draw()
-            with whole_file(path) as partial:
-                figure.savefig(partial, format=arguments.format)
-        plt.close(figure)
+            style.save(draw(), path, arguments.format)
         print(path)
     return 0

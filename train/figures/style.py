@@ -13,6 +13,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.statistics import Estimate
 
@@ -100,6 +101,13 @@ class Looks:
         """For a legend."""
         grey = {"color": "0.3", "marker": "o"}
         return [handle(f"k$_{{int}}$ = {k:g}", **{**grey, **self.k_int(k), **more}) for k in self.k_ints]
+
+
+def save(figure: Figure, path: Path, kind: str = "png", dpi: float | None = None) -> None:
+    """Writes a picture of a kind whole or not at all, and forgets the figure; without `dpi` as the style says."""
+    with whole_file(path) as partial:
+        figure.savefig(partial, format=kind, dpi=dpi)
+    plt.close(figure)
 
 
 def handle(label: str, **look: Any) -> Line2D:

@@ -14,6 +14,7 @@ from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
+from train.config_io import known_in
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
@@ -30,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
         f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done (or in another sweep's hands), "
         "1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal"
     )
-    table, known = Path(__file__).parents[1] / "words.yaml", ", ".join(spec.known_sweeps())
+    table, known = Path(__file__).parents[1] / "words.yaml", ", ".join(known_in(spec.SWEEP_DIR))
     return program(table, "sweep", told, known=known, step=STEP, stages=STAGES)
 
 

@@ -140,11 +140,6 @@ class Sweep:
     runs: tuple[RunSpec, ...]
 
 
-def known_sweeps() -> list[str]:
-    """Names of the sweeps that come with the package."""
-    return sorted(path.stem for path in SWEEP_DIR.glob("*.yaml"))
-
-
 def load(name_or_path: str) -> Sweep:
     """Reads a sweep by name or path.
 

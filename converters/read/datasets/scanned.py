@@ -51,7 +51,7 @@ COLLECTIONS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Colle
 def looks_like(name: str) -> Callable[[Path], bool]:
     """Whether a folder is a scene of a collection."""
     first = COLLECTIONS[name].marks[0]
-    return lambda root: root.is_dir() and any(root.glob(first))
+    return lambda root: any(root.glob(first))
 
 
 def reader(name: str) -> Callable[[Path, bool], RawScene]:

@@ -40,11 +40,6 @@ def scenes_of(root: Path) -> list[Path]:
     return sorted(root.rglob(f"*{SCENE}"))
 
 
-def looks_like(root: Path) -> bool:
-    """True when the folder has a scene file."""
-    return root.is_dir() and bool(scenes_of(root))
-
-
 def root_of(scene: Path) -> Path:
     """The folder of the dataset that a scene file belongs to: the nearest one with a dataset's config, if any."""
     near = scene.resolve().parents[:4]

@@ -55,11 +55,6 @@ def _tag(path: Path) -> str:
         return ""
 
 
-def looks_like(root: Path) -> bool:
-    """True when the folder has an MJCF file."""
-    return root.is_dir() and bool(mains_of(root))
-
-
 def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
     """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one.
 

@@ -40,11 +40,6 @@ def worlds_of(root: Path) -> list[Path]:
     return sorted(found or [p for folder in (root, root / "worlds") for p in folder.glob("*.sdf")])
 
 
-def looks_like(root: Path) -> bool:
-    """True when the folder has a world file."""
-    return bool(worlds_of(root))
-
-
 def root_of(world: Path) -> Path:
     """The folder whose world a file is."""
     return world.resolve().parents[1 if world.resolve().parent.name == "worlds" else 0]

@@ -75,11 +75,6 @@ _TABLES: dict[str, dict[str, Any]] = read_packaged(Path(__file__).with_suffix(".
 FOREIGN = {word: category for category, words in _TABLES["words"].items() for word in words}
 
 
-def looks_like(root: Path) -> bool:
-    """True when the folder has one drawing."""
-    return root.is_dir() and len(list(root.glob(f"*{ENDING}"))) == 1
-
-
 def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
     """Reads the only drawing of a folder, or the chosen one.
 

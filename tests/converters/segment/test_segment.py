@@ -13,7 +13,7 @@ import trimesh
 
 from converters.__main__ import main
 from converters.generate import GenerationError
-from converters.propose.proposals import scan2cad_trs
+from converters.propose.proposals import scan2cad_model
 from converters.propose.retrieval import read_library
 from converters.read.meshes import labels_beside
 from converters.read.source import read_source
@@ -224,8 +224,8 @@ def test_models_that_one_command_fitted_are_kept_and_edited(room, tmp_path, caps
     (scan,) = json.loads(kept.read_text())
     assert scan["aligned_models"] == [] and f"{kept.name}: 0 models" in capsys.readouterr().out.replace("\n", "")
     chair = read_library(None)["Scopia_kids_desk_chair"]
-    trs = scan2cad_trs(np.ones(3), 0.3, np.array([0.2, -0.1, floor_m - chair.vertices[:, 2].min()]))
-    model = {"catid_cad": "03001627", "id_cad": chair.cad_id, "trs": trs, "proposal": {"retrieval_confidence": 0.5}}
+    pose = np.ones(3), 0.3, np.array([0.2, -0.1, floor_m - chair.vertices[:, 2].min()])
+    model = scan2cad_model("chair", chair.cad_id, pose, chair.vertices) | {"proposal": {"retrieval_confidence": 0.5}}
     edited = json.dumps([scan | {"aligned_models": [model]}])
     kept.write_text(edited)
     main(words)

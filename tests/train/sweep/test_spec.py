@@ -11,6 +11,7 @@ import yaml
 
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf import sets
+from train.config_io import known_in
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.folder import SweepFolder, words_of_evaluation
@@ -135,8 +136,8 @@ def test_every_sweep_of_the_package_can_be_run(monkeypatch):
     of_set = sets._members
     homes = ["cluttered_000", "cluttered_001"]
     monkeypatch.setattr(sets, "_members", lambda word: homes if word.startswith("cluttered/") else of_set(word))
-    assert {"kint", "cluttered"} <= set(spec.known_sweeps())
-    for name in spec.known_sweeps():
+    assert {"kint", "cluttered"} <= set(known_in(spec.SWEEP_DIR))
+    for name in known_in(spec.SWEEP_DIR):
         assert spec.load(name).runs
     sweep = spec.load("cluttered")
     assert {len(run.config.env.scenes) for run in sweep.runs} == {2} and len(sweep.runs) == 54
