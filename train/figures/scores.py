@@ -45,7 +45,7 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
         axis.annotate(
             f"w = {float(weight):g}" if kind == "namo" else policy,
             (x.mean(), y.mean()),
-            xytext=(6, 5) if right else (-6, 5),
+            xytext=(8, 32 * float(weight) - 20) if kind == "namo" else (6 if right else -6, 5),
             ha="left" if right else "right",
             textcoords="offset points",
             fontsize=8,
@@ -59,7 +59,7 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
         axis.legend(loc="lower left", fontsize=8)
     low_x, low_y = axis.get_xlim()[0], axis.get_ylim()[0]
     equal_ins(axis)
-    axis.set(xlim=(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.12), ylim=(low_y, 1.02))
+    axis.set(xlim=(min(low_x, 0.0) if low_x < 0.2 else low_x, 1.12), ylim=(min(low_y, 0.8), 1.02))
     axis.set(xlabel="P$_{eff}$: shortest path over path driven, 0 on failure", ylabel="E$_{eff}$: effort efficiency")
     axis.set_title(f"{title}\ngrey: equal INS$_{{0.5}}$, steps of 0.1", fontsize=9)
     return figure

@@ -32,8 +32,6 @@ class Finding:
 
 def _verdict(test: Contrast, expected: str) -> str:
     """What a contrast says to a claim that expects higher, lower or same."""
-    if expected == "same" and test.verdict == "undecided":
-        return "no significant difference"
     if math.isnan(test.p_value):
         return "too few runs to test"
     return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
