@@ -108,7 +108,7 @@ def distance_field(
     if resolution <= 0:
         raise ValueError(f"resolution is {resolution} m, expected a positive cell side")
     if radius_m > 0:
-        traversable = erode(np.asarray(traversable), resolution, radius_m)
+        traversable = clearance(np.asarray(traversable), resolution) >= radius_m
     free = jnp.asarray(traversable, bool)
     rows, columns = free.shape
     goal = jnp.asarray(goal_xy, jnp.float32)
@@ -136,22 +136,9 @@ def distance_field(
     return field
 
 
-def erode(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
-    """Cells whose centre a disc of `radius_m` may occupy: blocked cells and the map's edge keep clear.
-
-    Args:
-        traversable: [rows, columns] bool.
-        resolution_m: cell side.
-        radius_m: body radius.
-
-    Returns:
-        [rows, columns] bool.
-    """
-    return clearance(traversable, resolution_m) >= radius_m
-
-
 def clearance(traversable: np.ndarray, resolution_m: float) -> np.ndarray:
-    """[rows, columns] metres from each cell's centre to the nearest blocked cell's border (0 if blocked)."""
+    """[rows, columns] metres from each cell's centre to the border of the nearest cell that is blocked, or lies beyond
+    the map (0 if blocked itself): a disc of no larger radius may stand there."""
     padded = np.pad(np.asarray(traversable, bool), 1)
     distance = np.asarray(scipy.ndimage.distance_transform_edt(padded), float)[1:-1, 1:-1]
     return np.maximum(distance - 0.5, 0.0) * resolution_m

@@ -25,6 +25,8 @@ class Stopped(Exception):
     """A signal asked to stop; carries its number. What was done is kept, and the same command goes on."""
 
 
+Progress = Callable[[str, int, int], None]
+"""Told what is done, how much of it, and of how much; may raise to stop."""
 Asked = Callable[[], int]
 """Asked at places where work can stop: the number of the signal that wants it to; 0: go on."""
 

@@ -269,7 +269,7 @@ def test_the_original_grid_is_longer_than_ours():
 def test_erosion_keeps_a_disc_clear_of_walls():
     free = np.ones((20, 20), bool)
     free[:, 0] = False
-    eroded = geodesic.erode(free, 0.1, 0.24)
+    eroded = geodesic.clearance(free, 0.1) >= 0.24
     # Column c's centre is (c - 0.5) * 0.1 m from the wall's face at column 0's right border.
     assert not eroded[10, 2] and eroded[10, 3]
     assert not eroded[1, 10] and eroded[3, 10] and not eroded[19, 10]  # the map's edge counts as a wall

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
 
 from rich.console import Console
 
 from interactive_nav_common.progress import progress_bar
-from topological_nav.errors import Asked, Stopped
-
-Tell = Callable[[str, int, int], None]
-"""Told what is done, how much of it, and of how much."""
+from topological_nav.errors import Asked, Progress, Stopped
 
 
-def stopping(tell: Tell, stops: list[int]) -> Tell:
+def stopping(tell: Progress, stops: list[int]) -> Progress:
     """The same, which raises `Stopped` before the end once `stops` has a signal (see `signals.stop_signals`)."""
 
     def told(what: str, done: int, total: int) -> None:

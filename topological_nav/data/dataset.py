@@ -24,10 +24,10 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_arrays
 from topological_nav.config import DataConfig
-from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
+from topological_nav.data.folders import Folder, draw_missing, load_scenes
 from topological_nav.data.passages import Passages, draw_passages, held_out
 from topological_nav.data.shards import read_arrays, read_shards
-from topological_nav.errors import DatasetError, SpaceError
+from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space, spread

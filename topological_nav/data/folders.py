@@ -21,11 +21,9 @@ from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import CameraConfig
 from topological_nav.data.shards import THREADS, in_order, write_shard
-from topological_nav.errors import DatasetError
+from topological_nav.errors import DatasetError, Progress
 from topological_nav.scenes.rendering import SceneRenderer, need_engine
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is drawn or driven, how much of it is done, and of how much."""
 Config = TypeVar("Config", bound=CameraConfig)
 
 

@@ -26,12 +26,12 @@ from interactive_nav.sensing.base import CameraPose
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
-from topological_nav.data.folders import Folder, Progress, draw_missing, load_scenes
+from topological_nav.data.folders import Folder, draw_missing, load_scenes
 from topological_nav.data.shards import read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
-from topological_nav.errors import DatasetError, SpaceError
+from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import scene_rooms

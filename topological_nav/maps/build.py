@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from interactive_nav_common.files import whole_file
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings
 from topological_nav.data.folders import lens_of
-from topological_nav.errors import SpaceError
+from topological_nav.errors import Progress, SpaceError
 from topological_nav.learn.localise import nearest_turn
 from topological_nav.learn.pairs import load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
@@ -34,7 +34,6 @@ from topological_nav.scenes.space import FreeSpace, free_space
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""
-Progress = Callable[[str, int, int], None]
 CPU_SUPERSAMPLE = 2
 """Beyond it drawing is what a CPU mostly does, and the networks answer nearly the same (docs/topological.md)."""
 

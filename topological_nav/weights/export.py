@@ -18,7 +18,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -36,7 +36,7 @@ from interactive_nav_common.versions import versions
 from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
-from topological_nav.errors import MapError, RunError
+from topological_nav.errors import MapError, Progress, RunError
 from topological_nav.learn.pairs import SAME, camera_of, load_pair
 from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
 from topological_nav.learn.training import Trained, load_trained
@@ -48,7 +48,6 @@ from topological_nav.weights.packaged import ABOUT
 FORMAT = 1
 PRECISION = "fp16"
 VERSIONS = "versions.json"
-Progress = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
