@@ -28,6 +28,8 @@ from rich.console import Console
 import interactive_nav
 from benchmarks.measurement import TABLE, append_row, command_line, origin, random_driving, timed
 from interactive_nav.physics import resolve_backend
+from interactive_nav.physics.nearness import widths_at
+from interactive_nav.physics.tiers import KINDS, propose_tiers
 from interactive_nav.physics.window import Window
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
@@ -42,6 +44,8 @@ CHUNK = 20
 """Steps in one compiled scan."""
 LEFT_OUT_SHARE = 0.005
 """Of environment steps: windows are proposed that are too small in fewer."""
+TIER_SHARES = ((0.7,), (0.7, 0.2), (0.5, 0.3, 0.15))
+"""Of the batch, in smaller windows: for which tiers are proposed."""
 SETTLED_STEPS = 10
 """Of an episode, after which objects that were laid out lie still."""
 SETTINGS = {"free": "active_furniture", "small": "active_small", "hinge": "active_doors", "walls": "active_walls"}
@@ -156,6 +160,7 @@ def simulation(
         if i % 10 == 0:
             memory.append(_gpu_memory_mib())
     nav, physics = state.info["nav"], env.physics
+    tiers = getattr(physics, "tiers", (physics,) if hasattr(physics, "window") else ())
     rate, clock = statistics.median(rates), env.config.physics
     return {
         "env_steps_per_s": round(rate),
@@ -167,9 +172,9 @@ def simulation(
         "running": {name: int(getattr(nav, name).sum()) for name in FAILURES if hasattr(nav, name)},
         "peak_memory_mib": _peak_memory_mib(),
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
-        "contacts_per_env": getattr(physics, "contacts_per_env", None),
-        "constraints_per_env": getattr(physics, "constraints_per_env", None),
-        "nv": getattr(physics, "window", physics).model.nv if hasattr(physics, "window") else physics.nv,
+        "nv": tiers[-1].window.model.nv if tiers else physics.nv,
+        "tiers_nv": [tier.window.model.nv for tier in tiers],
+        "tiers_buffers": [(tier.contacts_per_env, tier.constraints_per_env) for tier in tiers],
         "movables": int(env.world.occupied.sum(1).max()),
     }
 
@@ -185,7 +190,7 @@ def windows(
     batch, window = AutoResetEnv(env), Window(env.world, env.config)
     state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
     program = jax.jit(random_driving(_counting(batch.step), (num_envs, env.action_size), 10))
-    needs = jax.jit(jax.vmap(window.needs))
+    needs = jax.jit(jax.vmap(lambda *x: window.needs(window.measure(*x))))
     counted: dict[str, list[np.ndarray]] = {kind: [] for kind in SETTINGS}
     for i in range(max(1, steps // 10)):
         state, _ = program(state, jax.random.PRNGKey(1 + i))
@@ -195,9 +200,7 @@ def windows(
             counted[kind].append(np.asarray(count)[settled])
     counts = {kind: np.concatenate(values) for kind, values in counted.items()}
     shares = (0.5, 0.9, 0.99, 0.995, 0.999, 1.0)
-    least = 1 - LEFT_OUT_SHARE / len(counts)
-    # At least one: 0 stands for all.
-    proposed = {k: max(1, int(np.quantile(c, least, method="higher"))) for k, c in counts.items()}
+    proposed = widths_at(counts, 1 - LEFT_OUT_SHARE / len(counts))
     widths = {kind: width or np.inf for kind, width in window.widths.items()}
 
     def left_out(widths: Mapping[str, float]) -> float:
@@ -210,6 +213,13 @@ def windows(
         "left_out_share": left_out(widths),
         "proposed": {SETTINGS[kind]: width for kind, width in proposed.items()},
         "proposed_left_out_share": left_out(proposed),
+        "tiers": [
+            {
+                "windows": [" ".join(map(str, tier)) for tier in tiers],
+                "too_small_shares": [left_out(dict(zip(KINDS, tier[1:], strict=True))) for tier in tiers],
+            }
+            for tiers in (propose_tiers(counts, shares) for shares in TIER_SHARES)
+        ],
     }
 
 

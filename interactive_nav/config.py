@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from interactive_nav.camera_config import CameraNoise, CameraView, FovDeg, ImageSide
 from interactive_nav_common.config import (
@@ -131,6 +132,34 @@ WINDOW = ("active_furniture", "active_small", "active_doors", "active_walls")
 """Settings that size what MJX simulates at a time."""
 
 
+class Tier(NamedTuple):
+    """A share of the batch, and what there is room for in its windows."""
+
+    share: float
+    furniture: int
+    small: int
+    doors: int
+    walls: int
+
+
+def parse_tiers(words: Sequence[str]) -> tuple[Tier, ...]:
+    """Tiers as the setting `windows` writes them.
+
+    Raises:
+        ConfigError: they are not five numbers each, fill the batch, or one is narrower than that before it.
+    """
+    try:
+        tiers = tuple(Tier(float(s), *map(int, widths)) for s, *widths in map(str.split, words))
+        good = all(t.share > 0 and min(t[1:]) >= 0 for t in tiers) and sum(t.share for t in tiers) < 1
+        good &= all(a <= b for one, two in itertools.pairwise(tiers) for a, b in zip(one[1:], two[1:], strict=True))
+    except (TypeError, ValueError):
+        good, tiers = False, ()
+    if not good:
+        expected = 'such as ["0.7 2 1 1 12", "0.2 3 2 1 20"]: "share furniture small doors walls", none narrower than'
+        raise ConfigError(f"windows is {list(words)}, expected {expected} the one before, and shares below 1 in all")
+    return tiers
+
+
 @dataclasses.dataclass(frozen=True)
 class PhysicsConfig(Settings):
     """How the world is simulated. With backend auto, settings of all backends may stand side by side."""
@@ -162,6 +191,10 @@ class PhysicsConfig(Settings):
     """MJX backends: doors simulated at a time (auto: likewise; 0: all)."""
     active_walls: Natural | None = None
     """MJX backends: wall boxes that can be met at a time (auto: likewise; 0: all)."""
+    windows: tuple[str, ...] | None = ()
+    """MJX backends: smaller windows than that of `active_*`, for environments that need less: each "share furniture
+    small doors walls", such as "0.7 2 1 1 12", smallest first; what is left of the batch gets the whole window (auto:
+    measured in these scenes; (): one window for all)."""
     sleep: bool = True
     """Native backend: objects at rest sleep until touched."""
     threads: Natural = 0
@@ -170,6 +203,7 @@ class PhysicsConfig(Settings):
     IDLE = (
         (" ".join(WINDOW), "backend auto, jax or warp, or 0 (all)",
          lambda c: c.backend != "native"),
+        ("windows", "backend auto, jax or warp, or ()", lambda c: c.backend != "native"),
         ("contacts_per_env constraints_per_env", "backend auto or warp", lambda c: c.backend in ("auto", "warp")),
         ("threads", "backend auto or native", lambda c: c.backend in ("auto", "native")),
     )  # fmt: skip
@@ -179,6 +213,7 @@ class PhysicsConfig(Settings):
         control, sim = self.control_dt_s, self.sim_dt_s
         if abs(control / sim - round(control / sim)) > 1e-6:
             raise ConfigError(f"sim_dt_s is {sim}, expected a divisor of control_dt_s ({control} s)")
+        parse_tiers(self.windows or ())
 
     @property
     def substeps(self) -> int:

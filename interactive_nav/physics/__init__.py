@@ -50,7 +50,12 @@ def make_physics(world: World, config: NavConfig) -> Physics:
         return NativePhysics(world, config)
     from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
-    return (WarpPhysics if backend == "warp" else JaxPhysics)(world, config)
+    engine = WarpPhysics if backend == "warp" else JaxPhysics
+    if physics.windows == ():
+        return engine(world, config)
+    from interactive_nav.physics.tiers import TieredPhysics
+
+    return TieredPhysics(engine, world, config)
 
 
 __all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

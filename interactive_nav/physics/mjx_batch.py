@@ -20,6 +20,7 @@ from mujoco import mjx
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces, uncommitted
+from interactive_nav.physics.nearness import Measured
 from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import Window
 from interactive_nav.robots.spec import RobotState
@@ -31,6 +32,8 @@ from interactive_nav.scenes.world import World
 # contact matches; and the solver's iteration limit. A test compares them with the engine's.
 _DROPPED = 0b1011111
 _UNCONVERGED = 1 << 9
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+"""First of the kinds of constraint rows that are contacts'."""
 CCD_PER_ENV = 32
 """Pairs of boxes per environment that Warp's convex collider has room for at once; more are counted as overflow."""
 
@@ -38,8 +41,8 @@ CCD_PER_ENV = 32
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap; what the two implementations do apart is theirs."""
 
-    def __init__(self, world: World, config: NavConfig):
-        self.window = Window(world, config)
+    def __init__(self, world: World, config: NavConfig, window: Window | None = None):
+        self.window = window or Window(world, config)
         physics = config.physics
         self._world, self._substeps = world, physics.substeps
         self.nv = world.models[0].nv
@@ -85,9 +88,9 @@ class MjxPhysics(Physics):
         ctrl = self._world.robot.controls(command, robot, jnp)
         return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
 
-    def _step_one(self, template: mjx.Data, scene, state: PhysicsState, command, time_s):
+    def _step_one(self, template: mjx.Data, measured: Measured, scene, state: PhysicsState, command, time_s):
         window = self.window
-        chosen, walls, missed = window.select(scene, state)
+        chosen, walls, missed = window.select(measured)
         fields = window.fields(scene, chosen, walls)
         model = self._model.replace(
             **{name: value.reshape(getattr(self._model, name).shape) for name, value in fields.items()}
@@ -106,8 +109,14 @@ class MjxPhysics(Physics):
         return out, (window.spread_forces(forces, chosen), contacts), failures, missed
 
     def step_batch(self, scene, state, command, time_s):
+        return self.step_measured(jax.vmap(self.window.measure)(scene, state), scene, state, command, time_s)
+
+    def step_measured(
+        self, measured: Measured, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array
+    ) -> tuple[PhysicsState, StepSignals]:
+        """`step_batch` where what is near is known: leaves [N, ...]."""
         one = functools.partial(self._step_one, self._template(scene.shape[0]))
-        new, (forces, contacts), failures, missed = jax.vmap(one)(scene, state, command, time_s)
+        new, (forces, contacts), failures, missed = jax.vmap(one)(measured, scene, state, command, time_s)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
         return new, StepSignals(
             **summarise_forces(forces, jnp, contacts, self._forces),
@@ -123,9 +132,9 @@ class WarpPhysics(MjxPhysics):
 
     name = "warp"
 
-    def __init__(self, world: World, config: NavConfig):
+    def __init__(self, world: World, config: NavConfig, window: Window | None = None):
         keep_collector_out()
-        super().__init__(world, config)
+        super().__init__(world, config, window)
         if not (self.contacts_per_env and self.constraints_per_env):
             measured = measure_buffers(world, self.window)
             self.contacts_per_env = self.contacts_per_env or measured[0]
@@ -168,8 +177,8 @@ class JaxPhysics(MjxPhysics):
     name = "jax"
     tells_convergence = False
 
-    def __init__(self, world: World, config: NavConfig):
-        super().__init__(world, config)
+    def __init__(self, world: World, config: NavConfig, window: Window | None = None):
+        super().__init__(world, config, window)
         layout = self.window.layout
         self._slot_of_geom = _slot_of_geom(layout, self._host)
         self._rolls = rolling_geoms(self._host, world.robot, layout.robot_bodies)
@@ -269,15 +278,7 @@ def measure_buffers(world: World, window: Window, head_room: float = 1.6) -> tup
         slots = [np.sort(per_body[world.layout.slot_body[g.slots]])[::-1][: g.width].sum() for g in window.groups]
         own = int(sum(slots)) + int(per_body[world.layout.robot_bodies].sum())
         contacts = max(contacts, own)
-        rows = max(rows, own * max(2 * (dims - 1), 1) + (data.nefc - data.ne - _contact_rows(data)))
+        rows = max(rows, own * max(2 * (dims - 1), 1) + (data.nefc - data.ne - (data.efc_type >= _CONTACT).sum()))
     extra = 24
     contacts, rows = int(contacts * head_room) + extra, int(rows * head_room) + 4 * extra
     return contacts, -(-rows // 16) * 16
-
-
-def _contact_rows(data: mujoco.MjData) -> int:
-    kinds = [
-        int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS),
-        int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
-    ]
-    return int(np.isin(data.efc_type, kinds).sum())

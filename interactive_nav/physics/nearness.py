@@ -7,6 +7,9 @@ the boxes' shadows and between their centres (separating axes).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -35,6 +38,8 @@ _PLACES = 4000
 """Of the robot, at which a window's size is measured: of all scenes together, but at least 200 in each."""
 _SHARE = 0.999
 """Of these places a window has room for what stands near."""
+Measured = tuple[Any, Any, Any]
+"""What `Nearness.measure` returns."""
 
 
 @flax.struct.dataclass
@@ -123,7 +128,7 @@ class Nearness:
             gap = xp.where((push_m[one] < 0) & (used > 0), xp.minimum(gap, behind), gap)
         return gap
 
-    def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> tuple[Array, Array, Array]:
+    def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> Measured:
         """How far each slot is from where it can be met: within `reach_m` of the robot, or `TOUCH_M` of what moves.
 
         Returns:
@@ -145,8 +150,8 @@ class Nearness:
         walls = self._walls_gap_m(scene, state, reach_m, boxes, jnp.where(occupied, push, FAR_M))
         return jnp.where(occupied, gap, FAR_M), moving, walls
 
-    def widths(self, reach_m: float) -> dict[str, int]:
-        """How many of each kind of slot, and of walls, a window needs: at rest, with the robot anywhere on free floor.
+    def counts(self, reach_m: float) -> dict[str, np.ndarray]:
+        """[P] how many of each kind of slot, and of walls, are near at rest, the robot anywhere on free floor.
 
         Small objects lie anywhere, too.
         """
@@ -170,8 +175,12 @@ class Nearness:
                 for kind in ("small", "free", "hinge"):
                     counts[kind].append(int(near[kinds == kind].sum()))
                 counts["walls"].append(int((walls < 0).sum()))
-        # At least one: 0 stands for all.
-        return {k: max(1, int(np.quantile(c, _SHARE, method="higher"))) for k, c in counts.items()}
+        return {kind: np.asarray(values) for kind, values in counts.items()}
+
+
+def widths_at(counts: Mapping[str, np.ndarray], share: float = _SHARE) -> dict[str, int]:
+    """Of each kind, what suffices in this share of the counts; at least one, since 0 stands for all."""
+    return {k: max(1, int(np.quantile(c, share, method="higher"))) for k, c in counts.items()}
 
 
 def _rest(world: World, s: int) -> tuple[np.ndarray, ...]:

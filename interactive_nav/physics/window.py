@@ -9,7 +9,10 @@ whole building.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -19,13 +22,15 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.physics.nearness import REACH_M, Nearness
+from interactive_nav.physics.nearness import REACH_M, Measured, Nearness, widths_at
 from interactive_nav.scenes.layout import Layout
 from interactive_nav.scenes.spec import FEET, build_empty_spec
 from interactive_nav.scenes.world import World
 
 _MOVING_BONUS_M = 2.0
 """Moving objects rank as if they were this much nearer."""
+_FIRST_M = 1e3
+"""What can be met, or moves, ranks before all else: where there is room for what is needed, nothing is left out."""
 
 _BODY = (
     *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
@@ -74,50 +79,69 @@ class Window:
         physics = config.physics
         limits = {"small": physics.active_small, "free": physics.active_furniture, "hinge": physics.active_doors}
         model = world.models[0]
-        slots: list[tuple[str, int]] = []
-        picked = []
         self._slots = {kind: np.flatnonzero(kinds == kind) for kind in limits}
         self._nearness = Nearness(world)
         self._reach_m = world.robot.footprint_radius_m + REACH_M
         walls = physics.active_walls
         if None in (*limits.values(), walls):
-            needed = self._nearness.widths(self._reach_m)
+            needed = widths_at(self.needs_at_rest)
             limits = {kind: needed[kind] if limit is None else limit for kind, limit in limits.items()}
             walls = needed["walls"] if walls is None else walls
         self.widths = {**limits, "walls": walls}
         """Kind of slot, and `walls` -> how many at a time; 0: all."""
-        for kind, limit in limits.items():
-            own = self._slots[kind]
-            width = min(limit or len(own), len(own))
-            boxes = max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=FEET) - FEET
-            if width:
-                picked.append((own, width, len(slots), boxes))
-                slots += [(kind, boxes)] * width
-        n_walls = int(model.body_geomnum[layout.structure_body])
-        self.n_walls = min(walls or n_walls, n_walls)
-        self.spec, self.model, self.layout = build_empty_spec(world.robot, tuple(slots), self.n_walls, config)
-        self.groups = tuple(self._group(*p) for p in picked)
-        self._wall_tables, self._wall_rows = self._walls()
+        there = {kind: len(own) for kind, own in self._slots.items()}
+        there["walls"] = int(model.body_geomnum[layout.structure_body])
+        self._boxes = {
+            kind: max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=FEET) - FEET
+            for kind, own in self._slots.items()
+        }
+        self._tables = {kind: self._group_tables(kind) for kind, own in self._slots.items() if len(own)}
+        self._wall_tables = self._walls()
+        self._fit({kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}, config)
+
+    def narrower(self, widths: Mapping[str, int], config: NavConfig) -> Window:
+        """One with the same tables and at most these numbers of slots and walls, literally; one wall at least."""
+        made = copy.copy(self)
+        least = {**widths, "walls": max(1, widths["walls"])}
+        made._fit({kind: min(least[kind], room) for kind, room in self.room.items()}, config)
+        return made
+
+    def _fit(self, room: dict[str, int], config: NavConfig) -> None:
+        self.room = room
+        """Kind of slot, and `walls` -> how many there is room for."""
+        self.n_walls = self.room["walls"]
+        slots = tuple((kind, self._boxes[kind]) for kind in self._tables for _ in range(self.room[kind]))
+        self.spec, self.model, self.layout = build_empty_spec(self.world.robot, slots, self.n_walls, config)
+        self.groups, first = (), 0
+        for kind, (tables, outer) in self._tables.items():
+            width = self.room[kind]
+            rows, _ = _rows(self.model, self.layout, np.arange(first, first + width), self._boxes[kind], kind)
+            self.groups += (_Group(self._slots[kind], width, first, tables, rows, outer),)
+            first += width
+        self._wall_rows = self.model.body_geomadr[self.layout.structure_body] + np.arange(self.n_walls)
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
         self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
 
-    def _group(self, own: np.ndarray, width: int, first: int, boxes: int) -> _Group:
+    @functools.cached_property
+    def needs_at_rest(self) -> dict[str, np.ndarray]:
+        """[P] of each kind of slot, and of walls: needed with the robot at random places, everything at rest."""
+        return self._nearness.counts(self._reach_m)
+
+    def _group_tables(self, kind: str) -> tuple[dict[str, jax.Array], dict[str, np.ndarray]]:
         tables: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
         outer: dict[str, np.ndarray] = {}
         for model in self.world.models:
-            outer, padding = _rows(model, self.world.layout, own, boxes)
+            outer, padding = _rows(model, self.world.layout, self._slots[kind], self._boxes[kind], kind)
             hidden = _HIDDEN | {"geom_pos": model.body_ipos[outer["body_ipos"]][:, None]}
             for name, rows in outer.items():
                 values = getattr(model, name)[rows]
                 if name in hidden:
                     values = np.where(padding.reshape(padding.shape + (1,) * (values.ndim - 2)), hidden[name], values)
                 tables[name].append(values)
-        rows, _ = _rows(self.model, self.layout, np.arange(first, first + width), boxes)
-        stacked = {name: jnp.asarray(np.stack(values), jnp.float32) for name, values in tables.items()}
-        return _Group(own, width, first, stacked, rows, outer)
+        return {name: jnp.asarray(np.stack(values), jnp.float32) for name, values in tables.items()}, outer
 
-    def _walls(self) -> tuple[dict[str, jax.Array], np.ndarray]:
+    def _walls(self) -> dict[str, jax.Array]:
         world, body = self.world, self.world.layout.structure_body
         start, count = world.models[0].body_geomadr[body], world.models[0].body_geomnum[body]
         own = np.arange(start, start + count)
@@ -125,40 +149,39 @@ class Window:
         poses = [_static_poses(m) for m in world.models]
         tables["xpos"] = np.stack([xpos[own] for xpos, _ in poses])
         tables["xmat"] = np.stack([xmat[own] for _, xmat in poses])
-        rows = self.model.body_geomadr[self.layout.structure_body] + np.arange(self.n_walls)
-        return {k: jnp.asarray(v, jnp.float32) for k, v in tables.items()}, rows
+        return {k: jnp.asarray(v, jnp.float32) for k, v in tables.items()}
 
-    def select(self, scene: jax.Array, state: PhysicsState) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array]:
+    def measure(self, scene: jax.Array, state: PhysicsState) -> Measured:
+        """See `Nearness.measure`: of one environment's scene, [] i32, and state of the whole world."""
+        return self._nearness.measure(scene, state, self._reach_m)
+
+    def select(self, measured: Measured) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array]:
         """What goes into the window of one environment.
-
-        Args:
-            scene: [] i32.
-            state: of the whole world.
 
         Returns:
             Per group [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something
             within reach had to be left out.
         """
-        near, moving, walls = self._nearness.measure(scene, state, self._reach_m)
+        near, moving, walls = measured
         chosen, missed = [], jnp.zeros((), bool)
         for group in self.groups:
             if group.width == len(group.slots):
                 chosen.append(jnp.arange(group.width))
                 continue
             gap, moves = near[group.slots], moving[group.slots]
-            _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * moves), group.width)
-            left_out = jnp.ones(len(group.slots), bool).at[index].set(False)
-            missed |= jnp.any(left_out & ((gap < 0) | moves))
+            needed = (gap < 0) | moves
+            _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * moves - _FIRST_M * needed), group.width)
+            missed |= jnp.any(needed.at[index].set(False))
             chosen.append(index)
         if self.n_walls == len(walls):
             return tuple(chosen), jnp.arange(self.n_walls), missed.astype(jnp.int32)
         _, index = jax.lax.top_k(-walls, self.n_walls)
-        missed |= jnp.any(jnp.ones(len(walls), bool).at[index].set(False) & (walls < 0))
+        missed |= jnp.any((walls < 0).at[index].set(False))
         return tuple(chosen), index, missed.astype(jnp.int32)
 
-    def needs(self, scene: jax.Array, state: PhysicsState) -> dict[str, jax.Array]:
+    def needs(self, measured: Measured) -> dict[str, jax.Array]:
         """How many of each kind can be met, or move, in one environment: [] i32 by kind of slot, and of walls."""
-        near, moving, walls = self._nearness.measure(scene, state, self._reach_m)
+        near, moving, walls = measured
         needed = (near < 0) | moving
         counts = {kind: needed[jnp.asarray(slots)].sum() for kind, slots in self._slots.items()}
         return {**counts, "walls": (walls < 0).sum()}
@@ -220,7 +243,7 @@ class Window:
 
 
 def _rows(
-    model: mujoco.MjModel, layout: Layout, slots: np.ndarray, boxes: int
+    model: mujoco.MjModel, layout: Layout, slots: np.ndarray, boxes: int, kind: str
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Field -> its rows [m, ...] of slots of one kind; of geoms `boxes` and the feet, and where these are padding."""
     body = layout.slot_body[slots]
@@ -228,7 +251,7 @@ def _rows(
     k = np.arange(boxes + FEET)
     padding = (k >= own) & (k < boxes)
     geoms = start + np.where(k < own, k, np.where(padding, 0, k - boxes + own))
-    n_q, n_v = (1, 1) if layout.slot_kind[slots[0]] == "hinge" else (7, 6)
+    n_q, n_v = (1, 1) if kind == "hinge" else (7, 6)
     rows: dict[str, np.ndarray] = {**dict.fromkeys(_BODY, body), **dict.fromkeys(_GEOM, geoms)}
     rows |= dict.fromkeys(_JOINT, model.body_jntadr[body])
     rows |= dict.fromkeys(_DOF, layout.slot_qvel[slots][:, None] + np.arange(n_v))

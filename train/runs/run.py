@@ -71,7 +71,7 @@ def config_to_play(
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.
-        words = [*(f"env.{name}=auto" for name in WINDOW), *words]
+        words = ["env.windows=[]", *(f"env.{name}=auto" for name in WINDOW), *words]
     config = config_io.apply_overrides(folder.read_config(), words)
     env = dataclasses.replace(config.env, scenes=scene_folders(scenes) if scenes else config.env.scenes)
     if not any(word.startswith("env.backend=") for word in words):
@@ -81,7 +81,8 @@ def config_to_play(
             there = resolve_backend("auto")
             told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(told, highlight=False, soft_wrap=True)
-            env = replace(env, backend=there, **(dict.fromkeys(WINDOW) if there == "native" else {}))
+            sizes = {"windows": (), **dict.fromkeys(WINDOW)} if there == "native" else {}
+            env = replace(env, backend=there, **sizes)
     return dataclasses.replace(config, env=env)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState
-from interactive_nav.physics.nearness import FAR_M, TOUCH_M, Boxes, Nearness
+from interactive_nav.physics.nearness import FAR_M, TOUCH_M, Boxes, Nearness, widths_at
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.spec import FEET
@@ -143,6 +143,6 @@ def test_a_window_is_as_wide_as_what_stands_near_somewhere(tmp_path):
     blocks = (*(("chair", 3.0, y, 2.0, 0.4) for y in (0.9, 1.4, 1.9)), ("table", -3.0, -1.5, 9.0, 0.5))
     folder = write_room(tmp_path / "room", (8.0, 5.0), blocks)
     world = build_world(get_robot("turtlebot"), (load_scene(folder),), NavConfig.of(num_objects=2))
-    assert Nearness(world).widths(0.78) == {"small": 2, "free": 3, "hinge": 1, "walls": 2}
-    assert Nearness(world).widths(0.1)["free"] == 2, "chairs 0.1 m apart"
-    assert Nearness(world).widths(20.0) == {"small": 2, "free": 4, "hinge": 1, "walls": 4}
+    assert widths_at(Nearness(world).counts(0.78)) == {"small": 2, "free": 3, "hinge": 1, "walls": 2}
+    assert widths_at(Nearness(world).counts(0.1))["free"] == 2, "chairs 0.1 m apart"
+    assert widths_at(Nearness(world).counts(20.0)) == {"small": 2, "free": 4, "hinge": 1, "walls": 4}

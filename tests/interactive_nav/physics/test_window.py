@@ -43,11 +43,15 @@ def _state(world, scene, robot_xy=(0.0, 0.0)):
     return PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
 
 
+def _select(window):
+    return jax.jit(lambda scene, state: window.select(window.measure(scene, state)))
+
+
 @pytest.mark.parametrize("scene", [0, 1])
 def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
     window = Window(world, NavConfig.of(num_objects=2, **ALL))
     assert sum(group.width for group in window.groups) == world.layout.num_slots
-    chosen, walls, missed = jax.jit(window.select)(jnp.asarray(scene), _state(world, scene))
+    chosen, walls, missed = _select(window)(jnp.asarray(scene), _state(world, scene))
     fields, model, inner, outer = window.fields(jnp.asarray(scene), chosen, walls), world.models[scene], window, world
     assert int(missed) == 0 and set(fields) == set(FIELDS)
     for a, b in zip(inner.layout.slot_body, outer.layout.slot_body, strict=True):
@@ -77,7 +81,7 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
     two = Window(world, NavConfig.of(num_objects=2, active_furniture=2))
     kinds = {tuple(g.slots): i for i, g in enumerate(two.groups)}
     free = next(i for slots, i in kinds.items() if len(slots) == 4)
-    group, select = two.groups[free], jax.jit(two.select)
+    group, select = two.groups[free], _select(two)
 
     def names(xy):
         chosen, _, missed = select(jnp.asarray(0), _state(world, 0, xy))
@@ -87,7 +91,7 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
     assert names((-2.0, 0.0))[0] >= {"table_1"}
     one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
     # Between the chairs both are within 0.18 + 0.6 m; only one is simulated.
-    assert int(jax.jit(one.select)(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
+    assert int(_select(one)(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
 
 
 def test_sizes_are_measured_where_none_are_set(world):
@@ -104,7 +108,7 @@ def test_a_moving_object_outranks_one_at_rest(world):
     slot = world.names[0].index("chair_1")
     moving = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[slot]].set(0.5))
     free = next(i for i, g in enumerate(one.groups) if slot in g.slots)
-    select = jax.jit(one.select)
+    select = _select(one)
     picked = [int(one.groups[free].slots[int(select(jnp.asarray(0), s)[0][free][0])]) for s in (state, moving)]
     assert [world.names[0][p] for p in picked] == ["chair_0", "chair_1"]
 
@@ -114,7 +118,7 @@ def test_enter_and_leave_are_inverse(world):
     state = _state(world, 0)
     key = jax.random.PRNGKey(0)
     state = state.replace(qpos=state.qpos + 0.01 * jax.random.normal(key, state.qpos.shape))
-    chosen, _, _ = jax.jit(window.select)(jnp.asarray(0), state)
+    chosen, _, _ = _select(window)(jnp.asarray(0), state)
     inner = window.enter(state, chosen)
     back = window.leave(state, inner, chosen)
     np.testing.assert_array_equal(back.qpos, state.qpos)
@@ -168,7 +172,7 @@ def test_a_pushed_sofa_does_not_enter_a_wall_in_a_window(narrow):
 
     @jax.jit
     def enter(state):
-        chosen, walls, _ = window.select(jnp.asarray(0), state)
+        chosen, walls, _ = window.select(window.measure(jnp.asarray(0), state))
         return chosen, window.fields(jnp.asarray(0), chosen, walls), window.enter(state, chosen)
 
     step, command = jax.jit(physics.step), jnp.full(2, 14.0)
@@ -192,9 +196,9 @@ def test_walls_left_out_behind_what_may_be_pushed_are_told(narrow):
     one, two = (Window(narrow, NavConfig.of(num_objects=0, active_walls=n)) for n in (1, 2))
     beside = _state(narrow, 0, (0.6, 0.4))  # 0.4 m from a side wall, 1.9 m from the wall behind the sofa
     far = _state(narrow, 0, (-0.5, 0.4))  # out of the sofa's reach
-    left = {n: [int(jax.jit(w.select)(0, s)[2]) for s in (beside, far)] for n, w in ((1, one), (2, two))}
+    left = {n: [int(_select(w)(0, s)[2]) for s in (beside, far)] for n, w in ((1, one), (2, two))}
     assert left == {1: [1, 0], 2: [0, 0]}
-    counts = [int(jax.jit(one.needs)(0, s)["walls"]) for s in (beside, far)]
+    counts = [int(one.needs(one.measure(0, s))["walls"]) for s in (beside, far)]
     assert counts == [2, 1]
 
 

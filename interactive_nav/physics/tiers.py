@@ -1,0 +1,103 @@
+"""A batch sorted by what its environments need near them, and each part stepped in the smallest window that holds it.
+
+A step costs as the degrees of freedom of its model do, and most environments need few. Parts have fixed sizes, since
+shapes are static.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.config import NavConfig, Tier, parse_tiers
+from interactive_nav.physics.base import Physics
+from interactive_nav.physics.mjx_batch import MjxPhysics
+from interactive_nav.scenes.world import World
+
+KINDS: tuple[str, ...] = ("free", "small", "hinge", "walls")
+"""Of what a `Tier` has room for, in its order."""
+AUTO_SHARES = (0.7, 0.2)
+"""Of a batch, in measured tiers."""
+HEAD_ROOM = 2.0
+"""Measured tiers let this many times as many environments need more as were counted."""
+LEAST_ENVS = 64
+"""In smaller batches all environments have the whole window: launching kernels is what costs there."""
+
+
+def tier_sizes(count: int, shares: Sequence[float] | np.ndarray) -> tuple[int, ...]:
+    """Environments in each tier, smallest window first: `count` in all, at least one in the last, which has the rest.
+
+    `count` is N, at least 1; `shares` are of all tiers but the last.
+    """
+    ends = [min(round(count * end), count - 1) for end in np.cumsum(shares)]
+    return tuple(int(size) for size in np.diff([0, *ends, count]))
+
+
+def assign(needed: jax.Array, sizes: Sequence[int]) -> tuple[jax.Array, ...]:
+    """Which environments are in each tier: those that need most in the last, each in a smaller one than it needs only
+    where too many need as much; those that are left go up.
+
+    Args:
+        needed: [N] i32, the first tier that holds what the environment needs.
+        sizes: of the tiers, N in all.
+
+    Returns:
+        Of each tier [size] i32.
+    """
+    return tuple(jnp.split(jnp.argsort(needed, stable=True), np.cumsum(sizes)[:-1]))
+
+
+def propose_tiers(counts: Mapping[str, np.ndarray], shares: Sequence[float] = AUTO_SHARES) -> tuple[Tier, ...]:
+    """Tiers of these shares that fit what was counted: each the least quantile of all kinds alike that suffices.
+
+    `counts` are [P] of each kind of slot, and of walls; `shares` of the batch, of all tiers but the last.
+    """
+    kinds = np.stack([counts[kind] for kind in KINDS])
+    tiers = []
+    for share, below in zip(shares, np.cumsum(shares), strict=True):
+        least, widths = 1 - (1 - below) / HEAD_ROOM, kinds.max(1)
+        for quantile in np.linspace(least, 1, 101):
+            widths = np.quantile(kinds, quantile, axis=1, method="higher")
+            if (kinds <= widths[:, None]).all(0).mean() >= least:
+                break
+        tiers.append(Tier(share, *map(int, widths)))
+    return tuple(tiers)
+
+
+class TieredPhysics(Physics):
+    """Several engines of one backend, each with its window and its share of the batch."""
+
+    def __init__(self, make: Callable[..., MjxPhysics], world: World, config: NavConfig):
+        """Builds the engines; `make` takes a world, settings and a window."""
+        whole = make(world, config)
+        self.name, self.nv, self.window = whole.name, whole.nv, whole.window
+        self.tells_convergence = whole.tells_convergence
+        words = config.physics.windows
+        told = propose_tiers(whole.window.needs_at_rest) if words is None else parse_tiers(words)
+        self.shares = tuple(tier.share for tier in told)
+        wanted = (dict(zip(KINDS, tier[1:], strict=True)) for tier in told)
+        self.tiers = (*(make(world, config, whole.window.narrower(widths, config)) for widths in wanted), whole)
+
+    def needed(self, counts: Mapping[str, jax.Array]) -> jax.Array:
+        """[N] i32, the first tier that holds what each environment needs, or the last: `counts` are [N] each."""
+        rooms = [tier.window.room for tier in self.tiers[:-1]]
+        small = [jnp.stack([counts[kind] > width for kind, width in room.items()]).any(0) for room in rooms]
+        return jnp.stack(small).sum(0)
+
+    def step_batch(self, scene, state, command, time_s):
+        if scene.shape[0] < LEAST_ENVS:
+            return self.tiers[-1].step_batch(scene, state, command, time_s)
+        measured = jax.vmap(self.window.measure)(scene, state)
+        needed = self.needed(jax.vmap(self.window.needs)(measured))
+        places = assign(needed, tier_sizes(scene.shape[0], self.shares))
+        whole = (measured, scene, state, command, time_s)
+        parts = [
+            tier.step_measured(*jax.tree.map(lambda x, own=own: x[own], whole))
+            for tier, own in zip(self.tiers, places, strict=True)
+            if len(own)
+        ]
+        back = jnp.argsort(jnp.concatenate(places))
+        return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *parts)
