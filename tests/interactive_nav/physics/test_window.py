@@ -198,7 +198,7 @@ def test_walls_left_out_behind_what_may_be_pushed_are_told(narrow):
     far = _state(narrow, 0, (-0.5, 0.4))  # out of the sofa's reach
     left = {n: [int(_select(w)(0, s)[2]) for s in (beside, far)] for n, w in ((1, one), (2, two))}
     assert left == {1: [1, 0], 2: [0, 0]}
-    counts = [int(one.needs(one.measure(0, s))["walls"]) for s in (beside, far)]
+    counts = [int(one.needs(one.measure(jnp.asarray(0), s))["walls"]) for s in (beside, far)]
     assert counts == [2, 1]
 
 
