@@ -78,19 +78,16 @@ class Window:
         kinds = np.asarray(layout.slot_kind)
         physics = config.physics
         limits = {"small": physics.active_small, "free": physics.active_furniture, "hinge": physics.active_doors}
-        model = world.models[0]
         self._slots = {kind: np.flatnonzero(kinds == kind) for kind in limits}
         self._nearness = Nearness(world)
         self._reach_m = world.robot.footprint_radius_m + REACH_M
-        walls = physics.active_walls
-        if None in (*limits.values(), walls):
-            needed = widths_at(self.needs_at_rest)
-            limits = {kind: needed[kind] if limit is None else limit for kind, limit in limits.items()}
-            walls = needed["walls"] if walls is None else walls
-        self.widths = {**limits, "walls": walls}
+        limits["walls"] = physics.active_walls
+        found = widths_at(self.needs_at_rest) if None in limits.values() else {}
+        self.widths = {kind: found[kind] if limit is None else limit for kind, limit in limits.items()}
         """Kind of slot, and `walls` -> how many at a time; 0: all."""
-        there = {kind: len(own) for kind, own in self._slots.items()}
-        there["walls"] = int(model.body_geomnum[layout.structure_body])
+        model = world.models[0]
+        walls = {"walls": int(model.body_geomnum[layout.structure_body])}
+        there = {kind: len(own) for kind, own in self._slots.items()} | walls
         self._boxes = {
             kind: max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=FEET) - FEET
             for kind, own in self._slots.items()
