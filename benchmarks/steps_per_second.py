@@ -173,8 +173,7 @@ def simulation(
         "peak_memory_mib": _peak_memory_mib(),
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "nv": tiers[-1].window.model.nv if tiers else physics.nv,
-        "tiers_nv": [tier.window.model.nv for tier in tiers],
-        "tiers_buffers": [(tier.contacts_per_env, tier.constraints_per_env) for tier in tiers],
+        "tiers": [(tier.window.model.nv, tier.contacts_per_env, tier.constraints_per_env) for tier in tiers],
         "movables": int(env.world.occupied.sum(1).max()),
     }
 

@@ -37,15 +37,10 @@ def tier_sizes(count: int, shares: Sequence[float] | np.ndarray) -> tuple[int, .
 
 
 def assign(needed: jax.Array, sizes: Sequence[int]) -> tuple[jax.Array, ...]:
-    """Which environments are in each tier: those that need most in the last, each in a smaller one than it needs only
-    where too many need as much; those that are left go up.
+    """[size] i32 of each tier: its environments, in order of what they need, equal ones as they stand in the batch.
 
-    Args:
-        needed: [N] i32, the first tier that holds what the environment needs.
-        sizes: of the tiers, N in all.
-
-    Returns:
-        Of each tier [size] i32.
+    `needed` is [N] i32, the first tier that holds what the environment needs. Spare places of larger tiers go to those
+    that need less; where too many need a large one, the first of them get less than they need. `sizes` are N in all.
     """
     return tuple(jnp.split(jnp.argsort(needed, stable=True), np.cumsum(sizes)[:-1]))
 
