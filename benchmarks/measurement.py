@@ -24,12 +24,9 @@ PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
 
 
 def command_line(description: str | None, rows: str = "", settings: bool = False) -> argparse.ArgumentParser:
-    """The words that benchmarks share.
+    """The words that benchmarks share: of one that writes `rows`, a file in `RESULTS`, if not empty.
 
-    Args:
-        description: the benchmark's docstring.
-        rows: name of its file in `RESULTS`; empty: it writes none.
-        settings: it makes an environment, by `--set key=value`.
+    With `settings` it makes an environment, by `--set key=value`.
     """
     made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if settings:
@@ -82,14 +79,9 @@ def random_driving(
     low: float = -1.0,
     high: float = 1.0,
 ) -> Callable[[Any, jax.Array], tuple[Any, Any]]:
-    """State and key to the state after some steps of uniform actions, and what each step counted, stacked.
+    """State and key to the state after `steps` steps of uniform actions, and what each step counted, stacked.
 
-    Args:
-        step: state and actions to the next state, and what is counted.
-        shape: environments, numbers in an action.
-        steps: in one program.
-        low: least number.
-        high: largest.
+    `shape` is environments and numbers in an action, which lie between `low` and `high`.
     """
 
     def one(state: Any, key: jax.Array) -> tuple[Any, Any]:

@@ -231,12 +231,8 @@ MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {
 def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[SmallObject, ...]:
     """A set of small objects: two models of each kind, as many copies as it takes.
 
-    Slot i holds the same kind, with the same number of boxes, whatever the split and the variant.
-
-    Args:
-        num_objects: how many; ten give 3 baskets, 3 shoes, 2 pots, 2 toys.
-        split: whose models, train or test.
-        variant: which two models of each kind; 0 is the default set, and they come round again in the end.
+    Slot i holds the same kind, with the same number of boxes, whatever the split and the variant: which two models of
+    each kind, 0 the default set; they come round again. Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
 
     Raises:
         ConfigError: a negative number, or an unknown split.
@@ -272,13 +268,7 @@ def body_names(objects: Sequence[SmallObject]) -> tuple[str, ...]:
 
 
 def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
-    """Adds an object's boxes to a body: they collide, and share its mass by volume.
-
-    Args:
-        body: the object's body, origin on the floor.
-        obj: the model.
-        name: prefix of the geoms' names.
-    """
+    """Adds an object's boxes to its body, origin on the floor: they collide, and share its mass by volume."""
     volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
     for i, box in enumerate(obj.boxes):
         body.add_geom(
@@ -294,13 +284,7 @@ def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
 
 
 def add_shapes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
-    """Adds an object's shapes to a body, massless and without collision, in the group of visuals.
-
-    Args:
-        body: the object's body, origin on the floor.
-        obj: the model.
-        name: prefix of the geoms' names.
-    """
+    """Adds an object's shapes to its body, origin on the floor: visuals, massless and without collision."""
     for i, shape in enumerate(obj.shapes):
         body.add_geom(
             name=f"{name}_visual_{i}",

@@ -132,14 +132,7 @@ def _geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, friction: float) -> Movable:
-    """One movable body of a compiled scene or single object.
-
-    Args:
-        model: compiled from `xml`.
-        xml: named in errors.
-        name: of the body.
-        category: of the object.
-        friction: sliding coefficient.
+    """One movable body of a compiled scene or single object; `xml` is named in errors, `friction` is sliding.
 
     Raises:
         SceneError: no such body, not one joint that is free or a hinge, or no box to collide with.
@@ -188,10 +181,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """Reads and checks a scene folder.
-
-    Args:
-        folder: holds scene.xml, scene.json, maps.npz.
+    """Reads and checks a scene folder: scene.xml, scene.json, maps.npz.
 
     Raises:
         SceneError: a file is missing or unreadable, or scene.xml and scene.json disagree.

@@ -21,28 +21,14 @@ from interactive_nav.scenes.scene import Movable, Scene
 
 PARKING_W = (200.0, 200.0)
 """World x, y of the first parking spot; far outside any building."""
-
-
 _PARKING_STEP_M = 3.0
-
-
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
-
-
 _TILTED = np.array([0.8, 0.36, 0.48, 0.0])
-
-
 FEET = 12
 """Points of each movable object that can touch the floor."""
-
-
 _FOOT_RADIUS_M = 2e-3
-
-
 _SOLID, _FLOOR = 1, 2
 """Collision bits: bodies against each other, and what can touch the floor."""
-
-
 FLOOR_FRICTION = 0.05
 """Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
 
@@ -243,14 +229,7 @@ def build_empty_spec(
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel, Layout]:
     """A model whose movable slots and walls are all empty: its numbers are filled in per environment.
 
-    Args:
-        robot: the robot's spec.
-        slots: (kind, number of boxes) of each movable slot.
-        n_walls: wall boxes.
-        config: the environment's settings.
-
-    Returns:
-        Spec, compiled model and its layout, with sensors as `build_world`'s models have them.
+    `slots` are (kind, number of boxes) each. Returns spec, compiled model and layout, with sensors as `build_world`'s.
     """
     spec = _empty_spec(robot, config)
     named = [(f"{kind}_{i}", kind) for i, (kind, _) in enumerate(slots)]

@@ -97,11 +97,6 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
 def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) -> World:
     """Compiles one padded model per scene and settles its furniture under the environment's own physics.
 
-    Args:
-        robot: the robot's spec.
-        scenes: at least one; hull collision takes exactly one.
-        config: the environment's settings.
-
     Raises:
         ConfigError: no scene, or hulls with several scenes.
         SceneError: a scene whose furniture does not come to rest at finite coordinates, or a folder in

@@ -47,11 +47,7 @@ class Links:
     """All but the base."""
 
     def frames(self, qpos: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-        """World frames of the base and the rest: positions [..., 3], m, and axes as columns [..., 3, 3].
-
-        Args:
-            qpos: [..., nq].
-        """
+        """Of `qpos` [..., nq], world frames of the base and the rest: [..., 3], m, and axes as columns [..., 3, 3]."""
         at = self.base_qpos
 
         def constant(value: np.ndarray) -> jax.Array:
@@ -174,11 +170,7 @@ def _colours_of_slots(world: World, s: int, ids: list[int], classes: MaskClasses
 def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, robot: bool = False) -> BoxTables:
     """Collects the boxes of every scene into common slots.
 
-    Args:
-        world: with its scenes.
-        classes: the setting `segmentation_classes`.
-        colours: reads the textures, for images in colour.
-        robot: its bodies are seen, each geom as the box around it.
+    `colours` reads the textures, for images in colour; with `robot` its bodies are seen, each geom as a box.
     """
     layout, scenes = world.layout, world.scenes
     slots = layout.num_slots
@@ -241,10 +233,7 @@ def compose(first: jax.Array, second: jax.Array) -> jax.Array:
 def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array, jax.Array]:
     """A hinged body's frame in its frame at rest: place [..., 3], m, and axes as columns [..., 3, 3].
 
-    Args:
-        axis: [..., 3] unit vector, in the body's frame.
-        anchor_m: [..., 3] in the body's frame.
-        angle_rad: [...].
+    `axis`, [..., 3] of length 1, and `anchor_m`, [..., 3], are in the body's frame; `angle_rad` is [...].
     """
     half = 0.5 * angle_rad[..., None]
     turned = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
@@ -252,12 +241,7 @@ def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array
 
 
 def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """World frames of the bodies; leading batch axes as the caller has them.
-
-    Args:
-        tables: of the world.
-        scene: [...] i32.
-        qpos: [..., nq].
+    """World frames of the bodies, for scenes [...] i32 and qpos [..., nq]; leading batch axes as the caller has them.
 
     Returns:
         Positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body. If the

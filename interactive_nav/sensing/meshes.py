@@ -319,13 +319,7 @@ class MeshRenderer(Renderer):
     name = "warp (meshes)"
 
     def __init__(self, tables: BoxTables, lens: Lens, world: World):
-        """Puts the meshes of all scenes on the device and builds their trees, once.
-
-        Args:
-            tables: of the world, for the poses of its bodies.
-            lens: of the camera.
-            world: whose scenes are drawn.
-        """
+        """Puts the meshes of all scenes on the device and builds their trees, once."""
         keep_collector_out()
         self.lens, self.tables = lens, tables
         made = build_meshes(world, tables)

@@ -29,11 +29,7 @@ class Mount:
     """(3,)."""
 
     def pose(self, qpos: jax.Array) -> CameraPose:
-        """The camera's pose, without roll.
-
-        Args:
-            qpos: [..., nq].
-        """
+        """The camera's pose, without roll: of qpos [..., nq]."""
         pos, axes = self.links.frames(qpos)[-1]
 
         def constant(value: np.ndarray) -> jax.Array:

@@ -29,13 +29,7 @@ class RayRenderer(BoxRenderer):
     """Draws by casting a ray through the middle of each pixel."""
 
     def __init__(self, tables: BoxTables, lens: Lens, tiled: bool | None = None):
-        """Chooses the order of work.
-
-        Args:
-            tables: of the world.
-            lens: of the camera.
-            tiled: none: on CPUs.
-        """
+        """`tiled` chooses the order of work; None: tiles on CPUs."""
         self.lens, self.tables = lens, tables
         self._tiled = jax.default_backend() == "cpu" if tiled is None else tiled
         self.name = "rays (tiles)" if self._tiled else "rays (scan)"
@@ -94,15 +88,9 @@ def _greater(a, b):
 
 
 def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
-    """Distances at which rays enter and leave a box, in units of the direction's length.
+    """Distances (entry, exit) at which rays enter and leave a box, in units of the direction; met: entry < exit.
 
-    Args:
-        eye: three arrays, the rays' origin in the box's frame.
-        half: three arrays.
-        directions: three arrays, broadcast with them.
-
-    Returns:
-        (entry, exit); the box is met where entry < exit.
+    `eye`, the rays' origin in the box's frame, `half` and `directions` are three arrays each, broadcast.
     """
     entry = leave = None
     for o, h, d in zip(eye, half, directions, strict=True):
@@ -153,15 +141,9 @@ def _tile_side(size: int) -> int:
 
 
 def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Array:
-    """Which boxes may show between neighbouring planes through the eye.
+    """Which boxes may show between neighbouring planes through the eye: [N, B, k], false if all of it is on one side.
 
-    Args:
-        boxes: see `boxes_seen`.
-        edges: [k + 1] rising offsets at depth 1, along the camera's right (axis 1) or up (axis 2).
-        axis: 1 or 2.
-
-    Returns:
-        [N, B, k] bool; false only where the whole box lies on one side.
+    `edges` are [k + 1] rising offsets at depth 1, along the camera's right (axis 1) or up (axis 2).
     """
     ahead, aside = boxes["axes"][..., 0], boxes["axes"][..., axis]
     # The box's centre in the camera's frame is minus the eye's position in the box's.
@@ -173,12 +155,7 @@ def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Arr
 
 
 def _lists(shows: jax.Array, env: np.ndarray, n: int) -> tuple[jax.Array, jax.Array]:
-    """Each tile's list of the boxes that it shows, and how many these are.
-
-    Args:
-        shows: [T, B] bool.
-        env: [T] environment of each tile.
-        n: environments.
+    """Each tile's list of the boxes that it shows, and how many: of `shows` [T, B] and the tiles' environments [T].
 
     Returns:
         [T, B + 1] i32 rows of boxes, the free places pointing at the row of padding behind all of them; [T] i32.
@@ -257,15 +234,7 @@ def cast_fan(
 ) -> jax.Array:
     """Distances along a few rays of one environment, in units of their length: a lidar's beams.
 
-    Args:
-        tables: of the world.
-        scene: [] i32.
-        qpos: [nq] f32.
-        origin_w: (3,) m.
-        directions_w: [R, 3].
-
-    Returns:
-        [R] f32, infinite where nothing is met; the floor is met as well.
+    From `origin_w` (3,), m, along `directions_w` [R, 3]: [R] f32, infinite where nothing is met; the floor is met too.
     """
     centre, axes = box_poses(tables, scene, qpos)
     inverse = jnp.swapaxes(axes, -1, -2)

@@ -74,13 +74,7 @@ class Sensors:
     renderer: Renderer | None
 
     def __init__(self, world: World, settings: NavConfig, backend: str):
-        """Builds tables, and the renderer if images are asked for.
-
-        Args:
-            world: of the environment.
-            settings: the environment's.
-            backend: of the physics: warp, jax or native.
-        """
+        """Builds tables, and the renderer if images are asked for; `backend` is that of the physics."""
         rules, config = settings.rules, settings.sensors
         self._layout, self._config = world.layout, config
         model = world.models[0]

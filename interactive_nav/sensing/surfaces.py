@@ -43,21 +43,10 @@ def paint(
     index: jax.Array,
     look: Look | None = None,
 ) -> dict[str, jax.Array]:
-    """Images from the boxes that a renderer has met.
+    """Images, as `Renderer.images_batch` has them, from the boxes that a renderer has met.
 
-    Each ray meets its own box once more, so that depth and face are exact and the same whoever found the box.
-
-    Args:
-        tables: of the world, with colours.
-        lens: of the camera.
-        scene: [N] i32.
-        qpos: [N, nq] f32.
-        camera: leaves [N, ...].
-        index: [N, H, W] i32 as `BoxRenderer.trace_batch` gives it.
-        look: leaves [N, ...]; None: as it is.
-
-    Returns:
-        See `Renderer.images_batch`.
+    Each ray meets its own box once more, so that depth and face are exact and the same whoever found the box. Leading
+    axes are [N]; `index` [N, H, W] is of `BoxRenderer.trace_batch`; a `look` of None leaves things as they are.
     """
     n, shape = len(scene), index.shape
     assert tables.colour is not None
@@ -100,15 +89,9 @@ def lit_images(
     ids: jax.Array,
     look: Look | None = None,
 ) -> dict[str, jax.Array]:
-    """The images `rgb` and `normals`.
+    """The images `rgb` and `normals`, of `base` colours in [0, 1] and `normal_w`, both [N, H, W, 3], 0 where none.
 
-    Args:
-        base: [N, H, W, 3] colours in [0, 1].
-        normal_w: [N, H, W, 3], 0 where nothing is met.
-        camera: leaves [N, ...].
-        shaded: [N, H, W] bool: where light falls; else the colours stay as they are.
-        ids: [N, H, W] classes.
-        look: leaves [N, ...]; None: as it is.
+    Light falls where `shaded`, [N, H, W] bool; else the colours stay. A `look` of None leaves things as they are.
     """
     forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
     sideways, upward, away = ((normal_w * axis).sum(-1) for axis in (right, up, forward))

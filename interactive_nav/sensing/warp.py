@@ -104,17 +104,10 @@ class WarpRenderer(BoxRenderer):
 
 
 def morton_codes(xy_m: jax.Array, hidden: jax.Array) -> jax.Array:
-    """Places on a Z-order curve, so that neighbours in its order are neighbours in the plane; hidden ones come last.
+    """Places [N, B] i32 on a Z-order curve: neighbours in its order are neighbours in the plane; hidden ones come last.
 
     The renderer's tree of boxes keeps its shape, halves of halves of their order, and only its bounds follow
-    the boxes: it is as good as that order.
-
-    Args:
-        xy_m: [N, B, 2] centres.
-        hidden: [N, B] bool; these have no part in the curve's extent.
-
-    Returns:
-        [N, B] i32.
+    the boxes: it is as good as that order. Hidden boxes, [N, B] bool, have no part in the curve's extent.
     """
     low = jnp.min(jnp.where(hidden[..., None], jnp.inf, xy_m), 1, keepdims=True)
     high = jnp.max(jnp.where(hidden[..., None], -jnp.inf, xy_m), 1, keepdims=True)
@@ -130,11 +123,7 @@ class WarpColour:
     def __init__(self, model: mujoco.MjModel, lens: Lens, n: int, groups: list[int]):
         """Makes a context; the first picture compiles.
 
-        Args:
-            model: with visual meshes, and one camera, whose field of view is set here.
-            lens: of the camera.
-            n: pictures a call.
-            groups: geom groups that are drawn.
+        The model has visual meshes and one camera; `n` is pictures a call, `groups` are the geom groups that are drawn.
         """
         keep_collector_out()
         model = copy.copy(model)

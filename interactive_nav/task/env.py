@@ -32,13 +32,10 @@ from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
-
 SETTLE_STEPS = 5
 """Small objects that come to rest in an episode's first control steps, untouched, have not been moved."""
-
 LIFT_M = 0.2
 """A base that rises this far above its standing height has left the floor (the original's early failure)."""
-
 REWARD_TERMS = ("reward/success", "reward/potential", "reward/interaction")
 
 
@@ -57,12 +54,7 @@ class InteractiveNav(Env):
     """
 
     def __init__(self, robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig):
-        """Builds models, tables and the physics backend.
-
-        Args:
-            robot: the robot's spec.
-            scenes: loaded scenes, at least one.
-            config: settings.
+        """Builds models, tables and the physics backend, for one loaded scene or more.
 
         Raises:
             ConfigError: settings that do not fit each other or the backend.
@@ -105,15 +97,7 @@ class InteractiveNav(Env):
         return furniture_map(self.scenes[scene], rest_poses(self.world, scene), self.robot.height_m)
 
     def reset(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
-        """Draws an episode.
-
-        Args:
-            rng: one PRNG key; consumed.
-            scene: [] i32, to choose the scene; None: drawn.
-
-        Returns:
-            The first state of the episode.
-        """
+        """The first state of a new episode; `rng`, one key, is consumed, and `scene`, [] i32, is drawn where None."""
         return self.observe(self.draw(rng, scene))
 
     def draw(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
@@ -122,12 +106,7 @@ class InteractiveNav(Env):
         return self._begin(self.draw_start(key, scene), rng)
 
     def draw_start(self, key: jax.Array, scene: jax.Array | None = None) -> EpisodeStart:
-        """What an episode starts from, as `reset` draws it.
-
-        Args:
-            key: consumed.
-            scene: [] i32, to choose the scene; None: drawn.
-        """
+        """What an episode starts from, as `reset` draws it: `key` is consumed, `scene` is [] i32, None: drawn."""
         return draw_episode(
             key,
             self.tables,
@@ -149,12 +128,7 @@ class InteractiveNav(Env):
         return start.replace(small_xy_w=xy, small_yaw_rad=turn, small_placed=ok)
 
     def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
-        """The first state of a given episode (fixed evaluation episodes, tests).
-
-        Args:
-            start: what `draw_episode` returns; leaves of one environment.
-            rng: key that the state carries for its next episode.
-        """
+        """The first state of a given episode (fixed evaluation episodes, tests); it carries `rng` for its next one."""
         return self.observe(self._begin(start, rng))
 
     def _begin(self, start: EpisodeStart, rng: jax.Array) -> State:
@@ -211,20 +185,13 @@ class InteractiveNav(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one environment by one control period.
 
-        Args:
-            state: what `reset` or `step` returned.
-            action: (A,) in [-1, 1]; clipped, non-finite entries count as 0.
+        `action` is (A,) in [-1, 1]; it is clipped, and non-finite entries count as 0.
         """
         state = self.advance(state, action)
         return self.observe(state, blank=state.metrics["nonfinite"] > 0)
 
     def observe(self, state: State, blank: jax.Array | bool = False) -> State:
-        """The state with the observation of where it is now.
-
-        Args:
-            state: of one environment; `obs` may be empty or old.
-            blank: observe nothing but zeros, as after a broken step.
-        """
+        """The state with the observation of where it is now; zeros where `blank`, as after a broken step."""
         nav: NavInfo = state.info["nav"]
         obs = self.sensors.observe(state.pipeline_state, nav, state.info["rng"])  # pyright: ignore[reportArgumentType]
         return state.replace(obs=jax.tree.map(lambda x: jnp.where(blank, jnp.zeros_like(x), x), obs))

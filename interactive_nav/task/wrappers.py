@@ -25,12 +25,9 @@ def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
 
 
 def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
-    """[N, 2] keys to N new episodes, each in the scene that its environment keeps, if it keeps one.
+    """[N, 2] keys, consumed, to N new episodes, each in the scene that its environment keeps, if it keeps one.
 
-    Args:
-        env: of one episode.
-        keys: consumed.
-        slot: [N] i32 numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
+    `slot` is [N] i32, numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
     """
     scene = scene_of_slot(env, jnp.arange(keys.shape[0]) if slot is None else slot)
     return jax.vmap(env.reset)(keys) if scene is None else jax.vmap(env.reset)(keys, scene)
@@ -132,12 +129,7 @@ class AutoResetEnv(Wrapper):
         self.action_repeat = action_repeat
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
-        """[N, 2] keys to N states.
-
-        Args:
-            rng: the keys.
-            slot: [N] i32 numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
-        """
+        """[N, 2] keys to N states; `slot` as in `reset_all`."""
         state = reset_all(self.env, rng, slot)
         zero = jnp.zeros(rng.shape[0])
         info = {
