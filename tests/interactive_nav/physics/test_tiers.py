@@ -1,5 +1,6 @@
 """A batch sorted by need steps as with one window; nobody is lost, and who has too little room is counted."""
 
+import importlib.util
 from typing import Any
 
 import jax
@@ -91,7 +92,10 @@ def test_tiers_that_cannot_be_are_refused(words):
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    base = tmp_path_factory.mktemp("tiers")
+    return world_in(tmp_path_factory.mktemp("tiers"))
+
+
+def world_in(base):
     full = write_room(base / "full", (8.0, 5.0), FURNITURE)
     empty = write_room(base / "empty", (3.0, 3.0), (("basket", 0.7, 0.0, 1.0, 0.3),))
     return build_world(get_robot("turtlebot"), (load_scene(full), load_scene(empty)), NavConfig.of(num_objects=1))
@@ -134,6 +138,26 @@ def test_those_without_room_are_counted(world, engines):
     }
     assert tiered.needed({**counts, "walls": jnp.array([2, 2, 0, 0])}).tolist() == [0, 0, 1, 1]
     assert new.qpos.shape == state.qpos.shape
+
+
+@pytest.mark.heavy
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs the package warp-lang")
+def test_warp_steps_two_windows_in_one_program(world, monkeypatch):
+    """Each with buffers of its own, and in the order of the batch."""
+    monkeypatch.setattr(tiers, "LEAST_ENVS", 8)
+    config = NavConfig.of(backend="warp", num_objects=1, windows=("0.75 1 0 0 2",), **ALL)
+    tiered = make_physics(world, config)
+    assert isinstance(tiered, TieredPhysics)
+    narrow, whole = tiered.tiers
+    assert 0 < narrow.constraints_per_env < whole.constraints_per_env
+    state, scene = _start(world)
+    command = jnp.asarray(np.linspace(2.0, 9.0, 16).reshape(8, 2), jnp.float32)
+    new, signals = jax.jit(tiered.step_batch)(scene, state, command, jnp.zeros(8))
+    same, _ = jax.jit(whole.step_batch)(scene, state, command, jnp.zeros(8))
+    assert signals.left_out.tolist() == [0, 1, 0, 0, 0, 0, 0, 0] and signals.overflow.sum() == 0
+    np.testing.assert_allclose(new.qpos, same.qpos, atol=FREE_M)
+    assert float(jnp.abs(same.qpos - state.qpos)[:, :2].max()) > 10 * FREE_M, "they drive"
 
 
 @pytest.mark.heavy

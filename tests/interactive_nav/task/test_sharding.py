@@ -154,3 +154,40 @@ def test_impossible_processes_are_refused():
         start_distributed("localhost:1234", 2, 2)
     with pytest.raises(UserError, match="expected host:port"):
         start_distributed("localhost", 2, 0)
+
+
+TIERS = """
+import sys
+from pathlib import Path
+import interactive_nav
+import jax, jax.numpy as jnp
+from interactive_nav.config import NavConfig
+from interactive_nav.physics import make_physics, tiers
+from interactive_nav.task.sharding import ShardedEnv
+from tests.interactive_nav.physics import test_tiers as toy
+
+tiers.LEAST_ENVS = 4
+world = toy.world_in(Path(sys.argv[1]))
+physics = make_physics(world, NavConfig.of(backend="jax", num_objects=1, windows=("0.75 1 0 0 2",), **toy.ALL))
+
+class Stepped:
+    def reset(self, rng, slot):
+        return rng
+
+    def step(self, state, action):
+        return physics.step_batch(*state, action, jnp.zeros(len(action)))
+
+state, scene = toy._start(world)
+new, signals = jax.jit(ShardedEnv(Stepped()).step)((scene, state), jnp.zeros((8, 2)))
+still = abs(new.qpos[:, :2] - jnp.asarray(toy.STARTS)).max() < 0.01
+print(len(new.qpos.sharding.device_set), bool(still), signals.left_out.tolist())
+"""
+
+
+@pytest.mark.heavy
+@pytest.mark.slow
+def test_each_device_sorts_its_own_part_into_tiers(tmp_path):
+    """Three and one places on each: of the second's two robots between chairs the first has too small a window."""
+    command = [sys.executable, "-c", TIERS, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, env=_environment(2), capture_output=True, text=True)
+    assert done.stdout.strip().endswith("2 True [0, 0, 0, 0, 1, 0, 0, 0]"), done.stdout + done.stderr[-3000:]
