@@ -103,7 +103,8 @@ def world_in(base):
 
 @pytest.fixture(scope="module")
 def engines(world):
-    config = {"backend": "jax", "num_objects": 1, **ALL}
+    # Iterations until it has converged: see the comparison of steps.
+    config = {"backend": "jax", "num_objects": 1, "solver_iterations": 100, **ALL}
     tiered = make_physics(world, NavConfig.of(windows=("0.75 1 0 0 2",), **config))
     assert isinstance(tiered, TieredPhysics)
     with pytest.MonkeyPatch.context() as patch:
@@ -162,37 +163,40 @@ def test_warp_steps_two_windows_in_one_program(world, monkeypatch):
 
 @pytest.mark.heavy
 def test_each_step_is_that_of_one_window(world, engines):
-    """100 steps of random driving, each also from the same state in one window; and three undisturbed runs of both."""
+    """100 steps of random driving, each also from the same state in one window; and three undisturbed runs of both.
+
+    The control is one window again, from speeds that differ by 1e-5: 3 of 728 steps part, and none of the tiers'. With
+    10 iterations Newton's method has not converged where a chair is pushed, and what it stops at hangs on rounding.
+    Then 6 steps part, and 7 of the control; with other widths or the slots in reverse one window parts from itself in
+    13 and 3. C MuJoCo in double precision parts in 7 between 10 iterations and 100.
+    """
     tiered, step, one = engines
     state, scene = _start(world)
     alone, rng, kinds = state, np.random.default_rng(1), np.zeros((2, 8), bool)
     needs = jax.jit(
         lambda s: tiered.needed(jax.vmap(lambda *x: tiered.window.needs(tiered.window.measure(*x)))(scene, s))
     )
-    command, compared, worst = np.zeros((8, 2)), 0, []
+    command, compared, worst, nudged, own = np.zeros((8, 2)), 0, [], [], np.random.default_rng(5)
     for k in range(100):
         if k % 10 == 0:
             command = jnp.asarray(rng.uniform(-6, 10, (8, 1)) + rng.uniform(-3, 3, (8, 2)), jnp.float32)
-        same, signals = one(scene, state, command, jnp.zeros(8))
+        same, _ = one(scene, state, command, jnp.zeros(8))
         alone, _ = one(scene, alone, command, jnp.zeros(8))
+        nudge = 1e-5 * own.standard_normal(state.qvel.shape) * (state.qvel != 0)
+        other, _ = one(scene, state.replace(qvel=state.qvel + jnp.asarray(nudge, jnp.float32)), command, jnp.zeros(8))
         kinds[np.asarray(needs(state)), np.arange(8)] = True
         state, tiered_signals = step(scene, state, command)
         had_room = np.asarray(tiered_signals.left_out) == 0
         compared += had_room.sum()
-        gaps = [
-            np.abs(np.asarray(a - b)).reshape(8, -1).max(1)
-            for a, b in (
-                (state.qpos, same.qpos),
-                (state.qvel, same.qvel),
-                (tiered_signals.slot_force_n, signals.slot_force_n),
-            )
-        ]
-        worst.append(np.where(had_room, gaps, 0))
+        worst.append(np.where(had_room, np.abs(np.asarray(state.qvel - same.qvel)).max(1), 0))
+        nudged.append(np.where(had_room, np.abs(np.asarray(other.qvel - same.qvel)).max(1), 0))
     apart = np.abs(np.asarray(state.qpos - alone.qpos)).max(1)
     assert compared > 700 and kinds.all(0).any(), "somebody changes tiers"
     assert apart[[0, 3, 7]].max() < FREE_M
-    # Pushed bodies stick or slip: a few steps part in float32, all of them of bodies that the robot touches.
-    assert (np.asarray(worst)[:, 1] > STEP_M_S).sum() < 0.01 * compared
+    # Bodies that rest outside of a window have no speed there: in one window they keep what the solver leaves, 0.01.
+    parted, control = ((np.asarray(gaps) > STEP_M_S).sum() for gaps in (worst, nudged))
+    assert parted <= control, (parted, control)
+    assert parted < 0.005 * compared
 
 
 def test_the_solvers_warm_start_crosses_tiers(world, engines):
