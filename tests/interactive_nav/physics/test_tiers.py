@@ -157,8 +157,9 @@ def test_warp_steps_two_windows_in_one_program(world, monkeypatch):
     new, signals = jax.jit(tiered.step_batch)(scene, state, command, jnp.zeros(8))
     same, _ = jax.jit(whole.step_batch)(scene, state, command, jnp.zeros(8))
     assert signals.left_out.tolist() == [0, 1, 0, 0, 0, 0, 0, 0] and signals.overflow.sum() == 0
-    np.testing.assert_allclose(new.qpos, same.qpos, atol=FREE_M)
-    assert float(jnp.abs(same.qpos - state.qpos)[:, :2].max()) > 10 * FREE_M, "they drive"
+    free = np.array([0, 2, 3, 5, 7])  # of both windows; the others stand against chairs
+    np.testing.assert_allclose(new.qpos[free], same.qpos[free], atol=FREE_M)
+    assert float(jnp.abs(same.qpos - state.qpos)[free, :2].max()) > 10 * FREE_M, "they drive"
 
 
 @pytest.mark.heavy
