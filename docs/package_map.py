@@ -102,42 +102,61 @@ def levels(graph: Graph) -> dict[str, int]:
     return {name: level(name) for name in sorted(graph)}
 
 
+COLUMNS = (("interactive_nav_common", "scenes_mjcf", "converters"), ("interactive_nav", "train", "topological_nav"))
+WIDE, HIGH, LETTER = 360, 22, 7.8
+"""Of a column, of a room, of a letter of its name: pixels of a page 720 wide."""
+
+
 def svg(graph: Graph) -> str:
-    """A column a package: its rooms in the order in which they build on each other, each with those that it imports.
+    """Packages with their rooms, a line a step: each room builds on rooms of lines above it, never of those below."""
+    shapes: list[str] = []
+    heights = []
+    for k, column in enumerate(COLUMNS):
+        y = 0
+        for package in column:
+            if any(room.partition(".")[0] == package for room in graph):
+                y = _draw_package(shapes, graph, package, WIDE * k + 8, y)
+        heights.append(y)
+    size = f"{WIDE * len(COLUMNS)} {max(heights) + 8}"
+    wide, high = size.split()
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" font-family="Helvetica, Arial, sans-serif">',
+            f'<rect width="{wide}" height="{high}" fill="#ffffff"/>',
+            *shapes,
+            "</svg>",
+            "",
+        ]
+    )
 
-    What a whole package builds on stands in the column's head.
-    """
-    level = levels(graph)
-    packages = [p for p in PACKAGES if p not in UNDRAWN and any(room.partition(".")[0] == p for room in graph)]
-    columns = {p: sorted((r for r in graph if r.startswith(f"{p}.")), key=lambda r: (level[r], r)) for p in packages}
-    wide, high, gap, top = 236, 54, 8, 112
-    height = top + (high + gap) * max(len(rooms) for rooms in columns.values()) + gap
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide * len(packages)} {height}" '
-        'font-family="Helvetica, Arial, sans-serif">',
-        f'<rect width="{wide * len(packages)}" height="{height}" fill="#ffffff"/>',
-    ]
 
-    def write(x: int, y: int, size: int, text: str, colour: str = "#000000", weight: str = "normal") -> None:
-        lines.append(f'<text x="{x}" y="{y}" font-size="{size}" font-weight="{weight}" fill="{colour}">{text}</text>')
-
-    for k, (package, rooms) in enumerate(columns.items()):
-        x = wide * k + 8
-        outside = {other.partition(".")[0] for room in rooms for other in graph[room]} - {package}
-        write(x, 26, 16, package, weight="bold")
-        below = textwrap.wrap("builds on " + (", ".join(p for p in packages if p in outside) or "nothing"), 38)
-        for row, text in enumerate(below):
-            write(x, 46 + 14 * row, 11, text, "#555555")
-        for row, room in enumerate(rooms):
-            y = top + (high + gap) * row
-            inside = [other.partition(".")[2] for other in sorted(graph[room]) if other.startswith(f"{package}.")]
-            lines.append(
-                f'<rect x="{x}" y="{y}" width="{wide - 16}" height="{high}" rx="5" fill="#eef3f8" stroke="#7d93aa"/>'
+def _draw_package(shapes: list[str], graph: Graph, package: str, x: int, y: int) -> int:
+    """Adds a package's head and rooms from y down; returns where the next one may begin."""
+    rooms = {room for room in graph if room.startswith(f"{package}.")}
+    outside = {other.partition(".")[0] for room in rooms for other in graph[room]} - {package}
+    below = [other for other in PACKAGES if other in outside]
+    shapes.append(f'<text x="{x}" y="{y + 26}" font-size="16" font-weight="bold">{package}</text>')
+    for text in textwrap.wrap("builds on " + (", ".join(below) or "no other package"), 54):
+        shapes.append(f'<text x="{x}" y="{y + 43}" font-size="12" fill="#444444">{text}</text>')
+        y += 15
+    y += 37
+    level = levels({room: graph[room] & rooms for room in rooms})
+    for step in range(max(level.values(), default=-1) + 1):
+        right = x
+        for room in sorted(room for room in rooms if level[room] == step):
+            name = room.partition(".")[2]
+            wide = round(LETTER * len(name)) + 12
+            if right + wide > x + WIDE - 16:
+                right, y = x + 16, y + HIGH + 2
+            shapes.append(
+                f'<rect x="{right}" y="{y}" width="{wide}" height="{HIGH}" rx="4" fill="#e6f1f8" stroke="#0072b2"/>'
             )
-            write(x + 8, y + 18, 13, room.partition(".")[2])
-            for line, text in enumerate(textwrap.wrap(", ".join(inside), 44)):
-                write(x + 8, y + 33 + 12 * line, 9, text, "#33557a")
-    return "\n".join([*lines, "</svg>", ""])
+            shapes.append(
+                f'<text x="{right + wide // 2}" y="{y + 15}" font-size="13" text-anchor="middle">{name}</text>'
+            )
+            right += wide + 6
+        y += HIGH + 6
+    return y + 6
 
 
 if __name__ == "__main__":
