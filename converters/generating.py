@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 
 from rich.console import Console
 
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.progress import stage_progress
+from scenes_mjcf.sets import PACKAGED, in_cache, packaged_set
 
 
 def _generate(arguments: argparse.Namespace, console: Console) -> int:
@@ -40,6 +42,23 @@ def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
     with stage_progress(console) as report:
         failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
     return 1 if failed else 0
+
+
+def _make_scenes(arguments: argparse.Namespace, console: Console) -> int:
+    from converters.sets import make_packaged
+
+    with stage_progress(console) as report:
+        tell = functools.partial(console.print, soft_wrap=True, highlight=False)
+        failed = make_packaged(arguments.names, arguments.jobs, report, tell)
+    return 1 if failed else 0
+
+
+def _list_scenes(arguments: argparse.Namespace, console: Console) -> int:
+    for name, folder in PACKAGED.items():
+        for scene, member in packaged_set(name).scenes.items():
+            place = next((p for p in (folder / scene, in_cache(folder / scene)) if p.exists()), None)
+            print(f"{name:<10} {member.split:<6} {scene:<15} {place or 'not made'}")
+    return 0
 
 
 def _models(arguments: argparse.Namespace, console: Console) -> int:
@@ -88,6 +107,7 @@ def _list(arguments: argparse.Namespace, console: Console) -> int:
 
 GENERATING = {
     **{"generate": _generate, "generate-scenes": _generate_scenes, "models": _models},
+    "scenes": {"list": _list_scenes, "make": _make_scenes},
     "library": {"get": _get, "build": _build, "list": _list},
 }
 """Command -> what runs it, or its actions' table."""

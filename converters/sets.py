@@ -17,10 +17,21 @@ import yaml
 
 from converters.generate.design.config import GenerationError
 from converters.recipes import Recipes, Report, chosen, load_recipes, make_scenes, parse_recipes
+from interactive_nav_common.config import nearest
 from interactive_nav_common.files import write_text
 from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher
 from scenes_mjcf.schema import load_manifest
-from scenes_mjcf.sets import FILE, Member, SceneSet, read_set, scene_digest, write_set
+from scenes_mjcf.sets import (
+    FILE,
+    PACKAGED,
+    Member,
+    SceneSet,
+    in_cache,
+    packaged_set,
+    read_set,
+    scene_digest,
+    write_set,
+)
 
 RECIPES = "recipes.yaml"
 SEEDS = 100_000
@@ -192,4 +203,39 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
         failed = [name for name, failing in gates.items() if failing]
     if not wanted.only and (wanted.tier or (wanted.out / FILE).is_file()):
         list_set(recipes, wanted.out, tell)
+    return failed
+
+
+def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callable[[str], None]) -> list[str]:
+    """Makes scenes of the package's own sets in the cache folder.
+
+    Args:
+        names: of scenes, of sets, or of splits of them.
+        jobs: scenes side by side.
+        report: progress over those of a set.
+        tell: told one line a scene.
+
+    Returns:
+        Names of those that were not made, do not pass every gate, or are not what the set lists.
+
+    Raises:
+        GenerationError: an unknown name.
+    """
+    failed: list[str] = []
+    known: list[str] = []
+    for name, folder in PACKAGED.items():
+        members = packaged_set(name).scenes
+        known += [name, f"{name}/train", f"{name}/test", *members]
+        wanted = {n: m for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)}
+        if not wanted:
+            continue
+        out = in_cache(folder)
+        failed += generate_scenes(
+            Wanted(out, folder / RECIPES, None, None, None, tuple(wanted), False, jobs, "local", None), report, tell
+        )
+        for scene in (n for n, m in wanted.items() if n not in failed and scene_digest(out / n) != m.digest):
+            tell(f"{scene}: not the scene that the set {name} lists")
+            failed.append(scene)
+    for word in (word for word in names if word not in known):
+        raise GenerationError(f"no scene or set {word!r}{nearest(word, known)}; 'scenes list' shows them")
     return failed

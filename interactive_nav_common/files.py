@@ -28,6 +28,12 @@ LONGEST_NAME = 100
 """Bytes of a name: file systems take 255, and names of our files add to it."""
 
 
+def cache_folder() -> Path:
+    """`$INTERACTIVE_NAV_CACHE`, else `$XDG_CACHE_HOME/interactive_nav`, else `~/.cache/interactive_nav`."""
+    own = os.environ.get("INTERACTIVE_NAV_CACHE")
+    return Path(own or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav")
+
+
 def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
     """A name that comes from a file or a user and becomes one part of a path.
 

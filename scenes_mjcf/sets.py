@@ -2,7 +2,8 @@
 
 A set is a file that lists scenes, their splits and the digests of their tasks: `OUT/set.json`, which
 `python -m converters generate-scenes OUT` writes, or a committed one of this package. Wherever scenes are listed,
-`SET` stands for all of its scenes and `SET/train` or `SET/test` for those of a split.
+`SET` stands for all of its scenes and `SET/train` or `SET/test` for those of a split. What is not in the current folder
+is looked for beside the package and in the cache folder, by the same path (`scenes_mjcf/alder`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from interactive_nav_common.files import check_name, write_text
+from interactive_nav_common.files import cache_folder, check_name, write_text
 from interactive_nav_common.records import Reader
 from scenes_mjcf.schema import SPLITS, SceneError, load_maps
 
@@ -26,6 +27,8 @@ FILE = "set.json"
 HERE = Path(__file__).parent
 COMMITTED = HERE / "sets"
 """Folder of the package's own sets, `<name>.json`."""
+PACKAGED = {"sparse": HERE, "furnished": HERE / "furnished", "cluttered": HERE / "cluttered"}
+"""The package's own sets, and the folders that their scenes belong into."""
 _SETS = Reader(SceneError, "make the set again")
 
 
@@ -98,6 +101,23 @@ def write_set(scenes: SceneSet, path: Path) -> None:
     write_text(path, json.dumps(dataclasses.asdict(scenes), indent=1, sort_keys=True) + "\n")
 
 
+def packaged_set(name: str) -> SceneSet:
+    """One of `PACKAGED`."""
+    return read_set(next(p for p in (PACKAGED[name] / FILE, COMMITTED / f"{name}.json") if p.is_file()))
+
+
+def in_cache(path: Path) -> Path:
+    """Where the cache folder has what lies at a path of the package."""
+    return cache_folder() / path.relative_to(HERE.parent)
+
+
+def installed(path: str | Path) -> Path:
+    """A path as it is; else, where nothing is there, the package's or the cache's of the same name."""
+    found = Path(path)
+    roots = () if found.exists() or found.is_absolute() else (HERE.parent, cache_folder())
+    return next((root / found for root in roots if (root / found).exists()), found)
+
+
 def _file_of(name: str) -> Path | None:
     """The file that describes a set: in a folder of that name, or the package's."""
     for path in (Path(name) / FILE, HERE / name / FILE, COMMITTED / f"{name}.json"):
@@ -118,16 +138,18 @@ def _members(word: str) -> list[str] | None:
         scenes = read_set(file)
         root = Path(os.path.normpath(file.parent / scenes.folder))
         names = [n for n, member in scenes.scenes.items() if split in ("", member.split)]
-        missing = [n for n in names if not (root / n / "scene.json").is_file()]
+        places = {n: root / n for n in names}
+        if root.is_relative_to(HERE):
+            places |= {n: p for n in names if not places[n].exists() and (p := in_cache(places[n])).exists()}
+        missing = [n for n in names if not (places[n] / "scene.json").is_file()]
         what = f"the set has no scene to {split} in" if not names else None
         if missing:
             what = f"{len(missing)} of {len(names)} scenes are missing (the first is '{missing[0]}')"
         if what:
-            raise SceneError(
-                f"{word}: {what}; make them with 'python -m converters generate-scenes {os.path.relpath(root)}'"
-            )
-        return [os.path.relpath(root / n) if Path.cwd() in (root / n).absolute().parents else str(root / n)
-                for n in names]  # fmt: skip
+            own = next((f"scenes make {name}" for name, folder in PACKAGED.items() if folder == root), None)
+            command = own or f"generate-scenes {os.path.relpath(root)}"
+            raise SceneError(f"{word}: {what}; make them with 'python -m converters {command}'")
+        return [os.path.relpath(p) if Path.cwd() in p.absolute().parents else str(p) for p in places.values()]
     return None
 
 
@@ -147,5 +169,5 @@ def scene_folders(words: Sequence[str | Path]) -> tuple[str, ...]:
     found: list[str] = []
     for word in map(str, words):
         is_scene = (Path(word) / "scene.json").is_file()
-        found += [word] if is_scene else _members(word) or [word]
+        found += [word] if is_scene else _members(word) or [str(installed(word))]
     return tuple(found)

@@ -12,7 +12,16 @@ from converters.generate.homes.config import TIERS, HomeConfig
 from converters.recipes import load_recipes
 from interactive_nav.episodes import load
 from scenes_mjcf.schema import SceneError, load_manifest
-from scenes_mjcf.sets import COMMITTED, Member, SceneSet, read_set, scene_digest, scene_folders, write_set
+from scenes_mjcf.sets import (
+    COMMITTED,
+    Member,
+    SceneSet,
+    installed,
+    read_set,
+    scene_digest,
+    scene_folders,
+    write_set,
+)
 
 ROOT = Path(__file__).parents[1]
 TRAIN = ["alder", "birch", "cedar", "elm", "hazel", "juniper", "linden", "maple"]
@@ -168,3 +177,42 @@ def test_a_digest_passes_over_rounding_but_not_over_a_millimetre(tmp_path: Path)
     where = text.replace('<body name="chair_0"', '<site name="window_0" size="1 1 1"/><body name="chair_0"', 1)
     (folder / "scene.xml").write_text(where)
     assert where != text and scene_digest(folder) == digest  # where a window is moves nothing
+
+
+def test_what_is_not_here_is_the_packages_or_the_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    assert scene_folders(["scenes_mjcf/alder"]) == (str(ROOT / "scenes_mjcf" / "alder"),)
+    assert installed("scenes_mjcf/nowhere") == Path("scenes_mjcf/nowhere")
+    made = tmp_path / "cache" / "scenes_mjcf" / "furnished"
+    for number in (8, 9, 10):
+        (made / f"furnished_{number:03d}").mkdir(parents=True)
+        (made / f"furnished_{number:03d}" / "scene.json").write_text("{}")
+    if not (ROOT / "scenes_mjcf" / "furnished" / "furnished_008").exists():
+        expected = tuple(f"cache/scenes_mjcf/furnished/furnished_{n:03d}" for n in (8, 9, 10))
+        assert scene_folders(["furnished/test"]) == expected
+    assert installed("scenes_mjcf/furnished/furnished_009") == made / "furnished_009"
+    (tmp_path / "scenes_mjcf" / "alder").mkdir(parents=True)
+    assert installed("scenes_mjcf/alder") == Path("scenes_mjcf/alder"), "what is here comes first"
+
+
+def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """The generator is stood in for: it gives alder, and cedar where birch was wanted."""
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path))
+    asked = []
+
+    def generate(wanted, report, tell):
+        asked.append((wanted.out, wanted.recipes, wanted.only))
+        for name in wanted.only:
+            given = "cedar" if name == "birch" else name
+            shutil.copytree(ROOT / "scenes_mjcf" / given, wanted.out / name)
+        return []
+
+    monkeypatch.setattr("converters.sets.generate_scenes", generate)
+    assert main(["scenes", "make", "alder"]) == 0
+    assert main(["scenes", "make", "birch", "sparse/test"]) == 1
+    assert "birch: not the scene that the set sparse lists" in capsys.readouterr().out
+    out, recipes = tmp_path / "scenes_mjcf", ROOT / "scenes_mjcf" / "recipes.yaml"
+    assert asked == [(out, recipes, ("alder",)), (out, recipes, ("birch", "rowan", "willow"))]
+    assert main(["scenes", "make", "aldr"]) == 2
+    assert "no scene or set 'aldr', did you mean 'alder'?" in capsys.readouterr().err

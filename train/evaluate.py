@@ -19,7 +19,7 @@ from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
 from interactive_nav_common.words import program
-from scenes_mjcf.sets import scene_folders
+from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import config_to_play, make_env
@@ -40,7 +40,7 @@ ROWS = "evaluation/episodes.parquet"
 def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile, str]:
     """The first episodes of files, or all, and the files' digest."""
     try:
-        file, digest = load_all(paths)
+        file, digest = load_all([str(installed(path)) for path in paths])
     except EpisodeFileError as error:
         raise ConfigError(f"--episode-file: {error}") from None
     if most is not None and most > len(file.episodes):

@@ -28,6 +28,7 @@ from converters.clock import peak_memory_mib
 from converters.geometry.boxes import Hull, convex_hull
 from converters.records.cache import LIMIT_BYTES, store, touch
 from converters.records.errors import CANNOT_WRITE, StageFailed
+from interactive_nav_common import files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +54,8 @@ within the threshold, and a voxel is 7 cm, so that a leaf of 4 cm would become a
 
 
 def cache_folder() -> Path:
-    """`$INTERACTIVE_NAV_CACHE/converters`, else `$XDG_CACHE_HOME/interactive_nav/converters`, else `~/.cache/...`."""
-    own = os.environ.get("INTERACTIVE_NAV_CACHE")
-    if own:
-        return Path(own) / "converters"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav" / "converters"
+    """`converters` in the package's cache folder."""
+    return files.cache_folder() / "converters"
 
 
 def content_key(vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig) -> str:

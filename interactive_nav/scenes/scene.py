@@ -12,6 +12,7 @@ import numpy as np
 
 from interactive_nav_common.rotations import rotate
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+from scenes_mjcf.sets import installed
 
 TASK_DIGEST = "task-1:"
 """Begins a digest of what decides a task, and says how it was made; what does not begin so is `Scene.digest`."""
@@ -181,12 +182,12 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """Reads and checks a scene folder: scene.xml, scene.json, maps.npz.
+    """Reads and checks a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too.
 
     Raises:
         SceneError: a file is missing or unreadable, or scene.xml and scene.json disagree.
     """
-    folder = Path(folder)
+    folder = installed(folder)
     manifest, maps = load_manifest(folder), load_maps(folder)
     xml = folder / "scene.xml"
     if not xml.is_file():
