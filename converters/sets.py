@@ -207,7 +207,7 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
 
 
 def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callable[[str], None]) -> list[str]:
-    """Makes scenes of the package's own sets in the cache folder.
+    """Makes scenes of the package's own sets in the cache folder, unless the package has them.
 
     Args:
         names: of scenes, of sets, or of splits of them.
@@ -226,7 +226,10 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
     for name, folder in PACKAGED.items():
         members = packaged_set(name).scenes
         known += [name, f"{name}/train", f"{name}/test", *members]
-        wanted = {n: m for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)}
+        asked = [n for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)]
+        wanted = {n: members[n] for n in asked if not (folder / n / "scene.json").is_file()}
+        for scene in (n for n in asked if n not in wanted):
+            tell(f"{scene}: is there, {folder / scene}")
         if not wanted:
             continue
         out = in_cache(folder)

@@ -197,8 +197,12 @@ def test_what_is_not_here_is_the_packages_or_the_caches(tmp_path: Path, monkeypa
 
 
 def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    """The generator is stood in for: it gives alder, and cedar where birch was wanted."""
-    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path))
+    """The generator is stood in for, and so is the package: it gives alder, and cedar where birch was wanted."""
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("scenes_mjcf.sets.HERE", tmp_path / "package")
+    monkeypatch.setattr("converters.sets.PACKAGED", {"sparse": tmp_path / "package"})
+    monkeypatch.setattr("converters.sets.packaged_set", lambda name: read_set(COMMITTED / f"{name}.json"))
+    shutil.copytree(ROOT / "scenes_mjcf" / "elm", tmp_path / "package" / "elm")
     asked = []
 
     def generate(wanted, report, tell):
@@ -209,10 +213,11 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
         return []
 
     monkeypatch.setattr("converters.sets.generate_scenes", generate)
-    assert main(["scenes", "make", "alder"]) == 0
+    assert main(["scenes", "make", "alder", "elm"]) == 0
+    assert f"elm: is there, {tmp_path / 'package' / 'elm'}" in capsys.readouterr().out.replace("\n", "")
     assert main(["scenes", "make", "birch", "sparse/test"]) == 1
     assert "birch: not the scene that the set sparse lists" in capsys.readouterr().out
-    out, recipes = tmp_path / "scenes_mjcf", ROOT / "scenes_mjcf" / "recipes.yaml"
+    out, recipes = tmp_path / "cache" / "package", tmp_path / "package" / "recipes.yaml"
     assert asked == [(out, recipes, ("alder",)), (out, recipes, ("birch", "rowan", "willow"))]
     assert main(["scenes", "make", "aldr"]) == 2
     assert "no scene or set 'aldr', did you mean 'alder'?" in capsys.readouterr().err

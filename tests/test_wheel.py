@@ -19,6 +19,7 @@ PACKAGES = (
     "scenes_mjcf",
     "benchmarks",
 )
+SPARSE = ["alder", "birch", "cedar", "elm", "hazel", "juniper", "linden", "maple", "rowan", "willow"]
 FILES = ("pyproject.toml", "README.md", "LICENSE")
 SHORT = ("ppo.num_envs=8", "ppo.unroll_length=8", "ppo.batch_size=8", "ppo.num_minibatches=1", "run.num_timesteps=512")
 
@@ -61,7 +62,9 @@ def test_it_trains_and_is_scored_in_an_empty_folder(bare):
 
 def test_what_it_knows_by_name(bare):
     listed = run(bare, "scenes", "list").stdout.splitlines()
-    assert len(listed) == 32 and all(line.endswith("not made") for line in listed)
+    assert [line.split()[0] for line in listed if line.endswith("not made")] == ["furnished"] * 11 + ["cluttered"] * 11
+    assert [line.split()[2] for line in listed[:10]] == sorted(SPARSE[:8]) + SPARSE[8:]
+    assert "alder: is there" in run(bare, "scenes", "make", "alder").stdout
     missing = run(bare, "train", "--config", "demo", "env.scenes=[cluttered/train]")
     assert missing.returncode == 2
     assert "make them with 'python -m converters scenes make cluttered'" in missing.stderr.replace("\n", "")
