@@ -19,8 +19,6 @@ PACKAGES = (
     *("interactive_nav_common", "scenes_mjcf", "converters", "interactive_nav", "train", "topological_nav"),
     *("benchmarks", "docs"),
 )
-UNDRAWN = ("benchmarks", "docs")
-"""Programs that measure: no package imports them."""
 Graph = dict[str, set[str]]
 """Name -> names that it imports."""
 
