@@ -200,6 +200,40 @@ def test_paths_side_by_side_are_of_the_same_episodes():
     assert lines[0].get_linestyle() != lines[1].get_linestyle()
 
 
+def test_random_walks_are_thin_and_grey():
+    one = record(0.0)
+    merged = paths.side_by_side({"learned": one, "random": one})
+    figure = figures.trajectories(merged, episodes=[0])
+    learned, random = [line for line in figure.axes[0].lines if len(xy(line)) == 5]
+    assert random.get_color() == "0.6" and random.get_linewidth() < learned.get_linewidth() / 2
+    assert figure.axes[0].get_title() == "den, episode 0\nall reach it" and figure.get_figwidth() <= 7.2
+
+
+def test_effort_terms_leave_a_few_episodes_outside_and_say_how_many():
+    """98 of 100 episodes lie at 0.99, where the runs are: two at 0.5 and 0.6 would put all in one corner."""
+    rows = pa.concat_tables([run_rows("turtlebot", "ppo", 0.1, seed, 0.9, (0.99, 0.99)) for seed in (0, 1)])
+    terms = np.full(len(rows), 0.99)
+    far = max(1, len(rows) // 100)
+    terms[:far] = 0.5
+    for name in scores.EFFORT:
+        rows = rows.set_column(rows.column_names.index(name), name, pa.array(terms))
+    (axis,) = scores.effort_terms(rows, "test").axes
+    assert axis.get_xlim()[0] > 0.9 and axis.get_ylim()[0] > 0.9
+    share = np.mean(terms[np.asarray(rows["split"].to_pylist()) == "test"] < 0.9)
+    assert [text.get_text() for text in axis.texts] == [f"{100 * share:.0f} % of episodes lie outside"]
+
+
+def test_goals_of_a_sweep_are_drawn_a_panel_a_robot():
+    """1,000 steps and 3 goals, then 2,000 and 10: 3 and 5 goals in 1,000 steps."""
+    lines = [
+        {"env_steps": 1000, "episodes": 3.0, "episode/success": 1.0},
+        {"env_steps": 3000, "episodes": 20.0, "episode/success": 0.5},
+    ]
+    figure = figures.cell_curves({("turtlebot", "ppo", 0.1): [lines, lines], ("fetch", "sac", 0.1): [lines]})
+    assert [axis.get_title() for axis in figure.axes] == ["TurtleBot", "Fetch"]
+    assert [xy(axis.lines[0]).tolist() for axis in figure.axes] == [[[1000, 3], [3000, 5]]] * 2
+
+
 def test_tables_say_what_the_rows_say(results, capsys):
     assert figures.main([str(results), "--tables"]) == 0
     printed = capsys.readouterr().out

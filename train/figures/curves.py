@@ -18,10 +18,10 @@ CURVES = (
     ("episode/sum_reward", "episode reward"),
 )
 GOALS = "goals_per_1000_steps"
-CELL_CURVES = ((GOALS, "goals reached in 1,000 env steps"), *CURVES[1:])
+GOALS_LABEL = "goals reached in 1,000 env steps"
 """Of sweeps: their runs may end before every environment has had the time of a whole episode, and until then the
 episodes that end are those that succeed; goals reached in a number of steps count the others by their steps."""
-BOUNDS = {"episode/success": (0.0, 1.0), "episode/ins_0.5": (0.0, 1.0), GOALS: (0.0, np.inf)}
+SHARES = ("episode/success", "episode/ins_0.5")
 SMOOTHED = 40
 """Curves of more points than this are drawn as running means over a twentieth of them."""
 
@@ -88,49 +88,37 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
-    """Goals reached, INS_0.5 and reward of training episodes over env steps: a line a cell, with its seeds' interval.
+    """Goals that training reached over env steps, a panel a robot: a line a cell, with its seeds' interval.
 
     Args:
         cells: (robot, algorithm, k_int) -> lines of metrics of each of its runs.
     """
     looks = style.Looks(cells)
-    size = (3.3 * len(CELL_CURVES), 2.5 * len(looks.robots) + 0.7)
-    figure, grid = style.panels(size, len(looks.robots), len(CELL_CURVES))
+    figure, (axes,) = style.panels((3.6 * len(looks.robots), 3.6), 1, len(looks.robots), sharey=True)
     seeds = set()
     for (robot, algorithm, k_int), runs in sorted(cells.items()):
+        steps, values = common_curve([with_goal_rate(lines) for lines in runs], GOALS)
+        if not len(steps):
+            continue
+        seeds.add(len(values))
+        values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
         look = {**looks.algorithm(algorithm), "markersize": 4, **looks.k_int(k_int)}
-        for axis, (key, _) in zip(grid[looks.robots.index(robot)], CELL_CURVES, strict=True):
-            seeds |= _draw_cell(axis, key, [with_goal_rate(lines) for lines in runs], look)
-    for row, robot in zip(grid, looks.robots, strict=True):
-        for axis, (key, label) in zip(row, CELL_CURVES, strict=True):
-            _label(axis, key, label)
-            axis.set_title(style.robot_name(robot))
-    style.legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)])
-    figure.suptitle(
-        f"training episodes that ended (exploring policy), mean of {style.seeds_text(seeds)}, 95 % t interval\n"
-        "before all environments have had the time of a whole episode, those that end are those that succeed",
-        fontsize=9,
-    )
+        look |= {"markevery": max(1, len(steps) // 6), "linewidth": 1.2}
+        points = [estimate(column) for column in values.T]
+        style.draw_means(axes[looks.robots.index(robot)], steps, points, (0.0, np.inf), **look)
+    for axis, robot in zip(axes, looks.robots, strict=True):
+        _label(axis, GOALS, GOALS_LABEL if axis is axes[0] else "")
+        axis.set_title(style.robot_name(robot))
+    style.legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)], 3)
+    figure.suptitle(f"exploring policy, mean of {style.seeds_text(seeds)}, 95 % t interval", fontsize=9)
     return figure
-
-
-def _draw_cell(axis: Any, key: str, runs: Sequence[Sequence[Mapping[str, Any]]], look: dict[str, Any]) -> set[int]:
-    """One cell's mean and interval over its runs; returns how many there were, nothing where there was nothing."""
-    steps, values = common_curve(runs, key)
-    if not len(steps):
-        return set()
-    values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
-    points = [estimate(column) for column in values.T]
-    look = {**look, "markevery": max(1, len(steps) // 6), "linewidth": 1.2}
-    style.draw_means(axis, steps, points, BOUNDS.get(key, style.ANY), **look)
-    return {len(values)}
 
 
 def _label(axis: Any, key: str, label: str) -> None:
     """Axes of a metric over environment steps."""
     if key == GOALS:
         axis.set_ylim(bottom=0.0)
-    elif key in BOUNDS:
+    elif key in SHARES:
         axis.set_ylim(-0.02, 1.02)
     axis.set_xlabel("environment steps")
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))

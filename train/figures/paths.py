@@ -34,27 +34,34 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
     chosen = list(range(min(most, count))) if episodes is None else list(episodes)
     count = len(chosen)
     columns = min(count, 3)
-    rows = -(-count // columns)
     # A row is as high as its tallest scene, with titles and labels; below them the legend.
     aspects = [_aspect(paths, policies[0], i) for i in chosen]
-    heights = [4.0 * max(aspects[k : k + columns]) + 0.9 for k in range(0, count, columns)]
-    size = (4.4 * columns, sum(heights) + 0.6)
-    figure, grid = style.panels(size, rows, columns, height_ratios=heights)
+    heights = [2.2 * max(aspects[k : k + columns]) + 0.7 for k in range(0, count, columns)]
+    size = (2.4 * columns, sum(heights) + 1.0)
+    figure, grid = style.panels(size, len(heights), columns, height_ratios=heights)
     for axis in grid.flat[count:]:
         axis.set_axis_off()
     for axis, i in zip(grid.flat, chosen, strict=False):
         _draw_episode(axis, paths, policies, i)
     grey: dict[str, Any] = {"color": "0.35", "linestyle": ""}
     handles = [
-        *(style.handle(p, color=policy_colour(p, k), linestyle=LINES[k % len(LINES)]) for k, p in enumerate(policies)),
+        *(style.handle(policy, **_pen(policy, k)) for k, policy in enumerate(policies)),
         style.handle("start", marker="o", markerfacecolor="w", markersize=8, **grey),
         style.handle("goal", marker="*", markersize=11, **grey),
-        Patch(color=FURNITURE_COLOUR, label="furniture at start, as far as it bars the robot"),
-        style.handle("object at start", marker="s", markerfacecolor="none", markersize=6, **grey),
-        style.handle("object at end (coloured by who moved it)", marker="s", markersize=6, **grey),
+        style.handle("not reached", marker="x", **grey),
+        style.handle("object at start", marker="s", markerfacecolor="none", markersize=5, **grey),
+        style.handle("object at end, coloured by who moved it", marker="s", markersize=5, **grey),
+        Patch(color=FURNITURE_COLOUR, label="furniture at start"),
     ]
-    style.legend(figure, handles, 4, fontsize=8, frameon=False)
+    style.legend(figure, handles, columns, fontsize=8, frameon=False)
     return figure
+
+
+def _pen(policy: str, k: int) -> dict[str, Any]:
+    """How the k-th policy is drawn: random walks, which go everywhere, thin and grey."""
+    if policy == "random":
+        return {"color": "0.6", "linestyle": "-", "linewidth": 0.7}
+    return {"color": policy_colour(policy, k), "linestyle": LINES[k % len(LINES)], "linewidth": 1.6}
 
 
 def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[str], i: int) -> None:
@@ -69,26 +76,26 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
     begin = paths[f"{policies[0]}/object_start_w"][i, :, :2]
     # Empty slots and objects that found no place wait far outside the map.
     inside = ((begin > [extent[0], extent[2]]) & (begin < [extent[1], extent[3]])).all(-1)
-    axis.scatter(*begin[inside].T, s=26, marker="s", facecolors="none", edgecolors="0.35", linewidths=0.9)
+    axis.scatter(*begin[inside].T, s=14, marker="s", facecolors="none", edgecolors="0.35", linewidths=0.9)
     for k, policy in enumerate(policies):
-        colour = policy_colour(policy, k)
+        pen = _pen(policy, k)
+        colour = pen["color"]
         end = paths[f"{policy}/object_end_w"][i, :, :2]
         moved = inside & (np.linalg.norm(end - begin, axis=-1) > MOVED_M)
         for a, b in zip(begin[moved], end[moved], strict=True):
             axis.plot(*np.stack([a, b]).T, color=colour, linewidth=0.8, linestyle=":")
-        axis.scatter(*end[moved].T, s=26, marker="s", color=colour, linewidths=0, zorder=6)
+        axis.scatter(*end[moved].T, s=14, marker="s", color=colour, linewidths=0, zorder=6)
         track = paths[f"{policy}/robot_xy_w"][i]
         track = track[np.isfinite(track[:, 0])]
-        axis.plot(*track.T, color=colour, linewidth=1.6, linestyle=LINES[k % len(LINES)], alpha=0.9)
+        axis.plot(*track.T, **pen, alpha=0.9)
         if not paths[f"{policy}/success"][i]:
-            axis.plot(*track[-1], marker="x", color=colour, markersize=7, markeredgewidth=2)
+            axis.plot(*track[-1], marker="x", color=colour, markersize=6, markeredgewidth=1.5)
     start, goal = paths[f"{policies[0]}/start_xy_w"][i], paths[f"{policies[0]}/goal_xy_w"][i]
-    axis.plot(*start, marker="o", markerfacecolor="w", markeredgecolor="k", markersize=8, zorder=5)
-    axis.plot(*goal, marker="*", color="#e69f00", markeredgecolor="k", markersize=14, zorder=5)
+    axis.plot(*start, marker="o", markerfacecolor="w", markeredgecolor="k", markersize=6, zorder=5)
+    axis.plot(*goal, marker="*", color="#e69f00", markeredgecolor="k", markersize=11, zorder=5)
     reached = [policy for policy in policies if paths[f"{policy}/success"][i]]
-    axis.set_title(
-        f"{paths[f'scene/{scene}/name']}, episode {i}\nreached by: {', '.join(reached) or 'none'}", fontsize=9
-    )
+    told = "all reach it" if len(reached) == len(policies) else f"reached by {', '.join(reached) or 'none'}"
+    axis.set_title(f"{paths[f'scene/{scene}/name']}, episode {i}\n{told}", fontsize=8)
     axis.set_aspect("equal")
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)

@@ -116,7 +116,8 @@ def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
     _yardsticks(axis, rows, robot, split)
     step = _finish_plane(axis)
     handles = [*looks.algorithm_handles(), *looks.k_int_handles(linestyle="")]
-    style.legend(figure, handles, min(len(handles), 6))
+    planner = [style.handle("planner that knows all poses, weight w of pushing", color="0.45", marker=".")]
+    style.legend(figure, handles + planner * any(text.get_text()[:2] == "w=" for text in axis.texts), 3)
     axis.set_title(
         f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % t intervals\n"
         f"grey lines: equal INS$_{{0.5}}$, steps of {step:g}"
@@ -154,14 +155,14 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
     told = "structure_steps" in episodes.column_names
     touched = episodes["structure_steps"].to_numpy() > 0 if told else np.zeros(len(episodes), bool)
     wide = len(looks.robots)
-    figure, grid = style.panels((3.9 * wide, 4.3), 1, wide)
+    figure, grid = style.panels((3.6 * wide, 4.3), 1, wide)
     for axis, robot in zip(grid[0], looks.robots, strict=True):
         chosen = np.asarray(episodes["robot"].to_pylist()) == robot
         x, y = (episodes[name].to_numpy()[chosen] for name in EFFORT)
         shown = np.random.default_rng(0).permutation(len(x))[:DOTS]
         walls = touched[chosen][shown]
         for at, colour, above in ((~walls, FREE, 2), (walls, WALLS, 1)):
-            axis.scatter(x[shown][at], y[shown][at], s=3, color=colour, linewidths=0, rasterized=True, zorder=above)
+            axis.scatter(x[shown][at], y[shown][at], s=3, color=colour, linewidths=0, zorder=above)
         runs = [run for run in means if run.robot == robot]
         for run in runs:
             look = {**looks.algorithm(run.algorithm), "fillstyle": looks.fill(run.k_int), "linestyle": ""}
@@ -170,9 +171,12 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
         axis.set_title(
             f"{style.robot_name(robot)}\nr over runs: {over_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
         )
-        axis.set(xlabel="kinematic term of E$_{eff}$", ylabel="dynamic term of E$_{eff}$", aspect="equal")
-        low = max(0.0, 0.1 * np.floor(10 * min(x.min(), y.min())))
-        axis.set(xlim=(low - 0.02, 1.02), ylim=(low - 0.02, 1.02))
+        axis.set(xlabel="kinematic term of E$_{eff}$", ylabel="dynamic term of E$_{eff}$")
+        lows = [min(np.quantile(v, 0.02), *(r.scores[n] for r in runs)) for v, n in zip((x, y), EFFORT, strict=True)]
+        for low, limit in zip(lows, (axis.set_xlim, axis.set_ylim), strict=True):
+            limit(low - 0.05 * (1 - low), 1 + 0.05 * (1 - low))
+        outside = np.mean((x < lows[0]) | (y < lows[1]))
+        axis.text(0.02, 0.02, f"{100 * outside:.0f} % of episodes lie outside", transform=axis.transAxes, fontsize=8)
     kinds = ((FREE, "episode"), (WALLS, "episode that touched a wall"))[: 1 + bool(touched.any())]
     dots = [style.handle(name, color=c, marker=".", linestyle="", markersize=6) for c, name in kinds]
     style.legend(figure, [*looks.algorithm_handles(linestyle=""), *looks.k_int_handles(linestyle=""), *dots], 4)
@@ -251,7 +255,8 @@ def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> No
         named.append((label, place))
     for label, place in _gathered(named, near.reach):
         long = "," in label  # to the left: on the right the axis ends
-        look = {"ha": "right" if long else "left", "fontsize": 7, "color": "0.35"}
+        look = {"ha": "right" if long else "left", "fontsize": 7, "color": "0.35", "zorder": 5}
+        look["bbox"] = {"facecolor": "w", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
         axis.annotate(label, place, xytext=(-4 if long else 4, -9), textcoords="offset points", **look)
     if line:
         points = np.array(sorted(line))[:, 1:]
@@ -305,6 +310,6 @@ def _finish_plane(*axes: Axes) -> float:
     for axis in axes:
         equal_ins(axis, step)
         axis.set(xlabel=style.P_LABEL, xlim=(max(-0.02, x[0] - more_x), min(1.03, x[1] + more_x)))
-        axis.set(ylabel=style.E_LABEL, ylim=(max(-0.02, y[0] - more_y), min(1.01, y[1] + more_y)))
+        axis.set(ylabel=style.E_LABEL, ylim=(max(-0.02, y[0] - more_y), min(1.0 + 0.1 * more_y, y[1] + more_y)))
         axis.grid(visible=False)
     return step

@@ -1,7 +1,8 @@
 """`python -m docs.studies.robots`: robots measured, and drawn with what was measured of them.
 
     python -m docs.studies.robots evidence --backend warp --robots all
-    python -m docs.studies.robots figure docs/robots.png
+    python -m docs.studies.robots figure robots.png
+    python -m docs.studies.robots gallery docs/robots.webp
     python -m docs.studies.robots pictures pictures/                # one PNG per robot
 
 Exit status: 0; 1 if a check failed; 2 for a question that cannot be answered, with one line that says why.
@@ -17,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from docs.studies.robots.evidence import EVIDENCE, Evidence, measure
-from docs.studies.robots.pictures import picture, save_pictures
+from docs.studies.robots.pictures import gallery, picture, save_pictures
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav_common.errors import reports_errors
 
@@ -99,19 +100,24 @@ def main(argv: list[str] | None = None) -> int:
     for command, text in (
         ("evidence", "measure the robots and print the checks"),
         ("figure", "draw all of it"),
+        ("gallery", "draw all robots to one scale"),
         ("pictures", "draw each robot alone"),
     ):
         sub = commands.add_parser(command, help=text)
         sub.add_argument("--backend", default="native", choices=("native", "jax", "warp", "auto"))
         sub.add_argument("--robots", default="all", help="names, comma between them; default all")
         if command != "evidence":
-            sub.add_argument("out", type=Path, help="PNG to write; pictures: folder of them")
+            sub.add_argument("out", type=Path, help="picture to write; pictures: folder of them")
     args = parser.parse_args(argv)
     console = Console(width=None if sys.stdout.isatty() else 220)
     names = robot_names() if args.robots == "all" else tuple(name.strip() for name in args.robots.split(","))
     if args.command == "pictures":
         for path in save_pictures(names, args.out):
             console.print(f"wrote {path}")
+        return 0
+    if args.command == "gallery":
+        gallery(names).savefig(args.out, dpi=200)
+        console.print(f"wrote {args.out}")
         return 0
     kinds = {name: get_robot(name).kind for name in names}
     if args.command == "evidence":

@@ -1,4 +1,4 @@
-"""Robots in, pictures out: one PNG each.
+"""Robots in, pictures out: one PNG each, or all on one.
 
 Pictures come from MuJoCo's renderer where OpenGL is found (EGL, no display needed), else from rays against the same
 geoms.
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from matplotlib.figure import Figure
 
 from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import trace
@@ -23,6 +24,10 @@ from interactive_nav_common.errors import UserError
 
 _SIZE = (480, 480)
 _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG = 145.0, -22.0
+_SPAN_M, _FAR_M = 2.4, 20.0
+"""Of pictures to scale: what each shows from edge to edge, and from how far."""
+_PAGE_M, _LINE_M, _GAP_M = 5.1, 0.34, 0.16
+"""Of the gallery: its width, the height of names below a row, and what lies between two robots."""
 
 
 def stage(robot: RobotSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -69,48 +74,103 @@ def _span(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float
     return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
-def _camera(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[CameraPose, Lens]:
-    """A camera that holds what is drawn; leaves nothing else in geom group 0."""
+def _show(model: mujoco.MjModel, floor: bool) -> None:
+    """Leaves nothing but what is drawn in geom group 0."""
     shown = set(_shown(model))
     for g in range(model.ngeom):
-        if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE:
+        if not floor or model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE:
             model.geom_group[g] = 0 if g in shown else 5
-    centre, half = _span(model, data)
+
+
+def _camera(centre: np.ndarray, away_m: float, fov_deg: float) -> tuple[CameraPose, Lens]:
+    """A camera that looks at a place from the side and above."""
     azimuth, elevation = math.radians(_VIEW_AZIMUTH_DEG), math.radians(_VIEW_ELEVATION_DEG)
     level = math.cos(elevation)
     forward = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
-    return look_along(centre - 2.9 * half * forward, forward), Lens(*_SIZE, model.vis.global_.fovy)
+    return look_along(centre - away_m * forward, forward), Lens(*_SIZE, fov_deg)
 
 
-def _with_gl(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    pose, lens = _camera(model, data)
+def _with_gl(model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens) -> np.ndarray:
     one = CameraPose(pose.pos_w[None], pose.axes_w[None])
     return GlPainter(model, lens.width, lens.height, sky=None).draw(data, one, lens.fov_deg, [0])[0]
 
 
-def _with_rays(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    pose, lens = _camera(model, data)
+def _with_rays(model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens) -> np.ndarray:
     _, geom, _, normal = trace(model, data, pose, lens, [0])
     met = geom >= 0
     base = np.where(met[..., None], model.geom_rgba[geom, :3], 1.0)
     return lambert(base, normal * met[..., None], pose.axes_w[:, 0], met, np)
 
 
-def picture(robot: RobotSpec, renderer: str = "auto") -> np.ndarray:
+def picture(robot: RobotSpec, renderer: str = "auto", to_scale: bool = False) -> np.ndarray:
     """[480, 480, 3] uint8 image of the robot in its home pose.
 
     Args:
         robot: its spec.
         renderer: `gl`, `rays`, or `auto`: OpenGL where there is one.
+        to_scale: 200 pixels a metre from afar and without the floor, not as large as the image holds.
     """
     model, data = stage(robot)
+    _show(model, floor=not to_scale)
+    centre, half = _span(model, data)
+    fov_deg = math.degrees(2 * math.atan(_SPAN_M / 2 / _FAR_M)) if to_scale else model.vis.global_.fovy
+    pose, lens = _camera(centre, _FAR_M if to_scale else 2.9 * half, fov_deg)
     if renderer != "rays":
         try:
-            return _with_gl(model, data)
+            return _with_gl(model, data, pose, lens)
         except UserError:
             if renderer == "gl":
                 raise
-    return _with_rays(model, data)
+    return _with_rays(model, data, pose, lens)
+
+
+def cut_out(image: np.ndarray) -> np.ndarray:
+    """What of an image [rows, columns, 3] is not as its upper left pixel, the rest white."""
+    drawn = (image != image[0, 0]).any(-1)
+    rows, columns = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
+    whole = np.where(drawn[..., None], image, 255).astype(np.uint8)
+    return whole[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+
+def gallery(names: tuple[str, ...], renderer: str = "auto") -> Figure:
+    """All robots to one scale, on lines as on a shelf, with names, masses and a bar of half a metre."""
+    images = {name: cut_out(picture(get_robot(name), renderer, to_scale=True)) for name in names}
+    step_m = _SPAN_M / _SIZE[0]
+    lines: list[list[str]] = [[]]
+    room_m = _PAGE_M
+    wide = {name: max(step_m * image.shape[1], 0.55) + _GAP_M for name, image in images.items()}
+    for name in names:
+        if wide[name] > room_m:
+            lines, room_m = [*lines, []], _PAGE_M
+        lines[-1].append(name)
+        room_m -= wide[name]
+    places, y = [], 0.0
+    for line in lines:
+        y -= step_m * max(images[name].shape[0] for name in line)
+        more = (_PAGE_M - sum(wide[name] for name in line)) / len(line)
+        x = 0.0
+        for name in line:
+            places.append((name, x + (wide[name] + more) / 2, y))
+            x += wide[name] + more
+        y -= _LINE_M
+    return _on_shelves(images, places, step_m, y - 0.1)
+
+
+def _on_shelves(
+    images: dict[str, np.ndarray], places: list[tuple[str, float, float]], step_m: float, low: float
+) -> Figure:
+    figure = Figure(figsize=(7.2, 7.2 * -low / _PAGE_M))
+    axis = figure.add_axes((0, 0, 1, 1))
+    for name, x, y in places:
+        high, wide = (step_m * n for n in images[name].shape[:2])
+        axis.imshow(images[name], extent=(x - wide / 2, x + wide / 2, y, y + high), interpolation="antialiased")
+        mass_kg = get_robot(name).mass_kg
+        axis.text(x, y - 0.04, f"{name}\n{mass_kg:.3g} kg" if mass_kg else name, ha="center", va="top", fontsize=9)
+    axis.plot([0.06, 0.56], [low + 0.08] * 2, color="k", linewidth=2, solid_capstyle="butt")
+    axis.text(0.61, low + 0.08, "0.5 m", va="center", fontsize=9)
+    axis.set(xlim=(0, _PAGE_M), ylim=(low, 0.02), aspect="equal")
+    axis.set_axis_off()
+    return figure
 
 
 def save_pictures(names: tuple[str, ...], folder: Path) -> list[Path]:
