@@ -66,7 +66,7 @@ def rooms_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure, grid = plt.subplots(
         len(scenes),
         len(methods),
-        figsize=(3.6 * len(methods), 3.6 * sum(heights) + 0.55 * len(scenes)),
+        figsize=(2.4 * len(methods), 2.4 * sum(heights) + 0.85 * len(scenes)),
         height_ratios=heights,
         squeeze=False,
         layout="constrained",
@@ -76,16 +76,16 @@ def rooms_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
             mine = [r for r in rows if r["scene"] == scene and r["method"] == method]
             shown, rooms = mine[0], mine[0]["rooms"]
             floor_plan(axis, shown["space"])
-            room_points(axis, rooms.points_w, rooms.labels, s=5, linewidths=0)
+            room_points(axis, rooms.points_w, rooms.labels, s=3, linewidths=0)
             if shown["recorded"] is not None:
                 for x0, y0, x1, y1 in shown["recorded"]:
                     axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.9, edgecolor="k"))
             said = [
-                f"{r['count']} rooms ({r['chosen_by']})"
-                + ("" if r["agreement"] is None else f" ARI {r['agreement']:.2f}")
+                f"{r['count']} rooms, {r['chosen_by']}"
+                + ("" if r["agreement"] is None else f": ARI {r['agreement']:.2f}")
                 for r in mine
             ]
-            axis.set_title(f"{scene}, {method}\n" + "; ".join(said), fontsize=7.5)
+            axis.set_title("\n".join([f"{scene}, {method}", *said]), fontsize=8)
     return figure
 
 
@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     made.add_argument("--clearance", type=float, default=0.2, metavar="M", help="of positions (default 0.2)")
     arguments = made.parse_args(argv)
     rows = compare([Path(s) for s in arguments.scenes], arguments.seed, arguments.clearance)
-    save(rooms_figure(rows), Path(arguments.out))
+    save(rooms_figure(rows), Path(arguments.out), Path(arguments.out).suffix[1:] or "png")
     for row in rows:
         rand = "" if row["agreement"] is None else f"  adjusted Rand index {row['agreement']:.3f}"
         print(f"{row['scene']:<14}{row['method']:<10}{row['count']:>3} rooms ({row['chosen_by']}){rand}")

@@ -15,9 +15,9 @@ from PIL import Image
 from topological_nav.figures.maps import floor_plan, room_points, scene_axes
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
-from train.figures.style import plt
+from train.figures.style import BLUE, VERMILION, plt
 
-WON, LOST = "tab:blue", "tab:red"
+WON, LOST = BLUE, VERMILION
 FEW = 100
 """Episodes of which each start and goal is drawn; of more, only those of the lost."""
 INK = 40.0

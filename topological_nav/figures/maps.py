@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
 
 from topological_nav.data.dataset import load_plan, load_rooms, read_header
@@ -20,8 +20,10 @@ from topological_nav.scenes.space import FreeSpace
 from train.figures import style
 from train.figures.style import panels, plt
 
-PALETTE = [*plt.get_cmap("tab20").colors[::2], *plt.get_cmap("tab20").colors[1::2]]  # type: ignore[attr-defined]
-"""Colours of rooms; after twenty they repeat."""
+PALETTE = (style.BLUE, style.ORANGE, style.GREEN, style.PINK, style.SKY, style.VERMILION, "#f0e442", "#332288", "0.3")
+"""Colours of rooms; after nine they repeat."""
+FREE = LinearSegmentedColormap.from_list("free", (style.VERMILION, "0.88", style.BLUE))
+"""Colours of probabilities, from blocked to free, for colour-blind readers too."""
 save = functools.partial(style.save, dpi=130)
 
 
@@ -44,7 +46,7 @@ def scene_axes(part: Any, count: int, columns: int = 4) -> np.ndarray:
 
 
 def floor_plan(axis: Axes, space: FreeSpace) -> None:
-    """Draws free space white and obstacles grey, cut to where there is free space."""
+    """Draws free space white and obstacles grey, cut to where there is free space, with a bar of 2 m below."""
     rows, columns = space.clearance_m.shape
     (x0, y0), step = space.origin_w, space.resolution_m
     axis.imshow(
@@ -56,7 +58,10 @@ def floor_plan(axis: Axes, space: FreeSpace) -> None:
     )
     free = space.centres(0.0)
     (left, bottom), (right, top) = free.min(0) - 0.4, free.max(0) + 0.4
-    axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+    axis.set(xlim=(left, right), ylim=(bottom - 0.6, top), aspect="equal", xticks=[], yticks=[])
+    axis.spines[:].set_visible(False)
+    axis.plot([left, left + 2.0], [bottom - 0.3] * 2, color="k", linewidth=2, solid_capstyle="butt")
+    axis.text(left + 2.15, bottom - 0.3, "2 m", va="center", fontsize=8)
 
 
 def room_points(axis: Axes, points_w: np.ndarray, labels: np.ndarray, **style: Any) -> None:
@@ -100,11 +105,7 @@ def dataset_figure(folder: Path) -> Figure:
 
 
 def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Loss and accuracy over epochs, a column a phase.
-
-    Args:
-        lines: of a run's metrics.jsonl.
-    """
+    """Loss and accuracy over epochs, from lines of a run's metrics.jsonl, a column a phase."""
     names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
     phases = list(dict.fromkeys(line["phase"] for line in lines))
     figure, grid = panels((4.6 * len(phases), 3.2), 1, len(phases))
@@ -118,29 +119,26 @@ def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def map_figure(built: Built, route: Route | None = None) -> Figure:
-    """A map over the floor plan: edges red to green by probability, each direction on its own half.
-
-    Args:
-        built: of `build.build_map`.
-        route: drawn on top.
-    """
+    """A map over the floor plan, a route on top: edges from blocked to free, each direction on its own half."""
     made = built.map
     extent = np.ptp(built.space.centres(0.0), axis=0)
-    figure, axis = plt.subplots(figsize=(8.4, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")
+    figure, axis = plt.subplots(figsize=(7.2, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")
     floor_plan(axis, built.space)
     start, end = made.xy_w[made.edges[:, 0]], made.xy_w[made.edges[:, 1]]
     order = np.argsort(made.p)
-    halves = LineCollection(
-        list(np.stack([start, (start + end) / 2], 1)[order]), cmap="RdYlGn", linewidths=1.1, zorder=2
-    )
+    halves = LineCollection(list(np.stack([start, (start + end) / 2], 1)[order]), cmap=FREE, linewidths=1.1, zorder=2)
     halves.set_array(made.p[order])
     halves.set_clim(0.0, 1.0)
     axis.add_collection(halves)
-    room_points(axis, made.xy_w, made.room, s=34, edgecolors="k", linewidths=0.6, zorder=4)
-    for node, (x, y) in enumerate(made.xy_w):
-        axis.annotate(str(node), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=5, zorder=5)
+    room_points(axis, made.xy_w, made.room, s=130, linewidths=0, zorder=4)
+    axis.scatter(made.xy_w[:, 0], made.xy_w[:, 1], s=70, c="w", linewidths=0, zorder=4)
+    for node, xy in enumerate(made.xy_w):
+        if np.linalg.norm(made.xy_w[:node] - xy, axis=-1).min(initial=1.0) > 0.25:  # else one over the other
+            axis.text(xy[0], xy[1], str(node), ha="center", va="center", fontsize=6, zorder=5)
     if route is not None:
-        axis.plot(*made.xy_w[list(route.nodes)].T, color="tab:blue", linewidth=2.6, zorder=3)
-    figure.colorbar(halves, ax=axis, label="probability that the way is free", shrink=0.6, pad=0.01)
+        axis.plot(*made.xy_w[list(route.nodes)].T, color="k", linewidth=2.6, zorder=3)
+    figure.colorbar(
+        halves, ax=axis, label="probability that the way is free", orientation="horizontal", shrink=0.6, pad=0.01
+    )
     axis.set_title(f"{made.scene}: {len(made.xy_w)} nodes, {len(made.edges)} directed edges", fontsize=9)
     return figure
