@@ -11,6 +11,7 @@ import contextlib
 import importlib
 import importlib.util
 import inspect
+import io
 import os
 import sys
 from unittest import mock
@@ -22,8 +23,8 @@ from sphinx.application import Sphinx
 COLUMNS = 100
 
 
-def parser_of(module: str) -> argparse.ArgumentParser:
-    """The parser behind `python -m module --help`, caught when it would print.
+def help_of(module: str) -> dict[str, str]:
+    """What `python -m module --help` says, and its commands say, by the words that call them.
 
     Raises:
         ValueError: the program ends without printing help.
@@ -34,23 +35,26 @@ def parser_of(module: str) -> argparse.ArgumentParser:
     caught: list[argparse.ArgumentParser] = []
     with (
         mock.patch.object(argparse.ArgumentParser, "print_help", lambda self, file=None: caught.append(self)),
-        mock.patch.object(sys, "argv", [module, "--help"]),
+        mock.patch.object(sys, "argv", [f"python -m {module}", "--help"]),
+        contextlib.redirect_stdout(io.StringIO()) as printed,
         contextlib.suppress(SystemExit),
     ):
         main(*([["--help"]] if inspect.signature(main).parameters else []))
-    if not caught:
+    if caught:
+        return of_parser(caught[0])
+    if not printed.getvalue():
         raise ValueError(f"{module}: no help; expected a program that prints it with --help")
-    return caught[0]
+    return {f"python -m {module}": printed.getvalue()}
 
 
-def helps(parser: argparse.ArgumentParser) -> dict[str, str]:
-    """Help of a parser and of the commands below it, by the words that call them, 100 columns wide."""
+def of_parser(parser: argparse.ArgumentParser) -> dict[str, str]:
+    """Help of a parser and of the commands below it, 100 columns wide."""
     with mock.patch.dict(os.environ, {"COLUMNS": str(COLUMNS), "NO_COLOR": "1"}):
         told = {parser.prog: parser.format_help()}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for below in dict.fromkeys(action.choices.values()):
-                told |= helps(below)
+                told |= of_parser(below)
     return told
 
 
@@ -61,7 +65,7 @@ class HelpOf(Directive):
 
     def run(self) -> list[nodes.Node]:
         made: list[nodes.Node] = []
-        for k, (words, text) in enumerate(helps(parser_of(self.arguments[0])).items()):
+        for k, (words, text) in enumerate(help_of(self.arguments[0]).items()):
             made += [nodes.rubric(words, words)] if k else []
             made.append(nodes.literal_block(text, text, language="text"))
         return made

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from docs.package_map import read_sources
-from docs.program_help import helps, parser_of
+from docs.program_help import help_of
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "commands.md"
@@ -43,9 +43,10 @@ def test_a_program_that_is_missing_is_found(tmp_path):
 
 
 def test_help_is_that_of_the_parser_and_of_its_commands():
-    told = helps(parser_of("interactive_nav.episodes"))
+    told = help_of("interactive_nav.episodes")
     assert list(told) == ["python -m interactive_nav.episodes", "python -m interactive_nav.episodes make"]
     assert "--num-objects" in told["python -m interactive_nav.episodes make"]
     assert max(len(line) for text in told.values() for line in text.splitlines()) <= 100
+    assert "generate-scenes" in help_of("interactive_nav")["python -m interactive_nav"]
     with pytest.raises(AttributeError):
-        parser_of("train.config")
+        help_of("train.config")
