@@ -7,9 +7,9 @@ whose incoming state is not, to the bit, the one that the batch returned last.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -31,6 +31,35 @@ _ENGINE_FAILURES = (
     mujoco.mjtWarning.mjWARN_INERTIA,
 )
 _OVERFLOWS = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+
+
+def with_feet_apart(spec: mujoco.MjSpec, names: Sequence[str]) -> mujoco.MjModel:
+    """A scene's model that steps as its spec's does, to the bit, and faster.
+
+    MuJoCo's broadphase measures each geom of each body that can collide, asleep or not, and most geoms are feet. Here
+    the feet of `names` are on bodies of their own that can collide with nothing; pairs name the floor for them.
+    """
+    spec = spec.copy()
+    floor = spec.geom("floor")
+    for name in names:
+        legs = spec.body(name).add_body(name=f"{name}_feet", explicitinertial=True, mass=0.0, inertia=[0.0] * 3)
+        for foot in [geom for geom in spec.body(name).geoms if geom.name.startswith(f"{name}_foot_")]:
+            shape = {"type": foot.type, "pos": foot.pos, "size": foot.size, "mass": 0.0}
+            legs.add_geom(name=f"{foot.name}_apart", contype=0, conaffinity=0, **shape)
+            # As the engine would mix them: the larger friction, and both have the same solref and solimp.
+            spec.add_pair(
+                geomname1=floor.name,
+                geomname2=f"{foot.name}_apart",
+                condim=max(floor.condim, foot.condim),
+                friction=np.maximum(floor.friction, foot.friction)[[0, 0, 1, 2, 2]],
+                solref=foot.solref,
+                solimp=foot.solimp,
+            )
+            spec.delete(foot)
+    model = spec.compile()
+    for name in names:
+        model.body(f"{name}_feet").invweight0 = model.body(name).invweight0
+    return model
 
 
 class _Pool:
@@ -58,7 +87,7 @@ class NativePhysics(Physics):
         self._contacts = sensor_addresses(world.models[0]) if config.rules.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
-        self._models = tuple(copy.copy(m) for m in world.models)
+        self._models = tuple(with_feet_apart(spec, [slot.name for slot in world.slots]) for spec in world.specs)
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must be seen, not silently replaced by the model's default.

@@ -36,8 +36,10 @@ class World:
     robot: RobotSpec
     scenes: tuple[Scene, ...]
     small_objects: tuple[SmallObject, ...]
+    specs: tuple[mujoco.MjSpec, ...]
+    """One per scene."""
     models: tuple[mujoco.MjModel, ...]
-    """Compiled specs, one per scene, equal in structure."""
+    """Compiled specs, equal in structure."""
     layout: Layout
     rest_qpos: np.ndarray
     """[S, nq]: furniture settled, robot and small objects parked."""
@@ -111,7 +113,8 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         )
     small = small_objects(config.rules.num_objects, config.rules.small_objects, config.rules.objects)
     slots = find_slots(scenes, small)
-    models = [build_spec(robot, i, scenes, slots, config).compile() for i in range(len(scenes))]
+    specs = [build_spec(robot, i, scenes, slots, config) for i in range(len(scenes))]
+    models = [spec.compile() for spec in specs]
     layout = find_layout(models[0], robot, [(slot.name, slot.kind) for slot in slots])
     rest = [_settle(model, layout, robot) for model in models]
     for scene, qpos in zip(scenes, rest, strict=True):
@@ -121,6 +124,7 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         robot=robot,
         scenes=scenes,
         small_objects=small,
+        specs=tuple(specs),
         models=tuple(models),
         layout=layout,
         rest_qpos=np.asarray(rest),

@@ -87,7 +87,7 @@ def _with_floor_sensors(spec, robot, slots, config):
             type=mujoco.mjtSensor.mjSENS_CONTACT,
             objtype=mujoco.mjtObj.mjOBJ_GEOM,
             objname="floor",
-            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            reftype=mujoco.mjtObj.mjOBJ_XBODY,  # with its feet, which are a body of their own on native
             refname=name,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],
         )
