@@ -221,11 +221,13 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
     Raises:
         GenerationError: an unknown name.
     """
+    sets = {name: packaged_set(name).scenes for name in PACKAGED}
+    known = [word for name, members in sets.items() for word in (name, f"{name}/train", f"{name}/test", *members)]
+    for word in (word for word in names if word not in known):
+        raise GenerationError(f"no scene or set {word!r}{nearest(word, known)}; 'scenes list' shows them")
     failed: list[str] = []
-    known: list[str] = []
     for name, folder in PACKAGED.items():
-        members = packaged_set(name).scenes
-        known += [name, f"{name}/train", f"{name}/test", *members]
+        members = sets[name]
         asked = [n for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)]
         wanted = {n: members[n] for n in asked if not (folder / n / "scene.json").is_file()}
         for scene in (n for n in asked if n not in wanted):
@@ -239,6 +241,4 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
         for scene in (n for n, m in wanted.items() if n not in failed and scene_digest(out / n) != m.digest):
             tell(f"{scene}: not the scene that the set {name} lists")
             failed.append(scene)
-    for word in (word for word in names if word not in known):
-        raise GenerationError(f"no scene or set {word!r}{nearest(word, known)}; 'scenes list' shows them")
     return failed

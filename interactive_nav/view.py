@@ -166,7 +166,7 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def open_browser(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> None:
-    """Serves mjviser's page until Ctrl-C; it opens on the whole scene, or looks through the model's first camera."""
+    """Serves mjviser's page until Ctrl-C; on the whole scene, or through the camera of `vis.global.cameraid`."""
     viser, mjviser = importlib.import_module("viser"), importlib.import_module("mjviser")
     model.stat.extent /= 3  # mjviser looks from three extents away, and follows a body of its choice
     server, camera = viser.ViserServer(port=port), model.vis.global_.cameraid

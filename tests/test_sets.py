@@ -219,5 +219,5 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
     assert "birch: not the scene that the set sparse lists" in capsys.readouterr().out
     out, recipes = tmp_path / "cache" / "package", tmp_path / "package" / "recipes.yaml"
     assert asked == [(out, recipes, ("alder",)), (out, recipes, ("birch", "rowan", "willow"))]
-    assert main(["scenes", "make", "aldr"]) == 2
+    assert main(["scenes", "make", "cedar", "aldr"]) == 2 and len(asked) == 2, "refused before anything is made"
     assert "no scene or set 'aldr', did you mean 'alder'?" in capsys.readouterr().err
