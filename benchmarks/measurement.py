@@ -1,7 +1,5 @@
 """What the benchmarks share: their command lines, rows that say where they come from, random driving, timing."""
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import json

@@ -10,8 +10,6 @@ logs, compiling and checkpoints apart. Rows carry device, versions and commit, a
 `benchmarks/results/steps_per_second.jsonl`.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import statistics

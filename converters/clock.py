@@ -1,7 +1,5 @@
 """How long each stage of a conversion takes, what share of it all is done, and the memory that it takes."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import time

@@ -1,7 +1,5 @@
 """Commands of `python -m converters` that generate, and of the furniture for it; their words are in words.yaml."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

@@ -4,8 +4,6 @@ Each source is converted by a process of its own (`python -m converters.many JSO
 fails or is killed costs no other.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

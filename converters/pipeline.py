@@ -1,7 +1,5 @@
 """A raw folder in, a scene folder out: read, stages that are functions of arrays, write, rename."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import dataclasses

@@ -4,8 +4,6 @@ A recipe names a seed, a split, a tier and how the building departs from the tie
 which CAD models may be used. The same recipes give the same scenes, byte for byte.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections.abc import Callable, Iterable, Sequence

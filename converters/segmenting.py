@@ -1,7 +1,5 @@
 """Commands of `python -m converters` that label scans, and what they print; their words are in words.yaml."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -4,8 +4,6 @@ Each scene is made by a process of its own (`generate-scenes --only NAME`), so t
 so that any machine that sees the folder can make it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import tempfile

@@ -4,8 +4,6 @@ The body's frame is a scene object's: origin at the middle of the base, z up. `o
 with a free joint, so that it can be attached to any model; it stands as it comes to rest on a level floor.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """`interactive-nav COMMAND ...`: all programs of the project under one name; each is also `python -m MODULE ...`."""
 
-from __future__ import annotations
-
 import runpy
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Functions of whole batches, called for one element: any number of `vmap`s becomes one call with all elements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

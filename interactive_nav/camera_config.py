@@ -1,7 +1,5 @@
 """Settings of the robot's cameras: where they look, and the errors that they make."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated, Any
 

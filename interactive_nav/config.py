@@ -1,7 +1,5 @@
 """The environment's settings in three parts (task, physics, sensors), checked on construction."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

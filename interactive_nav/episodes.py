@@ -7,8 +7,6 @@ the same episodes on every machine and backend; with other scenes, another robot
 Files made before that digest was there name the digest of scene.xml and maps.npz, and are held to that.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

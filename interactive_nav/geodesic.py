@@ -10,8 +10,6 @@ crosses is free. The largest gap between the moves' directions is 18.4 degrees, 
 is at most 1/cos(9.2 deg) - 1 = 1.3 % too long, where an 8-connected grid errs by up to 8.2 %.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -4,8 +4,6 @@ Interactive Gibson (Xia et al. 2020), section IV. Every function takes any leadi
 returns arrays of those axes; nothing here reads a simulator.
 """
 
-from __future__ import annotations
-
 from interactive_nav_common.rotations import Array, namespace
 
 GRAVITY = 9.81

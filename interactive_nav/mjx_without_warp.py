@@ -4,8 +4,6 @@
 a base install is. Brax imports it too, so the modules of this package that use MJX are no place to catch it.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Sequence

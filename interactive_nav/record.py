@@ -7,8 +7,6 @@ with its textures from where somebody would film it.
 Playing a policy is for `train` to do: `python -m train.record RUN` plays an episode of a run, and has it drawn here.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import warnings

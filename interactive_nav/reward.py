@@ -3,8 +3,6 @@
 R = R_suc + R_pot + R_int. Pure functions on NumPy or JAX arrays with any leading batch axes.
 """
 
-from __future__ import annotations
-
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import Array, namespace
 

@@ -5,8 +5,6 @@ they stood at the start and filled where they stand at the end, an arrow from th
 robot's path coloured by time or by what it touched.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Records that travel through `reset` and `step`: frozen structs of arrays; shapes are those of one environment."""
 
-from __future__ import annotations
-
 import flax.struct
 import jax
 

@@ -3,8 +3,6 @@
 A window where the machine has a screen, else a page in the browser (mjviser, an optional dependency).
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util

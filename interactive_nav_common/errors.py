@@ -1,7 +1,5 @@
 """What a user can cause or mend: each error is one clear line (what, got, expected, remedy)."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import sys

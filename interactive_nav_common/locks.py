@@ -1,7 +1,5 @@
 """Advisory locks on files and folders, freed by the system however their holder ends."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

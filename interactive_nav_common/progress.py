@@ -1,7 +1,5 @@
 """Shares of work in, a bar on the console out."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ A record is a dataclass: its types say what its keys may hold, `Annotated` with 
 Lines of metrics too, packed or not, and back.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import gzip

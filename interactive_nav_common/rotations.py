@@ -1,7 +1,5 @@
 """Rotations of NumPy or JAX arrays: quaternions w x y z, angles in rad, matrices with the body's axes as columns."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

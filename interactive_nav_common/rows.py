@@ -1,7 +1,5 @@
 """Records of arrays taken in part and joined; tables of rows as Parquet files, whole or not at all, and as Markdown."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path

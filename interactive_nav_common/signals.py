@@ -1,7 +1,5 @@
 """SIGINT and SIGTERM: collected by programs that save before they end, or held back for an instant."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

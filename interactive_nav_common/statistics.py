@@ -1,7 +1,5 @@
 """Samples in; means with their intervals, and the tests between them, out."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import warnings

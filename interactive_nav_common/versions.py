@@ -1,7 +1,5 @@
 """What a result depends on: packages, device, cores, commit, command."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.metadata
 import os

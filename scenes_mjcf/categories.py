@@ -4,8 +4,6 @@ Whatever another module must know of every category (a class of a mask, a colour
 field here, so that a new category is one new row and no two places differ.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

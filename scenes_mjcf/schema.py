@@ -4,8 +4,6 @@ A scene folder holds `scene.xml` (MJCF), `scene.json` (this module's `SceneManif
 (`SceneMaps`) and `assets/`. World frame: z up, metres, floor at z = 0. See `scenes_mjcf/README.md`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

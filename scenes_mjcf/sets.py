@@ -6,8 +6,6 @@ A set is a file that lists scenes, their splits and the digests of their tasks: 
 is looked for beside the package and in the cache folder, by the same path (`scenes_mjcf/alder`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

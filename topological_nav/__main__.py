@@ -3,8 +3,6 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 import signal

@@ -1,7 +1,5 @@
 """Every setting of datasets, training and maps: frozen dataclasses checked on construction; docstrings are the help."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

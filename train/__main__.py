@@ -1,7 +1,5 @@
 """`python -m train`: words on the command line in, a trained run folder and an exit code out."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import sys

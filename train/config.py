@@ -1,7 +1,5 @@
 """Every setting of a training run: frozen dataclasses, checked on construction; docstrings are the help."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal

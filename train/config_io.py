@@ -1,7 +1,5 @@
 """YAML text and `key=value` words -> a `TrainConfig`, and back; every mistake named in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

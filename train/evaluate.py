@@ -1,7 +1,5 @@
 """`python -m train.evaluate`: run folders in; Parquet rows, recorded paths and tables of scores out."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -3,8 +3,6 @@
 `python -m train.replay`, then `python -m interactive_nav.record` of the replay.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ end otherwise; a replay carries its own scores. Videos and maps are drawn from i
 `python -m train.record`, `python -m interactive_nav.topdown`.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Sequence

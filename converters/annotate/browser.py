@@ -3,8 +3,6 @@
 All that was said is in the `Session`, saved before it is shown: a page that goes away loses nothing.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import functools

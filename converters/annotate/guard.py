@@ -5,8 +5,6 @@ about every request before it answers; ours comes first, so that nothing is sent
 has agreed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hmac
 import http

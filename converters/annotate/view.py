@@ -1,7 +1,5 @@
 """What the browser shows of an object: the scan around it, the model beside it, the camera, pictures of models."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

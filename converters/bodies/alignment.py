@@ -4,8 +4,6 @@ The seven free parameters (three scales, three translations, yaw; roll and pitch
 original annotation (Interactive Gibson, section III-B).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

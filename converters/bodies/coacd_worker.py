@@ -1,7 +1,5 @@
 """`python -m converters.bodies.coacd_worker IN.npz OUT.npz`: one mesh in, its convex hulls out."""
 
-from __future__ import annotations
-
 import sys
 
 import coacd

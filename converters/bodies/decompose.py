@@ -6,8 +6,6 @@ coacd runs outside this process because it prints its log to the terminal, may c
 cannot be interrupted from Python. A model is decomposed once, unscaled: scaling keeps a hull convex.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import dataclasses

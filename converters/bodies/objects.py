@@ -1,7 +1,5 @@
 """CAD models, hulls and upright poses in, `PlacedObject` records out."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import itertools

@@ -1,7 +1,5 @@
 """Category and hulls in; mass, centre of mass, inertia and friction out."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

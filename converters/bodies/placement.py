@@ -1,7 +1,5 @@
 """Annotated poses in, upright placements and rows that compare them with the re-solved ones out."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

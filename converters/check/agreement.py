@@ -1,7 +1,5 @@
 """Whether a scene's files agree: map with walls, `scene.json` with `scene.xml`, masses with what is usual."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

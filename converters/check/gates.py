@@ -1,7 +1,5 @@
 """A scene's model, manifest and maps in; acceptance values against one table of limits out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

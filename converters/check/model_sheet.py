@@ -1,7 +1,5 @@
 """Names of CAD models in, one picture of them out: each from the front, the right and above, with name and size."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

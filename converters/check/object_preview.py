@@ -1,7 +1,5 @@
 """A single object's folder in, a figure of it from above, from the front and from the side out."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

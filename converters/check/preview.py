@@ -3,8 +3,6 @@
 Drawn by matplotlib's Agg, which needs neither display nor GPU.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

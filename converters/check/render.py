@@ -1,7 +1,5 @@
 """Textured meshes and a camera in, a picture out; in NumPy: neither display nor GPU is needed."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Objects at their annotated poses and wall boxes in, objects at rest out."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Collection, Mapping
 

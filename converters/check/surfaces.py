@@ -1,7 +1,5 @@
 """Whether what is drawn of an object is what a robot hits, and what its model shows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import mujoco

@@ -1,7 +1,5 @@
 """A compiled scene in, pictures of what is drawn of it out: slantwise from the south, from above, and at eye height."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

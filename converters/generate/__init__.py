@@ -1,7 +1,5 @@
 """A seed in, a raw building folder out: a synthetic apartment in the raw Gibson layout."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Points in; convex hulls and boxes round them out."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

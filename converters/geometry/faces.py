@@ -1,7 +1,5 @@
 """Triangle meshes in; areas, labels, samples and cleaned surfaces out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 

@@ -1,7 +1,5 @@
 """A mesh of convex pieces in, few convex pieces out: what needs no decomposition."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError

@@ -1,7 +1,5 @@
 """Angles and axes in, rotation matrices out."""
 
-from __future__ import annotations
-
 import numpy as np
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

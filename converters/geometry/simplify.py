@@ -1,7 +1,5 @@
 """A triangle mesh and an error in; as few triangles as keep its surface out, every loose part for itself."""
 
-from __future__ import annotations
-
 import fast_simplification
 import numpy as np
 import trimesh

@@ -1,7 +1,5 @@
 """A scan in any frame and unit in; which way is up, how it is turned there, and metres a unit, out."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from converters.geometry.faces import face_areas, face_vectors

@@ -3,8 +3,6 @@
 `selection.yaml` names the models of each category and split; no creator is in both splits.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import concurrent.futures.process
 import dataclasses

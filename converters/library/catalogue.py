@@ -4,8 +4,6 @@ The file is a ZIP with `PluginFurnitureCatalog.properties` (Java's format: `name
 or other models with textures, and icons.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

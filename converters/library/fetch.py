@@ -1,7 +1,5 @@
 """Debian's package of furniture libraries, or a folder of them, in; checked `.sh3f` files in the cache folder out."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import shutil

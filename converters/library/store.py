@@ -4,8 +4,6 @@ One archive, `models.zip`: `index.json`, and for each model its arrays and its t
 front along +z, the middle of its base at the origin.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import io

@@ -1,7 +1,5 @@
 """Labelled points in, pieces of one class out: connected voxels, merged, parted at necks and in rows."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

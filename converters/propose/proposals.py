@@ -7,8 +7,6 @@ too long for one of its class; tables and desks also where two tops meet in a st
 rectangles have and one has not.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """A raw folder in; `proposals.json` (Scan2CAD's shape) and `proposals.png` out, and retrieval's report."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ two-sided iterative closest point scheme with the same seven parameters (three s
 judged by how far the scan lies from the model and the model from the scan.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

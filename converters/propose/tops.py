@@ -1,7 +1,5 @@
 """A piece of tables or desks in, single ones out: where two tops meet in a step, or make two rectangles' outline."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -4,8 +4,6 @@ Frames of the file (Avetisyan et al. 2019): an annotation world, y up; the scan'
 each model's `trs` CAD -> world, and both keypoint sets stand in that world (the CAD's after its `trs`).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

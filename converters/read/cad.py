@@ -1,7 +1,5 @@
 """A ShapeNet-like OBJ with its materials in, one `CadModel` (z up) out."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from converters.geometry.faces import merge_vertices

@@ -1,7 +1,5 @@
 """Paths in; meshes, images, JSON and hashes out; a failure is one `SceneRejected` line."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math

@@ -4,8 +4,6 @@ Files of the release: iGibson 0.0.4, `dataset.md`; z up, metres, maps of 0.01 m 
 the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -6,8 +6,6 @@ whose orientation and scale are baked into its mesh, `pos_<i>_<synset>.txt` the 
 `floors.txt` as in `gibson`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -4,8 +4,6 @@ Names of files that an OBJ or MTL gives are sought generously, for folders trave
 missing costs colour only and is a warning.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from urllib.parse import unquote

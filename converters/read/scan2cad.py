@@ -1,7 +1,5 @@
 """A folder with one ScanNet scan, its labels, Scan2CAD's annotation and the CAD models in, `RawScene` out."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

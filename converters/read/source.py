@@ -1,7 +1,5 @@
 """A raw folder in any layout that we read in, `RawScene` out."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A building with several floors in, one `RawScene` a floor out."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

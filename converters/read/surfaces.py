@@ -1,7 +1,5 @@
 """A scan without semantic labels in; floor, wall and ceiling told by shape out. Also: which way is the floor?"""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

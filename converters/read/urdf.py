@@ -4,8 +4,6 @@ Inertia is not read: released URDFs carry placeholders (1 kg m2 about every axis
 known, from which it follows.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable

@@ -5,8 +5,6 @@ compute; a stale entry can therefore not be met, and the folder may be deleted a
 NPZ with a JSON tree inside (no pickles: an entry can be damaged, but cannot run).
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Errors that a user of the converter can act on: one line with what, where, expected, remedy."""
 
-from __future__ import annotations
-
 from interactive_nav_common.errors import UserError
 
 

@@ -1,7 +1,5 @@
 """A gate's limit and its outcome."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a source may hold at most: the one table of limits, checked before the work that they bound."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from PIL import Image

@@ -5,8 +5,6 @@ up, not scaled; *world frame* (`_w`) = scan frame with the floor at z = 0; *body
 object's own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is drawn: coloured points of a scan, and meshes with their images."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

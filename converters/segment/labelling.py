@@ -1,7 +1,5 @@
 """An unlabelled scan in, NYU40 labels of its vertices out, and how well they fit a labelled one's."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ Each cell of 2 x 2 x 2 voxels is one place with eight times the channels, on the
 and nothing is lost. Normalisation is over channels alone, so that a tile's size changes nothing.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path

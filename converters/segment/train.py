@@ -4,8 +4,6 @@ OUT/crops/SEED.npz   labelled voxels of a generated building, held_out/SEED.npz 
     checkpoint.msgpack, weights.npz, metrics.jsonl   as of the last save
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -3,8 +3,6 @@
 Frame: the scan's, z up; voxels are counted from `Voxels.origin`, which lies `BELOW_M` under the floor.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

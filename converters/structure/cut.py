@@ -1,7 +1,5 @@
 """Scan mesh and placed objects in; which faces go, and which object each removed vertex showed, out."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

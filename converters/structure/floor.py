@@ -1,7 +1,5 @@
 """Labelled scan in; the floor's plane by RANSAC, and the scan with its floor level, out."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Traversable cells in, few boxes that bound them out."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator
 

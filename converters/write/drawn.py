@@ -1,7 +1,5 @@
 """Source surfaces in, what is drawn of them out: as they are where they are small, else simplified and baked."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

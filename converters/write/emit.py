@@ -3,8 +3,6 @@
 Conventions of the written MJCF (classes, groups, names) are in `scenes_mjcf/README.md`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

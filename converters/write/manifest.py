@@ -1,7 +1,5 @@
 """Results of the stages in, `SceneManifest` (scene.json) out."""
 
-from __future__ import annotations
-
 import dataclasses
 from importlib.metadata import version
 from typing import Any

@@ -6,8 +6,6 @@ navigation complexity, the largest ratio of the shortest way between two places 
 Gibson's buildings have ceilings and their furniture is part of the mesh; here it stands where it stands at rest.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -4,8 +4,6 @@ Frames: a scene is metres, z up, y to the back of the plan; a drawing is cm, its
 clockwise; models are y up with their front along +z. A door's own frame is z up, x along the wall that it stands in.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import xml.etree.ElementTree as ElementTree

@@ -1,7 +1,5 @@
 """Wall boxes and the map of a scene in; walls of its drawing, their gaps, and the rooms that doorways part, out."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Meshes and a cloud of coloured scan points in, simplified meshes with UVs and baked textures out."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

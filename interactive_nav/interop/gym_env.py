@@ -10,8 +10,6 @@ Environment i of a batch reset with seed s plays the episodes of a single enviro
 `scene_choice="slot"` it keeps scene i modulo their number, as a single one made with `slot=i`.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from typing import Any

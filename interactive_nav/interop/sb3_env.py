@@ -5,8 +5,6 @@ from interactive_nav.interop.sb3_env import SB3VecEnv
 PPO("MlpPolicy", SB3VecEnv("turtlebot", ["scenes_mjcf/apartment_0"], num_envs=16)).learn(1_000_000)
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Both sides then look at the same bytes on the same device. JAX takes its arrays 
 a tensor that came from JAX only after `clone()`, and into one that was handed to JAX not at all.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -6,8 +6,6 @@ the corners in sight, of the way there plus what the corner has left. Which corn
 nodes 0.1 m apart and blended between the four nearest, so the distance is continuous.
 """
 
-from __future__ import annotations
-
 import math
 
 import jax

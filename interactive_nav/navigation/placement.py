@@ -5,8 +5,6 @@ retries for ever; a small object that finds no place is parked outside, and coun
 drawn at the distances that were asked for, one that is known to be takes its place.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 

@@ -1,7 +1,5 @@
 """A `World` and its settings in, `SceneTables` on the device out: all that `reset` and `step` look up."""
 
-from __future__ import annotations
-
 import functools
 import math
 from concurrent.futures import ThreadPoolExecutor

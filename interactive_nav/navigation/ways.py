@@ -4,8 +4,6 @@ Ways are found by Dijkstra on a grid, round everything that can be moved or, at 
 movable obstacles; Stilman and Kuffner 2005, Interactive Gibson section II-D).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """Physics backends behind one interface: `warp`, `jax` and `native`; `make_physics` picks one."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import jax

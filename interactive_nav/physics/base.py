@@ -4,8 +4,6 @@ The state that travels is small and the same on every backend (`qpos`, `qvel`, t
 so resets are `jnp.where`, checkpoints are portable and nothing engine-specific leaks into the loop.
 """
 
-from __future__ import annotations
-
 import abc
 from typing import Any
 

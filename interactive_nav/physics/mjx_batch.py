@@ -5,8 +5,6 @@ Environments differ only in model fields: each fills the slots of one small mode
 is carried.
 """
 
-from __future__ import annotations
-
 import abc
 import functools
 from collections.abc import Callable

@@ -5,8 +5,6 @@ not travel in `PhysicsState`; it is kept beside the batch as a cache, and droppe
 whose incoming state is not, to the bit, the one that the batch returned last.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ whatever turn. Gaps are planar and never larger than the true ones: the largest 
 the boxes' shadows and between their centres (separating axes).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

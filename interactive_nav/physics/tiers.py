@@ -4,8 +4,6 @@ A step costs as the degrees of freedom of its model do, and most environments ne
 shapes are static.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import jax

@@ -8,8 +8,6 @@ collector too, if somebody holds the frame of an old call and drops it within a 
 `sys._current_frames` do: profile from outside of the process.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import sys

@@ -8,8 +8,6 @@ from MJX-Warp's, both with textures; where neither is, from rays with a flat col
 on a CPU too, after a compilation of ten seconds a size, so there it is used only when asked for.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ system and fails. Here the library is chosen when the first picture is asked for
 where there is no display.
 """
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import math

@@ -4,8 +4,6 @@ A replay names bodies and holds their poses in the world frame, so that it can b
 alone: without the policy, the physics, or the other scenes of the environment that it was played in.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

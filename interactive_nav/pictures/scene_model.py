@@ -4,8 +4,6 @@ Every picture and viewer starts from `furnished_spec`. `SceneModel` is what pict
 where a caller wants them, and rays are cast into it.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 

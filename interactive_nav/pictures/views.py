@@ -5,8 +5,6 @@ cluster node without a display and in the tests. Walls are cut low where one loo
 Policies see `interactive_nav.sensing` (or nothing but numbers); nothing here is on their path.
 """
 
-from __future__ import annotations
-
 import colorsys
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Robots by name: each a typed spec (mass, width, action map, camera) and an MJCF builder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from interactive_nav.robots.models.ant import ant

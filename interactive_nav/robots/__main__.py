@@ -3,8 +3,6 @@
 Exit status: 0; 2 for a question that cannot be answered, with one line that says why.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -6,8 +6,6 @@ without contype and conaffinity rolls: it is paired with the world's floor and m
 a sphere can stand for a thin wheel without standing out at its sides.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

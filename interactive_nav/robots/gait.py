@@ -4,8 +4,6 @@ A gait is a pure function of the twist command, the robot's state and the clock,
 targets are `home + reference(phase, command, base)`, a scripted stepping motion.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -5,8 +5,6 @@ What the task's physics needs and a file may lack is put right, each with a warn
 Control modes come from `build.py`.
 """
 
-from __future__ import annotations
-
 import functools
 import warnings
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ furniture; cylinders become boxes; links without inertia take their shapes'; dri
 sensors and options of the file go.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import warnings

@@ -8,8 +8,6 @@ when an option asks for them.
 What rolls are a robot's `rolling_bodies` and its casters: frictionless geoms (condim 1) of other bodies.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -1,7 +1,5 @@
 """Where things are in the models' state vectors: compiled models of equal layout in, addresses out."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import mujoco

@@ -1,7 +1,5 @@
 """Folders made by `python -m converters object` in, small objects out: what `NavConfig.objects` names."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ with textures, so these are ours: unions of boxes, which every physics backend c
 to look at. All models of a kind have equally many boxes, so that scenes of one batch may hold different models.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

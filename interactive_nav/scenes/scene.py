@@ -1,7 +1,5 @@
 """A scene folder in, a `Scene` of plain arrays out: the one reader of `scene.xml`."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

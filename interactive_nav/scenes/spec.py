@@ -1,7 +1,5 @@
 """Robot, small objects, furniture and walls in, the `MjSpec` of one padded scene out."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -5,8 +5,6 @@ program steps any mix of them: what differs between the models is numbers, never
 slot is a body without a place: it waits at its parking spot and never counts.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

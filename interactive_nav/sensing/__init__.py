@@ -1,7 +1,5 @@
 """Cameras and scanners: poses in, depth, class ids and distances out; `make_renderer` picks who draws."""
 
-from __future__ import annotations
-
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens, Renderer, look_along
 from interactive_nav.sensing.boxes import BoxTables, build_boxes

@@ -4,8 +4,6 @@ Every backend draws the same boxes and the floor, the plane z = 0. The robot is 
 it is invisible to itself.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

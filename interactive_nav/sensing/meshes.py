@@ -9,8 +9,6 @@ MJX has one set of meshes for a whole batch, so its renderer cannot mix scenes. 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

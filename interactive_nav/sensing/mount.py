@@ -1,7 +1,5 @@
 """Robot state in, pose of its camera out."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -3,8 +3,6 @@
 Formulas and sources stand in `docs/sensors.md`.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

@@ -13,8 +13,6 @@ Then, where asked for: localisation, odometry, collision, joints, lidar. Images 
 vector, not in it: `interactive_nav.sensing.sensors`.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -9,8 +9,6 @@ over boxes yields both. Two orders of work:
   like length are worked off together; for CPUs, where it does a sixteenth of the tests.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

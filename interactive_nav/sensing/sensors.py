@@ -19,8 +19,6 @@ out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It
 step alone.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import zlib

@@ -1,7 +1,5 @@
 """Colours of classes and of bodies, and how pictures and observations are lit."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.struct

@@ -1,7 +1,5 @@
 """Which box each pixel shows in, what there is to see of it out: depth, class, normal and colour, for all renderers."""
 
-from __future__ import annotations
-
 import abc
 
 import jax

@@ -5,8 +5,6 @@ that all backends draw the same numbers. MJX allocates a context for a number of
 one is made for each batch size and kept.
 """
 
-from __future__ import annotations
-
 import copy
 
 import jax

@@ -5,8 +5,6 @@ section IV of Interactive Gibson (Xia et al. 2020); where paper and code differ,
 is meant.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """An episode's bookkeeping in, its scores out: what `InteractiveNav` reports on an episode's last step."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

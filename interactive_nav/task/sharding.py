@@ -9,8 +9,6 @@ computes from the sharded arrays (means, gradients) XLA reduces over the devices
 Several machines or processes: call `start_distributed` first in each of them, before anything else uses JAX.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Jobs on a Ray cluster: an actor a job, on whatever node has room; all nodes see the same folder."""
 
-from __future__ import annotations
-
 import logging
 import os
 from typing import Any

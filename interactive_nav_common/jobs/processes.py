@@ -1,7 +1,5 @@
 """A command in, its exit code out; it ends with whoever started it, and when it is asked to."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

@@ -5,8 +5,6 @@ extractor of its own makes that starts as the source's; in turn the extractor le
 source's extractor stays as it is. No label and no position of a target image is used.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Settings of transfer to another domain: a frozen dataclass checked on construction; docstrings are the help."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated
 

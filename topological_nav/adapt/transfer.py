@@ -6,8 +6,6 @@
 | learned from the source | C | D |
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`python -m topological_nav adapt features|passages|map`: words in, networks and maps of another domain out."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

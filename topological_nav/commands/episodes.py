@@ -1,7 +1,5 @@
 """`navigate` and `evaluate`: episodes played, drawn and scored; maps that are nowhere are made first."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import sys

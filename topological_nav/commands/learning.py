@@ -1,7 +1,5 @@
 """`data` and `train`: scenes in, datasets out; datasets in, networks and policies out."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`map` and `export`: networks in, a scene's map out; runs and maps in, a small folder of them out."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The words of the command line of `topological_nav`; they stand in words.yaml."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """How far a command is, on the terminal; and how a signal stops it."""
 
-from __future__ import annotations
-
 import sys
 import time
 from contextlib import contextmanager

@@ -9,8 +9,6 @@
 What is decided depends on scene and settings only. Drawing goes file by file and skips those that exist.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

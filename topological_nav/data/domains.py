@@ -5,8 +5,6 @@ linear light, sensor noise, the camera's own tone curve. Pure functions of image
 (rendered anew through another lens or engine, or a scanned room) is a dataset's business, see `config.DataConfig`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

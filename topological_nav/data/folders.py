@@ -1,7 +1,5 @@
 """A folder of images of scenes: its description, who may work in it, and how its files of images are drawn."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

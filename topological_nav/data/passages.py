@@ -1,7 +1,5 @@
 """Sources and targets in, passage labels out: how far is the straight way ahead free?"""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

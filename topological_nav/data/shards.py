@@ -1,7 +1,5 @@
 """Arrays of small images in, compact files out, and back: sheets of images as WebP, some sheets a file."""
 
-from __future__ import annotations
-
 import functools
 import io
 import math

@@ -10,8 +10,6 @@ Kept are drives that reached their last node and touched nothing: then the furni
 drawn. What is decided depends on scenes and settings only. Simulating and drawing skip files that exist.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence

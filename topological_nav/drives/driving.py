@@ -1,7 +1,5 @@
 """What drives along an edge of the map: images in, velocities out, ten times a second."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Protocol
 

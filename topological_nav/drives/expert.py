@@ -8,8 +8,6 @@ what the lidar sees and the map holds. The map adds what a planar scan misses, s
 scan sees, in the middle of its way, the robot stops, because no way round is planned.
 """
 
-from __future__ import annotations
-
 import flax.struct
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Routes in, what the expert did on them out: thousands of drives as one batch of the environment's physics."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A folder of drives and two trained networks in, the embeddings of all images of the drives out."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence

@@ -6,8 +6,6 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
     network.json     how to build it, and which runs embed its images
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

@@ -1,7 +1,5 @@
 """Embeddings in, classes of velocities out: the local policy's two memories, its forward model and their loss."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.linen as nn

@@ -1,7 +1,5 @@
 """A scene's free space in, drives along its graph out: which nodes after each other, begun where and turned how."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

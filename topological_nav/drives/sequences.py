@@ -1,7 +1,5 @@
 """Drives in, sequences to learn from out: windows of control steps, commands as classes, straight ones thinned."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Who plays episodes: the navigator through a camera, an expert with the plan, a learned policy told the goal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol
 

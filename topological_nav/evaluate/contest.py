@@ -1,7 +1,5 @@
 """A contest in words, and each of its scenes with what is asked of it: episodes, maps, networks, contenders."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

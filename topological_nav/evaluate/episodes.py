@@ -1,7 +1,5 @@
 """A scene's free space in, its fixed episodes out: starts, goals, and the shortest ways between them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

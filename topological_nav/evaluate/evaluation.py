@@ -6,8 +6,6 @@ same episodes under the same rule: an episode is won when a run of 5 s ends with
 navigator finds itself at the goal's node; it is lost after 30 minutes of simulated time.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

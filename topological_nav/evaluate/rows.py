@@ -8,8 +8,6 @@ The digest is of everything that decides the rows: scene, episodes, settings, ma
 adds files; the same one finds its own and plays what is missing.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

@@ -1,7 +1,5 @@
 """Drives and policies in, pictures out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

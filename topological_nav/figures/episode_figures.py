@@ -1,7 +1,5 @@
 """Plans, maps and paths in, pictures of episodes out."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """One episode of a scene, driven by the navigator with everything it did kept: for a picture, a log and a film."""
 
-from __future__ import annotations
-
 import dataclasses
 import textwrap
 from collections.abc import Callable, Iterator

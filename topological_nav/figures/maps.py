@@ -1,7 +1,5 @@
 """Plans, rooms, images, curves and maps in, pictures out."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs of transfer and exports in, pictures out: domains side by side, learning, scores; an export beside its runs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ The images stay on the device as u8. An epoch's order and augmentation follow fr
 run that goes on from a checkpoint ends where an uninterrupted one does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

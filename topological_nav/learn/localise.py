@@ -1,7 +1,5 @@
 """Embeddings in, places out: which node of a map an image was taken nearest to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

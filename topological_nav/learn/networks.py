@@ -4,8 +4,6 @@ Image batches are u8 [N, H, W, 3] of any size from 16 pixels a side. `width` sca
 the original's. Batch normalisation and the stem's two halvings are the originals'.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.linen as nn

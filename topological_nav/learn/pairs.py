@@ -1,7 +1,5 @@
 """Two runs in, a localiser and a passage detector out that see through one camera."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

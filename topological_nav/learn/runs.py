@@ -1,7 +1,5 @@
 """A run folder's files: settings that a run is bound to, epochs with metrics, checkpoints to go on from."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

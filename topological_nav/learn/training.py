@@ -9,8 +9,6 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
     curves.png
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence

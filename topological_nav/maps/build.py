@@ -1,7 +1,5 @@
 """A scene and two trained networks in, its topological map out: nodes placed, images drawn, edges judged."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """A scene's free space and rooms in, the places of a map's nodes out."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra

@@ -4,8 +4,6 @@ The navigator itself never looks into an image. `NetworkSight` asks trained netw
 ones in tests and measurements: its "images" are poses.
 """
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 import numpy as np

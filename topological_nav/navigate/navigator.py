@@ -15,8 +15,6 @@
 sees a position, and looks at images only through `sight.Sight`. `Pilot` keeps the state for those who drive one robot.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

@@ -3,8 +3,6 @@
 Exit codes: 0 done, 2 on a user's error or a failed node of `all` (one line on stderr), 128 + signal when asked to stop.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

@@ -1,7 +1,5 @@
 """Settings of the simulator and of what drives: frozen dataclasses checked on construction; docstrings are the help."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated, Literal

@@ -5,8 +5,6 @@ the end of `sys.path`, so that everything the environment has itself comes first
 `topological_nav.ros`. Where rospy can be imported anyway (a sourced ROS workspace), nothing is changed.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import os

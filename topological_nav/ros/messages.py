@@ -5,8 +5,6 @@ right, y down. `*_fields` return nested dicts of a message's fields (a header's 
 any object with such attributes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """A map, networks and goal pictures in, the navigator as a driver out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -5,8 +5,6 @@ TTbot on C MuJoCo (`native`), its lidar and odometry from `interactive_nav.sensi
 it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Names, types and frames of all that goes over topics: one table for nodes, recorder and tests."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import Any

@@ -4,8 +4,6 @@ Positions are clustered by their coordinates alone. Where a scene's plan is reco
 scenes), the rooms found are compared with it by the adjusted Rand index.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ Physics is `interactive_nav`'s environment; furniture begins where it stands at 
 it is, open doors open, and small objects where they lie.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Obstacles are the walls and everything movable where it stands at rest, up to the robot's height, doors included.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -10,8 +10,6 @@ maps and policies made with either belong to both: an export whose predictions d
 `export.weights_digest` is of what `weights.msgpack.xz` unpacks to.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

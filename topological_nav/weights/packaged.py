@@ -7,8 +7,6 @@ maps/SCENE.npz             may be absent: then a scene's map is made when it is 
 export.json                where all of it came from
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.resources
 import json

@@ -1,7 +1,5 @@
 """`python -m train.figures`; see `train.figures.cli`."""
 
-from __future__ import annotations
-
 import sys
 
 from train.figures.cli import main

@@ -1,7 +1,5 @@
 """`python -m train.figures RESULTS_DIR -o figures/`: metrics, rows and recorded paths in, pictures and tables out."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Lines of metrics.jsonl in; learning curves out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

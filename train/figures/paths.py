@@ -1,7 +1,5 @@
 """Recorded paths in; top views of where robots went and what they moved out (paper, figures 7 and 8)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

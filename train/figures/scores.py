@@ -1,7 +1,5 @@
 """Rows in; the plane of policies and the planner's line, and of sweeps the paper's figures 5, 6 and 9 to 13, out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 Colours are Okabe and Ito's (2008). An algorithm is a colour and a marker, k_int a fill and a line style.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

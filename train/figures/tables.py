@@ -1,7 +1,5 @@
 """Rows of a sweep in; Markdown tables of scores, claims and provenance out."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """What SAC and DDPG are alike in: a policy and critics, how they begin, and one step down both of their losses."""
 
-from __future__ import annotations
-
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -18,6 +16,7 @@ from brax.training.agents.sac import networks as sac_networks
 
 from train.config import OffPolicyConfig, TrainConfig
 from train.learners import networks
+from train.learners.networks import ObservationSize
 
 
 @flax.struct.dataclass
@@ -44,7 +43,7 @@ class ActorCritic(abc.ABC):
     config: OffPolicyConfig
     networks: sac_networks.SACNetworks
     """[..., outputs] and [..., critics] of observations, and actions."""
-    size: networks.ObservationSize
+    size: ObservationSize
     action_size: int
     shared: bool
     """The policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""

@@ -1,7 +1,5 @@
 """Names of algorithms -> the learners behind them: one face for training, checkpoints and evaluation."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

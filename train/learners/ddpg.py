@@ -8,8 +8,6 @@ Time limits: a step with `truncation` = 1 is left out of the critic's loss, as i
 not known (the environment shows a new episode's observation).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

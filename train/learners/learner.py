@@ -1,7 +1,5 @@
 """An update function and run settings in, a trained learner out: face and loop that all learners share."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

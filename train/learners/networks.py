@@ -10,8 +10,6 @@ a `Split` holds both parts.
 Images are u8 (divided by 255 here) or floats in [-1, 1], as each is; only the vector is normalised.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

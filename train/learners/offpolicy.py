@@ -11,8 +11,6 @@ run begins new episodes when resumed and fills the replay with the policy it has
 count like any others.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from typing import Any

@@ -13,8 +13,6 @@ environments that report `truncation` = 0 there: with `truncation` = 1 it is mas
 cut for V after it, and it multiplies V by `reward_scaling`. We do not use it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any
@@ -33,6 +31,7 @@ from brax.training.agents.ppo import optimizer as ppo_optimizer
 from train.config import PPOConfig, TrainConfig
 from train.learners import networks as nets
 from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
+from train.learners.networks import ObservationSize
 
 
 @flax.struct.dataclass
@@ -61,9 +60,9 @@ class PPOParts:
     """All that learning does not change."""
 
     config: PPOConfig
-    nets: nets.ActorCritic
+    nets: nets.PpoNetworks
     optimizer: optax.GradientTransformation
-    observation_size: nets.ObservationSize
+    observation_size: ObservationSize
     shared: bool = False
     """Actor and critic have one encoder."""
 

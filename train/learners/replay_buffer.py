@@ -8,8 +8,6 @@ its truncation is 1 and the losses leave it out (see `sample`).
 Everything is pure; learners donate the ring to their compiled update, which then writes it in place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -8,8 +8,6 @@ Time limits: Brax's critic loss leaves out a step with `truncation` = 1, for wha
 environment shows a new episode's observation); it says nothing about the step's value, so nothing is learned from it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

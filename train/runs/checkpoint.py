@@ -1,7 +1,5 @@
 """Snapshots in, checkpoint folders out, and back: whole or not there at all, whatever happens in between."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -5,8 +5,6 @@ policy read from such a file acts nearly as the original did (docs/results.md sa
 further.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from pathlib import Path

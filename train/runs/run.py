@@ -1,7 +1,5 @@
 """A config in, a run folder with checkpoints and metrics out: environment, learner, files, signals wired."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

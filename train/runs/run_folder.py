@@ -9,8 +9,6 @@
                  lock              held by the process that trains it
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

@@ -1,7 +1,5 @@
 """`name=module:factory` in, a policy that plays out: any Python callable, NumPy, JAX or PyTorch, on the host."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Rows of episodes in; what they say to the paper's claims (section V), one comparison a line, out."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """A run and an environment in; every policy's fixed episodes played, as rows and recorded paths, out."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time

@@ -5,8 +5,6 @@ planner weighs pushing against detour (`interactive_nav.navigation.ways`). Both 
 furniture, doors and small objects are, their mass and friction.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

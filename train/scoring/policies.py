@@ -5,8 +5,6 @@ a vector (O,) or a dict with images; batch it with `jax.vmap` and a key for each
 depend on which others run beside it.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """An environment, a policy and one key an episode in; every episode's scores, and some of the paths, out."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import operator

@@ -1,7 +1,5 @@
 """What an evaluation was asked to play, and the file of rows that answers it."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

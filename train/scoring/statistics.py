@@ -4,8 +4,6 @@ A run is the unit: its score is the mean over its fixed episodes, and intervals 
 their seed. Episodes of one run share a policy and are no independent trials of an algorithm.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

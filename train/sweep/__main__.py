@@ -1,7 +1,5 @@
 """`python -m train.sweep`: one YAML file in; trained runs and rows of their evaluation out."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What a machine has, and which part of it a run gets."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import subprocess

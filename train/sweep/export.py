@@ -3,8 +3,6 @@
 Rows become one file, which takes half of what a file a run does: many columns are the same in all of them.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from pathlib import Path

@@ -8,8 +8,6 @@
                  locks/<run>            held by whoever works on it
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

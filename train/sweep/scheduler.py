@@ -1,7 +1,5 @@
 """Runs and a launcher in; every run trained and evaluated, given up with a reason, or stopped where it can go on."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

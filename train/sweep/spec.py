@@ -1,7 +1,5 @@
 """One YAML file in, a list of runs with their complete configs out; every mistake named in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import re

@@ -1,7 +1,5 @@
 """A doorway and a door model in, an open leaf on its hinge out, with the floor that it sweeps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

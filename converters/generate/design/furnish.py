@@ -5,8 +5,6 @@ and enough floor to drive into every room stay free; some chairs narrow a doorwa
 one aside pays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Frame: scan x, y; heights above the floor; metres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -7,8 +7,6 @@ origin of the scan frame, rows run along +y and columns along +x. `floor_0`: 0 w
 nothing static, 0 elsewhere.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import shapely
 

@@ -4,8 +4,6 @@ Grids are (n, n) bool, rows along +y and columns along +x, cells of `GRID_M`, th
 middle.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import shapely
 

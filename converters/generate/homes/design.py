@@ -1,7 +1,5 @@
 """Settings and a random stream in, a furnished home out, with what was measured of it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ Rasters are (rows, columns), rows along +y and columns along +x, cells of `CELL_
 corner of the building's outline.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

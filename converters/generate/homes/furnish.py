@@ -1,7 +1,5 @@
 """A home's plan in, its floor with furniture out: what each room's use asks for, then more until it is full enough."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import Counter

@@ -5,8 +5,6 @@ groups (chairs pushed 0.1 m under tables and turned by up to 27 degrees, sofas 2
 beside armchairs), follow the databases of ProcTHOR (github.com/allenai/procthor, Apache-2.0).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

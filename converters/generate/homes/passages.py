@@ -4,8 +4,6 @@ A bounded search: one light piece is taken from where it stands and put into a p
 reached is measured, and the piece stays there where that is nearer to the ranges asked for.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

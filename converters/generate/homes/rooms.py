@@ -4,8 +4,6 @@ How often homes have which rooms, and how large they are against each other, fol
 ProcTHOR (github.com/allenai/procthor, Apache-2.0): kitchen to living room 3:2 to 1:2, bedroom to bathroom 2:1.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

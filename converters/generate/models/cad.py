@@ -6,8 +6,6 @@ whole; parts marked `open` lack their underside, as in many models that people d
 models, with a surface of their own, and drawn ones of the kinds that it lacks.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """The rows of `drawings.yaml` in, furniture of convex parts out: metres, base at y = 0, front along +z."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

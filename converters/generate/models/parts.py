@@ -1,7 +1,5 @@
 """Sizes in, convex pieces of furniture out: boxes, cushions, bars, plates, shells and leaves, in metres, y up."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

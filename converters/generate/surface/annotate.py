@@ -6,8 +6,6 @@ the centre of the CAD's bounding box, both in the CAD frame. Keypoints of both k
 those of the CAD through the annotated pose.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

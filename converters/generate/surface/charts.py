@@ -3,8 +3,6 @@
 Frame: scan x, y, height above the floor; metres. Faces are one-sided, counter-clockwise from where they are seen.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 

@@ -1,7 +1,5 @@
 """A room's use in, the colours of its floor and walls out: boards, tiles, carpet, paint, wallpaper, rugs, pictures."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """A plan in, the light in it out: daylight through the windows, a lamp in each room, dark corners."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 Frame: scan x, y, height above the floor; metres.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ noise along the normals, and labels that are sometimes wrong near a border. Ther
 this project looks at it. Frame: scan x, y, height above the floor; metres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import fast_simplification

@@ -3,8 +3,6 @@
 A place at a wall is (along, out, z): metres along the wall, out of its face into the room, above the floor.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Iterator
 

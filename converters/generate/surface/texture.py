@@ -4,8 +4,6 @@ Each chart is a connected patch of faces that look mostly along the same axis, p
 texel knows its place in the building, and a floor board runs on across chart borders.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Surface nets (one vertex per cell that the surface crosses, at the mean of its e
 sized triangles and rounded edges that fused depth images give.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Meshes, images and annotations in, files out: the raw Gibson layout. Same input, same bytes."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

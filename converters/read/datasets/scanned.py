@@ -4,8 +4,6 @@ The folder of one scene is the source, where its collection's own download put i
 their classes. scenezoo may fetch a collection's tables of splits and classes, where they do not lie beside the scans.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import re

@@ -6,8 +6,6 @@ has y up. Objects that a class lexicon numbers (`*semantic_lexicon.json`; HSSD n
 names of their classes.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ on a free joint is a part; what no joint lets move is structure, body by body; w
 its piece, but for doors.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import math

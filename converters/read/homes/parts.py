@@ -4,8 +4,6 @@ Authors of simulated homes fix most furniture to the world to save time. Here a 
 of a movable category, whatever its source calls it; what stands on such a part moves with it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ the SDF that it names. Read are models, includes, links, poses, meshes, boxes, c
 friction. Links of a model are one rigid part.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import xml.etree.ElementTree as ElementTree

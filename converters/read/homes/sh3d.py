@@ -4,8 +4,6 @@ Walls, rooms, and what doors and windows cut out of them become structure, level
 swing, furniture is what its catalogue id or its name says.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """A Sweet Home 3D drawing (`.sh3d`, a ZIP) in; a folder with its files and the elements of its `Home.xml` out."""
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ElementTree

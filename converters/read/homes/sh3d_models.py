@@ -3,8 +3,6 @@
 Models are y up, front along +z. A piece's own frame is z up, front along -y, the middle of its base at the origin.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

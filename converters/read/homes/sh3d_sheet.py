@@ -1,7 +1,5 @@
 """Flat regions in plan or on a wall in, textured triangles of a Sweet Home 3D drawing's structure out."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator

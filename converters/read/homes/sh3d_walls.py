@@ -4,8 +4,6 @@ Frame: metres, z up, x to the right of the plan, y against the plan's, which poi
 the left of one who walks from its start to its end.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import xml.etree.ElementTree as ElementTree

@@ -10,8 +10,6 @@ Control modes: `native`, eight joint torques (hip, ankle of legs 1 to 4: front l
 right); `position` or `velocity` of each joint; or `twist`, linear and angular velocity of the base through its gait.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -9,8 +9,6 @@ Control modes: `native`, seventeen joint torques; `position` or `velocity` of ea
 velocity of the base through its gait, which also balances it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

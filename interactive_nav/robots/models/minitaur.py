@@ -10,8 +10,6 @@ Torque is bounded to the motor's 3.5 N m. Ours: all links of a leg in one plane,
 which keep the chains from folding through themselves, and no collisions of the robot's parts with each other.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

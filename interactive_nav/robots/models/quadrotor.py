@@ -9,8 +9,6 @@ The original moved the base kinematically: gravity off in the whole scene, six b
 offers that without touching the scene: the robot alone is weightless, and six velocity servos act on its base.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from pathlib import Path

@@ -6,8 +6,6 @@ gripper's opening; `twist`, linear and angular velocity of the base, an arm fold
 `torque` of all joints.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path
