@@ -36,9 +36,9 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     return overlay(base or TrainConfig(), plain, where, known=list(flatten(TrainConfig())))
 
 
-def from_yaml(text: str, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
+def from_yaml(text: str, where: str = "config") -> TrainConfig:
     """As `from_dict`, from YAML text."""
-    return from_dict(_parsed(text, where), base, where)
+    return from_dict(_parsed(text, where), where=where)
 
 
 def _parsed(text: str, where: str) -> Any:

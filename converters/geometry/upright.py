@@ -37,7 +37,7 @@ def _extent(values: np.ndarray, area: np.ndarray) -> tuple[float, float]:
     return float(values[order[low]]), float(values[order[min(high, len(values) - 1)]])
 
 
-def find_up(vertices: np.ndarray, faces: np.ndarray, where: str, seed: int = 0) -> np.ndarray:
+def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     """(3,) unit vector that points up in a room's scan.
 
     Rooms are level and upright: nearly all area lies along or across three directions that are square to each other.
@@ -48,7 +48,6 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str, seed: int = 0) 
         vertices: (n, 3) in any unit.
         faces: (m, 3), their front to the room.
         where: file named in errors.
-        seed: of the draws of faces.
 
     Raises:
         SceneRejected: the scan does not tell.
@@ -57,7 +56,7 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str, seed: int = 0) 
     if not area.sum() > 0:
         raise SceneRejected(f"{where}: its faces enclose no area; fetch it again")
     middle = vertices[faces].mean(axis=1)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     drawn = normal[rng.choice(len(area), DRAWS, p=area / area.sum())]
     cosine = np.abs(drawn @ normal.T)
     score = ((cosine > ALONG) | (cosine < ACROSS)) @ area

@@ -90,7 +90,7 @@ class Plane:
         return (points - self.origin) @ self.normal
 
 
-def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, seed: int = 0) -> list[Plane]:
+def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> list[Plane]:
     """Vertical planes of the walls by sequential RANSAC (Fischler and Bolles 1981), the largest first.
 
     A draw is one upright face: its middle and the horizontal direction of its normal are a hypothesis; its
@@ -103,13 +103,12 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, see
         vertices: (n, 3) m, z up.
         faces: (m, 3) that stay.
         labels: (n,) NYU40.
-        seed: of the draws.
     """
     label, area, normal = face_labels(labels, faces), face_areas(vertices, faces), unit_normals(vertices, faces)
     left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
     middle = vertices[faces].mean(axis=1)
     flat = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-9)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     planes = []
     while len(planes) < MAX_WALLS:
         index = np.flatnonzero(left)

@@ -55,9 +55,7 @@ def _least_squares(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, 
     return centre, float(height), np.array(slope)
 
 
-def fit_floor(
-    vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_m: float | None = None, seed: int = 0
-) -> FloorFit:
+def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_m: float | None = None) -> FloorFit:
     """The floor's plane by RANSAC (Fischler and Bolles 1981) over the faces labelled floor.
 
     A draw is three such faces' middles, drawn by area; its support is the area within `TOLERANCE_M` of the plane
@@ -70,7 +68,6 @@ def fit_floor(
         faces: (m, 3).
         labels: (n,) NYU40.
         near_m: the height as the source states it: only what lies within `GIVEN_NEAR_M` of it counts.
-        seed: of the draws.
 
     Raises:
         SceneRejected: too few floor labels, or they lie in no level plane.
@@ -88,7 +85,7 @@ def fit_floor(
         used &= np.abs(middle[:, 2] - near_m) < GIVEN_NEAR_M
     weight, middle = weight[used], middle[used]
     best, best_support = None, 0.0
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     if len(weight) >= 3:
         draws = rng.choice(len(weight), (DRAWS, 3), p=weight / weight.sum())
         a, b, c = (middle[draws[:, k]] for k in range(3))

@@ -51,7 +51,7 @@ def specific_surface_1_m(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> f
     return area_m2 / float(ConvexHull(np.vstack([vertices for vertices, _ in surfaces])).volume)
 
 
-def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float, seed: int = 0) -> float:
+def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> float:
     """Largest ratio of the shortest way between two places to the straight line, of pairs a metre or more apart.
 
     Ways lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
@@ -61,7 +61,6 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float, seed
         free: [rows, columns] bool, True where nothing stands.
         cell_m: its cells' side.
         radius_m: of the disc.
-        seed: chooses the places to start from.
 
     Returns:
         1 where there is no such pair.
@@ -84,7 +83,7 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float, seed
         lengths.append(np.full(int(both.sum()), np.hypot(dr, dc) * step * cell_m))
     edges = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
     graph = sparse.coo_matrix(edges, (int(mask.sum()),) * 2).tocsr()
-    starts = np.random.default_rng(seed).permutation(int(mask.sum()))[:STARTS]
+    starts = np.random.default_rng(0).permutation(int(mask.sum()))[:STARTS]
     way_m = np.asarray(csgraph.dijkstra(graph, directed=False, indices=starts))
     places = np.argwhere(mask) * step * cell_m
     line_m = np.linalg.norm(places[starts][:, None] - places[None], axis=2)

@@ -175,7 +175,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     for name, draw in figures_of(Path(arguments.results), split):
         path = Path(arguments.out) / f"{name}.{arguments.format}"
-        with style.applied():
+        with style.plt.rc_context(style.RC):
             style.save(draw(), path, arguments.format)
         print(path)
     return 0

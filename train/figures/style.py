@@ -3,8 +3,7 @@
 Colours are Okabe and Ito's (2008). An algorithm is a colour and a marker, k_int a fill and a line style.
 """
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +31,7 @@ LINES: tuple[Any, ...] = (":", "--", "-", "-.")
 ANY = (-np.inf, np.inf)
 P_LABEL, E_LABEL = "P$_{eff}$ (SPL)", "E$_{eff}$"
 RC: dict[Any, Any] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Any])
-
-
-@contextlib.contextmanager
-def applied() -> Iterator[None]:
-    """Draws in this style."""
-    with plt.rc_context(RC):
-        yield
+"""What `plt.rc_context` takes to draw in this style."""
 
 
 def look(kind: dict[str, tuple[str, str]], name: str, among: list[str]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from typing import Any
 import flax.serialization
 import jax
 import numpy as np
-from brax.envs import Env
 from rich.console import Console
 from tensorboardX import SummaryWriter
 
@@ -221,7 +220,6 @@ def train_run(
     config: TrainConfig,
     console: Console,
     build_env: Callable[[EnvConfig], Any] = make_env,
-    wrap_env: Callable[[Any], Env] = AutoResetEnv,
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Trains as configured, beginning or continuing the run folder.
 
@@ -229,7 +227,6 @@ def train_run(
         config: as loaded; sizes may still be `auto`.
         console: for progress.
         build_env: config -> one environment.
-        wrap_env: one environment -> batched and resetting itself.
 
     Returns:
         The result, the folder, and the signal that ended it early, if one did.
@@ -252,11 +249,11 @@ def train_run(
         raise
     busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
     with locked(folder.lock, busy):
-        return _train_in(folder, config, env, console, wrap_env)
+        return _train_in(folder, config, env, console)
 
 
 def _train_in(
-    folder: RunFolder, config: TrainConfig, env: Any, console: Console, wrap_env: Callable[[Any], Env]
+    folder: RunFolder, config: TrainConfig, env: Any, console: Console
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Trains in a folder that nobody else writes to."""
     exists = folder.open(config)
@@ -269,7 +266,7 @@ def _train_in(
     with stop_signals() as stops, TrainingDisplay(console) as display:
         callbacks = FolderCallbacks(folder, config, env, display, stops)
         try:
-            result = ALGORITHMS[config.algorithm].train(wrap_env(env), config, callbacks)
+            result = ALGORITHMS[config.algorithm].train(AutoResetEnv(env), config, callbacks)
         finally:
             callbacks.close()
         metrics = result.metrics or last_metrics(folder)
