@@ -112,7 +112,7 @@ def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console:
     return 1 if failed else 0
 
 
-def _object(arguments: argparse.Namespace, console: Console) -> int:
+def _object(arguments: argparse.Namespace, console: Console) -> None:
     from converters.single_object import ObjectConfig, convert_object
 
     config = ObjectConfig(**_words_of(ObjectConfig, arguments) | {"source": arguments.within})
@@ -128,7 +128,6 @@ def _object(arguments: argparse.Namespace, console: Console) -> int:
         f"{1000 * made['rest']['drift_boxes_m']:.2f} mm with boxes",
         soft_wrap=True,
     )
-    return 0
 
 
 def _check(arguments: argparse.Namespace, console: Console) -> int:
@@ -148,23 +147,21 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
-def _preview(arguments: argparse.Namespace, console: Console) -> int:
+def _preview(arguments: argparse.Namespace, console: Console) -> None:
     from converters.check.preview import preview
 
     preview(arguments.scene, arguments.output, arguments.source)
     console.print(f"{arguments.output}: picture of {arguments.scene}", soft_wrap=True)
-    return 0
 
 
-def _export(arguments: argparse.Namespace, console: Console) -> int:
+def _export(arguments: argparse.Namespace, console: Console) -> None:
     from converters.write.sh3d import export_sh3d
 
     for line in export_sh3d(arguments.scene, arguments.output):
         console.print(f"{arguments.output}: {line}", soft_wrap=True, highlight=False, markup=False)
-    return 0
 
 
-def _propose(arguments: argparse.Namespace, console: Console) -> int:
+def _propose(arguments: argparse.Namespace, console: Console) -> None:
     from converters.propose.report import propose
     from converters.propose.retrieval import read_library
     from converters.read.source import read_source
@@ -178,10 +175,9 @@ def _propose(arguments: argparse.Namespace, console: Console) -> int:
     for table in proposal_tables(found):
         console.print(table)
     console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
-    return 0
 
 
-def _annotate(arguments: argparse.Namespace, console: Console) -> int:
+def _annotate(arguments: argparse.Namespace, console: Console) -> None:
     from converters.annotate.browser import Page
     from converters.annotate.guard import guarded_server
     from converters.annotate.session import Store, start
@@ -204,7 +200,6 @@ def _annotate(arguments: argparse.Namespace, console: Console) -> int:
     states = [item.state for item in page.session.items]
     told = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
     console.print(f"{arguments.output}: {told}", soft_wrap=True)
-    return 0
 
 
 RUNS: dict[str, Any] = {
@@ -218,7 +213,7 @@ RUNS: dict[str, Any] = {
     "preview": _preview,
     "export": _export,
 }
-"""Command of words.yaml -> what runs it, or its actions' table."""
+"""Command of words.yaml -> what runs it, or its actions' table; an exit code where it is not always 0."""
 
 
 def _add(commands: Commands, name: str, row: Command, run: Any) -> None:
@@ -288,7 +283,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if "launcher" in arguments and arguments.launcher != "ray":
             refuse_unused(arguments, "--ray-address", "without --launcher ray")
-        return arguments.run(arguments, console)
+        return arguments.run(arguments, console) or 0
     except KeyboardInterrupt:
         print(f"interrupted; {written()}", file=sys.stderr)
         return 130

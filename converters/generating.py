@@ -12,7 +12,7 @@ from interactive_nav_common.progress import stage_progress
 from scenes_mjcf.sets import PACKAGED, in_cache, packaged_set
 
 
-def _generate(arguments: argparse.Namespace, console: Console) -> int:
+def _generate(arguments: argparse.Namespace, console: Console) -> None:
     from converters.generate import generate_building
     from converters.recipes import building_of
 
@@ -25,7 +25,6 @@ def _generate(arguments: argparse.Namespace, console: Console) -> int:
         f"'python -m converters convert {arguments.out} SCENE_DIR'",
         soft_wrap=True,
     )
-    return 0
 
 
 def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
@@ -51,32 +50,29 @@ def _make_scenes(arguments: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
-def _list_scenes(arguments: argparse.Namespace, console: Console) -> int:
+def _list_scenes(arguments: argparse.Namespace, console: Console) -> None:
     for name, folder in PACKAGED.items():
         for scene, member in packaged_set(name).scenes.items():
             place = next((p for p in (folder / scene, in_cache(folder / scene)) if p.exists()), None)
             print(f"{name:<10} {member.split:<6} {scene:<15} {place or 'not made'}")
-    return 0
 
 
-def _models(arguments: argparse.Namespace, console: Console) -> int:
+def _models(arguments: argparse.Namespace, console: Console) -> None:
     from converters.check.model_sheet import model_sheet
 
     count = model_sheet(arguments.output, arguments.names)
     console.print(f"{arguments.output}: picture of {count} models", soft_wrap=True)
-    return 0
 
 
-def _get(arguments: argparse.Namespace, console: Console) -> int:
+def _get(arguments: argparse.Namespace, console: Console) -> None:
     from converters.library.fetch import fetch, library_folder
 
     target = arguments.out or library_folder()
     files = fetch(arguments.given, target, arguments.overwrite)
     console.print(f"{target}: {len(files)} furniture libraries, checked by digest", soft_wrap=True)
-    return 0
 
 
-def _build(arguments: argparse.Namespace, console: Console) -> int:
+def _build(arguments: argparse.Namespace, console: Console) -> None:
     from converters.library.build import build
     from converters.library.fetch import FILES, library_folder
 
@@ -87,10 +83,9 @@ def _build(arguments: argparse.Namespace, console: Console) -> int:
     with stage_progress(console) as report:
         count = build(files, arguments.out, arguments.jobs, report)
     console.print(f"{arguments.out}: {count} models with their hulls, and ATTRIBUTION.md", soft_wrap=True)
-    return 0
 
 
-def _list(arguments: argparse.Namespace, console: Console) -> int:
+def _list(arguments: argparse.Namespace, console: Console) -> None:
     from converters.library.store import read_index
 
     for model in read_index().values():
@@ -100,7 +95,6 @@ def _list(arguments: argparse.Namespace, console: Console) -> int:
             f"{model.faces:>5} faces {model.hulls:>3} hulls  "
             + "; ".join(f"{c.creator}, {c.licence}" for c in model.credits)
         )
-    return 0
 
 
 GENERATING = {

@@ -30,12 +30,11 @@ def _read(arguments: argparse.Namespace) -> Any:
     return read_source(arguments.source, **{k: getattr(arguments, w) for k, w in words.items() if w in arguments})
 
 
-def _segment(arguments: argparse.Namespace, console: Console) -> int:
+def _segment(arguments: argparse.Namespace, console: Console) -> None:
     arguments.output = target = _beside(arguments.source, "labels.npz")
     if target.exists() and not arguments.overwrite:
         raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
     _label(arguments, target, arguments.weights, console)
-    return 0
 
 
 def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
@@ -80,7 +79,7 @@ def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, co
     console.print(f"{target}: labels of {len(labels)} vertices", soft_wrap=True)
 
 
-def _train(arguments: argparse.Namespace, console: Console) -> int:
+def _train(arguments: argparse.Namespace, console: Console) -> None:
     from converters.segment.train import SegmentConfig, train
     from interactive_nav_common.config import overridden
 
@@ -88,10 +87,9 @@ def _train(arguments: argparse.Namespace, console: Console) -> int:
     with stage_progress(console) as report:
         scores = train(arguments.out, config, report, lambda line: console.print(line, soft_wrap=True))
     _table(console, "held-out crops", scores)
-    return 0
 
 
-def _score(arguments: argparse.Namespace, console: Console) -> int:
+def _score(arguments: argparse.Namespace, console: Console) -> None:
     from converters.read.source import read_source
     from converters.segment.labelling import load_scores, score_homes, score_source
     from converters.segment.train import HELD_OUT_SEED
@@ -110,7 +108,6 @@ def _score(arguments: argparse.Namespace, console: Console) -> int:
             # Whole buildings of other seeds than those whose crops the training was watched by.
             found = score_homes(HELD_OUT_SEED + 50_000, arguments.homes, scores, report)
             _table(console, f"{arguments.homes} held-out buildings", found)
-    return 0
 
 
 def _table(console: Console, what: str, iou: dict[str, float]) -> None:
