@@ -56,7 +56,7 @@ def look(page: Page, browser: Tab, point: np.ndarray, eye: np.ndarray) -> tuple[
             and np.allclose(camera.look_at, point, atol=1e-3)
         )
 
-    until(there, 20, "the camera")
+    until(there, what="the camera")
     camera = client.camera
     turn = trimesh.transformations.quaternion_matrix(camera.wxyz)[:3, :3]
     x, y, z = turn.T @ (point - camera.position)
@@ -104,7 +104,7 @@ def click_six_pairs(page: Page, browser: Tab, k: int) -> int:
     own = bounds(annotated_vertices(truth, page.raw.cads))
     at = max(range(len(boxes)), key=lambda i: box_iou(own, boxes[i]))
     page.do(lambda s: s.at_object(at))
-    until(lambda: page.candidates(), what="candidates")
+    page._pool.submit(int).result(120)  # the ranking is done: until then candidates change places
     number = page.candidates().index(truth.cad_id)
     for _ in range(number // 4):
         browser.press("more")

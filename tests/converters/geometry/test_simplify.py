@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fast_simplification
 import numpy as np
 import pytest
 import trimesh
@@ -31,6 +32,30 @@ def test_a_windows_rim_stays_where_it_was(most):
     assert Surface(vertices, faces).distance(low[0]).max() < 0.012
     a, b, c = low[0][low[1]].transpose(1, 0, 2)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(4 * 2.5 - 1.5 * 1.1, abs=0.05)
+
+
+def plate() -> tuple[np.ndarray, np.ndarray]:
+    """1 x 1 m in steps of 2.5 cm, level but for 10 nm of noise."""
+    x, y = np.meshgrid(np.arange(40) * 0.025, np.arange(40) * 0.025, indexing="ij")
+    vertices = np.stack([x, y, np.full_like(x, 0.7)], axis=-1).reshape(-1, 3)
+    corner = (np.arange(39)[:, None] * 40 + np.arange(39)).reshape(-1)
+    faces = np.vstack([corner[:, None] + [0, 40, 1], corner[:, None] + [40, 41, 1]]).astype(np.int32)
+    return vertices + 1e-8 * np.random.default_rng(0).standard_normal(vertices.shape), faces
+
+
+def test_no_corner_of_a_level_surface_flies_away():
+    vertices, faces = plate()
+    for most in (2700, 1500, 300):
+        low = simplify_open(vertices, faces, most)
+        assert np.abs(low[0]).max() < 1 and Surface(vertices, faces).distance(low[0]).max() < 1e-3
+
+
+def test_a_replayed_simplification_puts_corners_elsewhere():
+    """Once this fails (after fast-simplification 0.2.0), `simplify_open` may take the replay's places."""
+    vertices, faces = plate()
+    own, _, collapses = fast_simplification.simplify(vertices, faces, target_count=1500, return_collapses=True)
+    replayed = fast_simplification.replay_simplification(vertices, faces, collapses)[0]
+    assert len(own) == len(replayed) and np.abs(own).max() < 1 and np.abs(replayed).max() > 100
 
 
 def test_few_faces_stay():
