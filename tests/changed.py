@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
@@ -9,6 +10,10 @@ from pathlib import Path, PurePosixPath
 HOURS = 4
 AT_MOST = 3
 """Heavy tests that `make test` takes on: some two minutes' worth at 40 s each."""
+INSTALLED = {
+    "tests/test_wheel.py": {"pyproject.toml", "interactive_nav/__main__.py", "interactive_nav/programs.yaml"},
+}
+"""Tests of the whole, and what of it concerns them."""
 COMMANDS = (
     ("diff", "--name-only", "HEAD"),
     ("ls-files", "--others", "--exclude-standard"),
@@ -29,11 +34,12 @@ def changed_files(root: Path) -> set[str]:
 
 
 def chosen(tests: Iterable[str], changed: set[str]) -> list[str]:
-    """The first `AT_MOST` of tests 'tests/a/test_b.py::...' whose file, or module a/b.py, changed."""
+    """The first `AT_MOST` of tests 'tests/a/test_b.py::...' whose file, module a/b.py or page ('...[b.md]') changed."""
 
     def touched(test: str) -> bool:
         path = PurePosixPath(test.partition("::")[0])
         module = PurePosixPath(*path.parts[1:-1], path.name.removeprefix("test_"))
-        return not changed.isdisjoint({str(path), str(module)})
+        pages = {f"docs/{page}" for page in re.findall(r"\[([\w-]+\.md)\]", test)}
+        return not changed.isdisjoint({str(path), str(module), *pages, *INSTALLED.get(str(path), ())})
 
     return [test for test in tests if touched(test)][:AT_MOST]

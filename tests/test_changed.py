@@ -32,4 +32,7 @@ def test_tests_of_changed_files_and_of_the_modules_that_they_mirror_are_chosen()
     assert chosen(tests, {"a/b/c.py"}) == tests[:2]
     assert chosen(tests, {"tests/a/test_c.py"}) == tests[2:]
     assert chosen(tests, {"c.py", "a/b/d.py"}) == []
+    pages = ["tests/test_docs.py::test_it[a-b.md]", "tests/test_docs.py::test_it[c.md]"]
+    assert chosen(pages, {"docs/c.md"}) == pages[1:]
+    assert chosen(["tests/test_wheel.py::test_it"], {"pyproject.toml"}) == ["tests/test_wheel.py::test_it"]
     assert len(chosen([f"tests/a/test_c.py::t{k}" for k in range(9)], {"a/c.py"})) == AT_MOST

@@ -85,8 +85,10 @@ def folder(tmp_path, monkeypatch):
 
 # This page reads a robot file of the user's: tests/interactive_nav/robots/test_add_a_robot.py writes one and runs it.
 ELSEWHERE = ("add-a-robot.md",)
+# Half a minute each, for calls that README's and the other tests make too.
+LONG = ("gymnasium.md", "sensors.md", "sweep.md", "videos.md")
 with_python = [
-    p
+    pytest.param(p, id=p.name, marks=[pytest.mark.heavy] if p.name in LONG else [])
     for p in PAGES
     if p.name not in ELSEWHERE and any(b.language == "python" for b in blocks(p.read_text(encoding="utf-8")))
 ]
@@ -101,7 +103,7 @@ def quick_compilation():
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("page", with_python, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", with_python)
 def test_python_of_a_page_runs(page, quick_compilation):
     assert run_page(page, page.read_text(encoding="utf-8")) > 0
 

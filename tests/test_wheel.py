@@ -50,7 +50,7 @@ def run(bare: tuple[Path, Path], *words: str, **more: str) -> subprocess.Complet
     return subprocess.run([bare[0], *words], cwd=bare[1], env=environment, capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_it_trains_and_is_scored_in_an_empty_folder(bare):
     done = run(bare, "train", "--config", "demo", "run.name=short", *SHORT)
     assert done.returncode == 0, done.stderr

@@ -304,7 +304,7 @@ def test_the_next_conversion_clears_what_a_killed_one_left_and_not_what_runs(pri
     os.utime(running, (0, 0))
     # Killed while it replaced a scene: that one is there again, and is not overwritten unasked.
     with pytest.raises(FileError, match="exists already"):
-        convert(pristine / "gibson", out, ConvertConfig(), cache=hull_cache)
+        convert(pristine / "gibson", out, SMALL, cache=hull_cache)
     assert (out / "scene.json").read_text() == "kept"
     assert sorted(p.name for p in out.parent.iterdir()) == [".output.part-1", "out"]  # another scene's stays
 

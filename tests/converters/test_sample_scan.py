@@ -38,9 +38,10 @@ def escaping_share(folder, maps) -> float:
 
 
 def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_path, hull_cache):
+    config = ConvertConfig(format="scan2cad", structure_texture=512, object_texture=128)
     start = time.monotonic()
     out = tmp_path / "scenes" / "room"
-    converted = convert(sample_data / "scan2cad_scene0470_00", out, ConvertConfig(format="scan2cad"), cache=hull_cache)
+    converted = convert(sample_data / "scan2cad_scene0470_00", out, config, cache=hull_cache)
     seconds = time.monotonic() - start
     assert seconds < LIMIT_S, f"took {seconds:.0f} s"
     manifest, gates = check_folder(out)

@@ -152,7 +152,7 @@ def test_six_pairs_on_a_generated_scan_give_its_alignment(tmp_path):
 
 
 @pytest.mark.data
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_six_pairs_in_the_real_room_give_the_peoples_alignment(sample_data, tmp_path):
     source = sample_data / "scan2cad_scene0470_00"
     with opened(source, tmp_path / "mine") as (page, address), tab(address, tmp_path / "profile") as browser:

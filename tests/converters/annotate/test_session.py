@@ -20,6 +20,7 @@ from converters.records.errors import SceneRejected
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.rotations import yaw_matrix
 
+SMALL = ConvertConfig(structure_texture=64, object_texture=32)
 YAW, SCALE, SHIFT = 0.7, np.array([1.2, 0.8, 1.5]), np.array([2.0, -1.0, 0.4])
 CAD = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1.0)])
 SCAN = CAD * SCALE @ yaw_matrix(YAW).T + SHIFT
@@ -179,7 +180,13 @@ def test_convert_takes_the_file_in_place_of_the_sources_own(read, scan2cad_raw, 
     store = Store(tmp_path / "mine", cads)
     store.save(click_corners(store.open(raw, lambda: start(raw, propose_instances(raw.scan))), raw, cads).accepted())
     file = tmp_path / "mine" / "full_annotations.json"
-    [made] = convert_building(scan2cad_raw, tmp_path / "s", ConvertConfig(), cache=hull_cache, annotations=file)
+    [made] = convert_building(
+        scan2cad_raw,
+        tmp_path / "s",
+        SMALL,
+        cache=hull_cache,
+        annotations=file,
+    )
     [table] = made.manifest.objects
     assert table.category == "table" and made.manifest.alignment[0]["n_keypoints"] == 8
     with pytest.raises(SceneRejected, match="names model table-a, which the packaged furniture lacks; give its --lib"):

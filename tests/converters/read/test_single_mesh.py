@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, WALL
 from tests.converters import tiny_raw
 
+SMALL = ConvertConfig(structure_texture=64, jobs=1)
 TURN = Rotation.from_euler("xyz", [118, 11, 0], degrees=True).as_matrix()
 
 
@@ -57,15 +59,17 @@ def test_a_tilted_scan_in_centimetres_becomes_the_scene_of_the_right_one(room, t
     mesh = tall_room()
     mesh.vertices = 100.0 * mesh.vertices @ TURN.T
     mesh.export(tmp_path / "tilted.ply")
-    right = convert(room, tmp_path / "a", ConvertConfig(jobs=1), cache=hull_cache)
-    tilted = convert(tmp_path / "tilted.ply", tmp_path / "b", ConvertConfig(jobs=1), cache=hull_cache)
+    right = convert(room, tmp_path / "a", SMALL, cache=hull_cache)
+    tilted = convert(tmp_path / "tilted.ply", tmp_path / "b", SMALL, cache=hull_cache)
     assert all(g.passed for g in (*right.gates, *tilted.gates))
     assert tilted.manifest.floor_area_m2 == pytest.approx(right.manifest.floor_area_m2, rel=0.1)
     words = " ".join(tilted.manifest.warnings)
     assert "turned by 117" in words and "taken to be in cm" in words and "told by shape" in words
     assert "turned" not in " ".join(right.manifest.warnings)
     told: list[str] = []
-    convert_building(room, tmp_path / "c", ConvertConfig(jobs=1, auto_align=True), cache=hull_cache, warn=told.append)
+    convert_building(
+        room, tmp_path / "c", dataclasses.replace(SMALL, auto_align=True), cache=hull_cache, warn=told.append
+    )
     assert "--auto-align: no label of furniture in the scan, so no model is fitted" in told
 
 

@@ -23,6 +23,7 @@ from scenes_mjcf.schema import CATEGORIES, load_manifest, load_maps
 from tests.converters.read.homes.test_drawn_lamps import PLAIN
 from tests.converters.read.homes.test_sh3d import piece, write_home
 
+SMALL = ConvertConfig(structure_texture=64, object_texture=32)
 HOME = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
 DRAWN = HOME.parent / "drawn" / "flat"
 """The example of the tutorial, beside its drawing."""
@@ -123,8 +124,7 @@ def test_the_reader_knows_every_category(category):
 
 def test_a_scene_comes_back(tiny_scene, tmp_path, hull_cache):
     assert main(["export", str(tiny_scene[0]), str(tmp_path / "tiny.sh3d")]) == 0
-    config = ConvertConfig(structure_texture=64, object_texture=32)
-    back = convert(tmp_path / "tiny.sh3d", tmp_path / "back", config, cache=hull_cache)
+    back = convert(tmp_path / "tiny.sh3d", tmp_path / "back", SMALL, cache=hull_cache)
     assert {g.name for g in back.gates if not g.passed} == set()
     own, again = (sorted(load_manifest(f).objects, key=lambda o: o.name) for f in (tiny_scene[0], tmp_path / "back"))
     assert [o.name for o in again] == [o.name for o in own]
@@ -144,8 +144,7 @@ def test_a_generated_home_comes_back_piece_by_piece(tmp_path, hull_cache, name, 
     home = HOME.parent / name
     told = export_sh3d(home, tmp_path / "home.sh3d")
     assert f", {rooms} rooms," in told[0]
-    config = ConvertConfig(structure_texture=64)
-    back = convert(tmp_path / "home.sh3d", tmp_path / "back", config, cache=hull_cache)
+    back = convert(tmp_path / "home.sh3d", tmp_path / "back", SMALL, cache=hull_cache)
     assert {g.name for g in back.gates if not g.passed} == set()
     own, again = load_manifest(home).objects, list(back.manifest.objects)
     assert len(own) == len(again)
@@ -171,8 +170,7 @@ def test_the_example_was_made_of_its_drawing():
 
 @pytest.mark.heavy
 def test_the_example_is_what_its_drawing_becomes(tmp_path, hull_cache):
-    config = ConvertConfig(structure_texture=64, object_texture=32)
-    made = convert(DRAWN.with_suffix(".sh3d"), tmp_path / "flat", config, cache=hull_cache)
+    made = convert(DRAWN.with_suffix(".sh3d"), tmp_path / "flat", SMALL, cache=hull_cache)
     own, again = load_manifest(DRAWN), load_manifest(made.folder)
     assert {g.name for g in made.gates if not g.passed} == set()
     assert {o.name: o.category for o in own.objects} == {o.name: o.category for o in again.objects}
@@ -274,12 +272,11 @@ def test_windows_come_back_where_they_were(tmp_path, hull_cache):
     counter = piece("Counter", 100, 30, "200 60 80", "movable='false'")  # the scene has no wall behind it
     home = [*PLAIN, counter, piece("Side", -5, 150, "80 10 120", words, tag="doorOrWindow")]
     home.append(piece("Alone", 200, 150, "80 10 120", words, tag="doorOrWindow"))  # in no wall
-    config = ConvertConfig(structure_texture=64)
-    made = convert(write_home(tmp_path / "two", home), tmp_path / "out", config, cache=hull_cache)
+    made = convert(write_home(tmp_path / "two", home), tmp_path / "out", SMALL, cache=hull_cache)
     assert " 2 windows, " in export_sh3d(made.folder, tmp_path / "again.sh3d")[0]
     drawn = [[1.0, 0.05, 1.4, 0.6, 0.03, 0.5, 0.0], [-0.05, -1.5, 1.4, 0.4, 0.06, 0.6, np.pi / 2]]
     assert openings(made.folder) == pytest.approx(np.array(drawn), abs=1e-5)
-    back = convert(tmp_path / "again.sh3d", tmp_path / "back", config, cache=hull_cache)
+    back = convert(tmp_path / "again.sh3d", tmp_path / "back", SMALL, cache=hull_cache)
     assert {g.name for g in back.gates if not g.passed} == set()
     off = np.abs(openings(back.folder) - drawn)
     assert off[:, [0, 1, 2, 3, 5]].max() < 0.01 and np.degrees(off[:, 6]).max() < 1
@@ -299,7 +296,7 @@ def test_windows_come_back_where_they_were(tmp_path, hull_cache):
 def test_windows_of_a_scan_are_drawn_where_its_file_says(gibson_raw, tmp_path, hull_cache):
     """The floor is at 0.3 m; one window lies along x, one along y."""
     (gibson_raw / "windows.txt").write_text("0.6 2.45 0.9 1.4 2.55 1.5\n-0.05 0.5 0.9 0.05 1.5 1.5\n")
-    made = convert(gibson_raw, tmp_path / "out", ConvertConfig(structure_texture=64), cache=hull_cache)
+    made = convert(gibson_raw, tmp_path / "out", SMALL, cache=hull_cache)
     there = [[1.0, 2.5, 0.9, 0.4, 0.05, 0.3, 0.0], [0.0, 1.0, 0.9, 0.5, 0.05, 0.3, np.pi / 2]]
     assert openings(made.folder) == pytest.approx(np.array(there), abs=1e-6)
     export_sh3d(made.folder, tmp_path / "room.sh3d")

@@ -190,7 +190,7 @@ def test_the_force_on_a_pushed_block_on_warp(world, mjx_warp):
     "backend",
     [
         "native",
-        pytest.param("jax", marks=pytest.mark.slow),
+        pytest.param("jax", marks=pytest.mark.heavy),
         pytest.param("warp", marks=[pytest.mark.slow, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
     ],
 )

@@ -203,7 +203,7 @@ def test_small_steps_and_round_cones_give_coulombs_friction(tmp_path):
 FEW = [1, 6, 10]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_pushes_balance_on_jax(tmp_path):
     assert_balanced(run(*make_world(tmp_path), "jax", FEW))
 

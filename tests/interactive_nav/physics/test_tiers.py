@@ -123,6 +123,7 @@ def _start(world):
     return PhysicsState(jnp.asarray(qpos), still, still), scene
 
 
+@pytest.mark.heavy
 def test_those_without_room_are_counted(world, engines):
     """Sizes are 6 and 2: of three robots between two chairs the first has a window with one of them only."""
     tiered, step, one = engines
@@ -200,6 +201,7 @@ def test_each_step_is_that_of_one_window(world, engines):
     assert parted < 0.005 * compared
 
 
+@pytest.mark.heavy
 def test_the_solvers_warm_start_crosses_tiers(world, engines):
     """What the whole window's solver leaves, the smaller one's begins with: of the robot and of the chair it holds."""
     narrow, whole = (tier.window for tier in engines[0].tiers)

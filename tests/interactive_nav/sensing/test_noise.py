@@ -32,9 +32,13 @@ def pictures(depth_m, rgb=(0.5, 0.5, 0.5)):
     }
 
 
+@functools.cache
+def drawn(noise):
+    return jax.jit(lambda images, seed: disturbed(noise, LENS, images, key_of=lambda name: key_of(name, seed)))
+
+
 def seen(noise, images, seed=0):
-    draw = jax.jit(functools.partial(disturbed, noise, LENS, key_of=lambda name: key_of(name, seed)))
-    return {name: np.asarray(value) for name, value in draw(images).items()}
+    return {name: np.asarray(value) for name, value in drawn(noise)(images, seed).items()}
 
 
 def test_without_settings_nothing_is_disturbed():

@@ -127,7 +127,13 @@ def test_wrappers_that_would_be_passed_over_are_refused(env):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrap", [interactive_nav.wrap_for_brax_training, None], ids=["ours", "brax"])
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        pytest.param(interactive_nav.wrap_for_brax_training, id="ours"),
+        pytest.param(None, id="brax", marks=pytest.mark.heavy),  # its wrappers begin again: see above
+    ],
+)
 def test_brax_own_ppo_learns_on_the_environment(tmp_path, wrap):
     # Of three seeds: from 0.2 to 1.4 before to 8.6 to 11.0 after; success 0.02 to 0.11 before, 0.75 to 0.98 after.
     brax_compat.install()

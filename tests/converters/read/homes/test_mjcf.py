@@ -37,6 +37,7 @@ ROOM = """<mujoco>
 <body name="drawer" pos="-1.8 -1.2 0.4"><joint type="slide" axis="0 1 0"/><geom type="box" size="0.1 0.1 0.4"/></body>
 <include file="more.xml"/>
 </worldbody></mujoco>"""
+SMALL = ConvertConfig(structure_texture=64, object_texture=32, jobs=1)
 MORE = """<mujocoinclude>
 <body name="tall_thing" pos="1.5 -1 0.5"><geom type="capsule" size="0.1 0.4"/></body>
 </mujocoinclude>"""
@@ -72,7 +73,12 @@ def test_free_bodies_and_named_furniture_move_and_the_rest_is_structure(tmp_path
 
 
 def test_a_room_becomes_a_scene_that_passes_its_gates(tmp_path, hull_cache):
-    made = convert(write_room(tmp_path / "home"), tmp_path / "scene", ConvertConfig(jobs=1), cache=hull_cache)
+    made = convert(
+        write_room(tmp_path / "home"),
+        tmp_path / "scene",
+        SMALL,
+        cache=hull_cache,
+    )
     assert [g.name for g in made.gates if not g.passed] == []
     assert {o.category: o.mass_kg for o in made.manifest.objects}["chair"] == pytest.approx(6.0)
 

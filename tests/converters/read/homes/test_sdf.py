@@ -37,6 +37,7 @@ def box(size: str, pose: str = "0 0 0 0 0 0", also: str = "") -> str:
     return shape("box", f"<size>{size}</size>", pose, also)
 
 
+SMALL = ConvertConfig(structure_texture=64, object_texture=32, jobs=1)
 ROOM = [
     model("GroundFloor", shape("plane", "<size>4 3</size>"), "0 0 0 0 0 0"),
     model("WallNorth", box("4 0.1 2.4"), "0 1.55 1.2 0 0 0"),
@@ -129,7 +130,7 @@ def test_floor_and_walls_are_told_although_their_faces_are_large(source):
 
 
 def test_a_world_becomes_a_scene_that_passes_its_gates(source, tmp_path, hull_cache):
-    made = convert(source, tmp_path / "home", ConvertConfig(jobs=1), cache=hull_cache)
+    made = convert(source, tmp_path / "home", SMALL, cache=hull_cache)
     assert [g.name for g in made.gates if not g.passed] == []
     objects = {o.category: o for o in made.manifest.objects}
     assert set(objects) == {"chair", "table", "other"}
