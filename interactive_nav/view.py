@@ -24,6 +24,7 @@ from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, ad
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import look_along
 from interactive_nav_common.errors import UserError, reports_errors
+from interactive_nav_common.extras import missing
 from interactive_nav_common.words import program
 
 GAP_M = 0.03
@@ -73,7 +74,7 @@ def choose_viewer(
     if browser():
         return "browser"
     why = "no screen to open a window on, and " if wanted == "auto" else ""
-    raise ViewError(f"{why}mjviser is not installed; 'pip install mjviser' shows the scene in a browser")
+    raise ViewError(why + missing("a view in the browser", "mjviser", "view"))
 
 
 def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np.random.Generator) -> np.ndarray:

@@ -8,7 +8,6 @@ has agreed.
 import contextlib
 import hmac
 import http
-import importlib
 import io
 import ipaddress
 import secrets
@@ -18,6 +17,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.extras import missing, optional
 
 
 def is_local(host: str) -> bool:
@@ -76,10 +76,8 @@ def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
     Raises:
         ConfigError: viser is not installed or works otherwise than 1.1 does, or the port cannot be had.
     """
-    try:
-        viser, serving = importlib.import_module("viser"), importlib.import_module("websockets.asyncio.server")
-    except ImportError:
-        raise ConfigError("viser is not installed, expected it for annotate; pip install 'viser>=1.1,<1.2'") from None
+    names = "viser", "websockets.asyncio.server"
+    viser, serving = (optional(name, missing("annotate", "viser", "annotate")) for name in names)
     token, listening = None if is_local(host) else secrets.token_urlsafe(24), bind(host, port)
     original, checked = serving.serve, []
 
@@ -106,7 +104,7 @@ def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
         setattr(serving, "serve", original)  # noqa: B010
     if not checked:
         server.stop()
-        raise ConfigError(f"viser is {viser.__version__}, which cannot be guarded; pip install 'viser>=1.1,<1.2'")
+        raise ConfigError(f"viser {viser.__version__} cannot be guarded; pip install 'interactive-nav[annotate]'")
     own = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
     return server, f"http://{shown}:{own}/" + (f"?token={token}" if token else "")

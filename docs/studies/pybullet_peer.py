@@ -27,6 +27,7 @@ from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
+from interactive_nav_common.extras import missing, optional
 
 WHEEL_RADIUS_M, HALF_TRACK_M, BODY_RADIUS_M = 0.0352, 0.115, 0.176
 
@@ -40,9 +41,7 @@ class BulletScene:
 
     def __init__(self, world, qpos: np.ndarray):
         """Builds everything from the world's first scene at a given state [nq]."""
-        import pybullet as bullet  # pyright: ignore[reportMissingImports]
-
-        self.bullet = bullet
+        bullet = self.bullet = optional("pybullet", missing("the peer", "pybullet", "pybullet"))
         bullet.connect(bullet.DIRECT)
         bullet.setGravity(0, 0, -9.81)
         plane = bullet.createCollisionShape(bullet.GEOM_PLANE)

@@ -14,14 +14,9 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 import interactive_nav
 from interactive_nav.interop.gym_steps import reset_where, step
@@ -31,6 +26,16 @@ from interactive_nav.robots import robot_names
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
 from interactive_nav.task.wrappers import reset_all, scene_of_slot
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.extras import MissingPackage, missing
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.utils import seeding
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise MissingPackage(missing(__name__, "gymnasium", "gymnasium")) from error
 
 ARRAYS = ("numpy", "jax", "torch")
 VERSION = 0

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from gymnasium.vector import AutoresetMode
 
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.task.wrappers import draw_where
+
+if TYPE_CHECKING:
+    from gymnasium.vector import AutoresetMode
 
 
 def _where(mask: jax.Array, new: Any, old: Any) -> Any:
@@ -33,11 +35,11 @@ def step(
     """The state after a step and, where the mode has it, a new beginning; which episodes were over before, so that
     nothing but a reset was done; and observation, reward, terminated, truncated and metrics."""
     stepped = new = jax.vmap(env.step)(state, actions)
-    same = mode is AutoresetMode.SAME_STEP
-    if mode is not AutoresetMode.DISABLED:
+    same = mode.name == "SAME_STEP"
+    if mode.name != "DISABLED":
         due, keys = (stepped.done > 0, stepped.info["rng"]) if same else (ended, state.info["rng"])
         new = jax.lax.cond(due.any(), lambda s: reset_where(env, s, keys, due), lambda s: s, stepped)
-    told = new if mode is AutoresetMode.NEXT_STEP else stepped
+    told = new if mode.name == "NEXT_STEP" else stepped
     truncated = told.info["truncation"] > 0
-    over = ended if mode is AutoresetMode.NEXT_STEP else jnp.zeros_like(ended)
+    over = ended if mode.name == "NEXT_STEP" else jnp.zeros_like(ended)
     return new, over, (told.obs, told.reward, (told.done > 0) & ~truncated, truncated, dict(told.metrics))

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
-from interactive_nav.interop.gym_env import InteractiveNavVectorEnv
+from interactive_nav.interop.gym_env import AutoresetMode, InteractiveNavVectorEnv
 from interactive_nav.task.env import EPISODE_METRICS
 
 try:

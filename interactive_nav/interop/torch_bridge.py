@@ -10,14 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.extras import optional
 
-
-def _torch() -> Any:
-    try:
-        import torch  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("PyTorch is not installed; follow https://pytorch.org/get-started") from error
-    return torch
+MISSING = "PyTorch is not installed; follow https://pytorch.org/get-started"
 
 
 def to_torch(tree: Any) -> Any:
@@ -30,9 +25,9 @@ def to_torch(tree: Any) -> Any:
         The same structure with a tensor for each JAX array; other leaves are left alone.
 
     Raises:
-        ImportError: PyTorch is not installed.
+        MissingPackage: PyTorch is not installed.
     """
-    torch = _torch()
+    torch = optional("torch", MISSING)
     return jax.tree.map(lambda x: torch.from_dlpack(x) if isinstance(x, jax.Array) else x, tree)
 
 
@@ -49,10 +44,10 @@ def to_jax(tree: Any) -> Any:
         The same structure with a JAX array for each tensor; other leaves are left alone.
 
     Raises:
-        ImportError: PyTorch is not installed.
+        MissingPackage: PyTorch is not installed.
         ConfigError: a tensor that requires a gradient.
     """
-    torch = _torch()
+    torch = optional("torch", MISSING)
 
     def convert(x: Any) -> Any:
         if not isinstance(x, torch.Tensor):

@@ -8,6 +8,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals
 from interactive_nav.scenes.world import World
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.extras import MissingPackage, missing
 
 
 def resolve_backend(name: str) -> str:
@@ -23,10 +24,7 @@ def resolve_backend(name: str) -> str:
             return "native"
         return "warp" if platform == "gpu" and has_warp else "jax"
     if name == "warp" and not has_warp:
-        raise ConfigError(
-            "backend is 'warp' but the package warp-lang is not installed; "
-            "install the gpu extra (pip install '.[gpu]') or choose backend=native"
-        )
+        raise MissingPackage(missing("backend=warp", "warp-lang", "warp", ", or choose backend=native"))
     return name
 
 

@@ -5,6 +5,7 @@ import os
 from typing import Any
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.extras import missing, optional
 from interactive_nav_common.jobs.processes import LOST, Begun, Child, Job, Launcher
 
 
@@ -56,13 +57,7 @@ class RayLauncher(Launcher):
 
     def __init__(self, address: str):
         super().__init__()
-        try:
-            import ray
-        except ImportError:
-            raise ConfigError(
-                "--launcher ray: Ray is not installed; pip install 'interactive-nav[ray]', or use --launcher local"
-            ) from None
-        self._ray = ray
+        ray = self._ray = optional("ray", missing("--launcher ray", "ray", "ray", ", or use --launcher local"))
         self._mine = not ray.is_initialized()
         if self._mine:
             try:

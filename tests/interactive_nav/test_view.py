@@ -31,8 +31,8 @@ def test_a_window_where_there_is_a_screen_else_the_browser():
 
 @pytest.mark.parametrize(
     ("wanted", "has", "message"),
-    [("auto", no, "no screen to open a window on, and mjviser is not installed; 'pip install mjviser'"),
-     ("browser", no, "^mjviser is not installed; 'pip install mjviser'"),
+    [("auto", no, "no screen to open a window on, and a view in the browser needs mjviser"),
+     ("browser", no, "^a view in the browser needs mjviser"),
      ("window", yes, "no screen to open a window on; .* --viewer browser")],
 )  # fmt: skip
 def test_what_is_missing_is_said(wanted, has, message):
@@ -50,8 +50,8 @@ def test_without_a_display_and_mjviser_the_command_says_so_in_one_line(room, mon
     assert view.main([str(room), "--objects", "2"]) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert error == [
-        "interactive_nav.view: no screen to open a window on, and mjviser is not installed; "
-        "'pip install mjviser' shows the scene in a browser"
+        "interactive_nav.view: no screen to open a window on, and a view in the browser needs mjviser, "
+        "which is not installed; pip install 'interactive-nav[view]'"
     ]
 
 

@@ -5,7 +5,6 @@ the end of `sys.path`, so that everything the environment has itself comes first
 `topological_nav.ros`. Where rospy can be imported anyway (a sourced ROS workspace), nothing is changed.
 """
 
-import importlib
 import importlib.util
 import os
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.extras import optional
 
 DIST_PACKAGES = Path("/usr/lib/python3/dist-packages")
 PACKAGES = (
@@ -44,16 +44,8 @@ def load() -> types.SimpleNamespace:
         sys.path.append(str(DIST_PACKAGES))
     if urlsplit(_master()).hostname in ("localhost", "127.0.0.1", "::1") and "ROS_HOSTNAME" not in os.environ:
         os.environ.setdefault("ROS_IP", "127.0.0.1")
-    found: dict[str, Any] = {}
-    for name in _MODULES:
-        try:
-            module = importlib.import_module(name)
-        except ImportError as error:
-            raise RosError(
-                f"ROS is not installed here ({error}); on Debian 12: apt-get install --no-install-recommends {PACKAGES}"
-            ) from None
-        found[name.split(".")[0]] = module
-    return types.SimpleNamespace(**found)
+    line = f"ROS is not installed here; on Debian 12: apt-get install --no-install-recommends {PACKAGES}"
+    return types.SimpleNamespace(**{name.split(".")[0]: optional(name, line, RosError) for name in _MODULES})
 
 
 def need_master(ros: Any) -> None:

@@ -7,7 +7,6 @@ learned from the other.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,6 +22,7 @@ from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.extras import missing, optional
 from interactive_nav_common.rotations import matrix_from_quat
 
 CPU_IMAGES = (1, 2, 6, 18)
@@ -71,13 +71,8 @@ def need_engine(engine: str) -> None:
         UserError: it is `warp`, and the package warp-lang is not there.
     """
     if engine == "warp":
-        try:
-            importlib.import_module("warp")
-        except ImportError as error:
-            raise UserError(
-                f"engine 'warp' does not start here ({error}); install its extra: pip install -e '.[warp]' "
-                "(networks see by the engine that they learned from; what is drawn anew can have engine=gl)"
-            ) from error
+        note = "; networks see by the engine that they learned from, what is drawn anew can have engine=gl"
+        optional("warp", missing("engine=warp", "warp-lang", "warp", note))
 
 
 class SceneRenderer:

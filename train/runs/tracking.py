@@ -6,13 +6,13 @@ folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY
 
 from __future__ import annotations
 
-import importlib
 import uuid
 from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.extras import missing, optional
 from interactive_nav_common.files import write_text
 from train.config import TrainConfig
 
@@ -25,13 +25,7 @@ def import_wandb() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        return importlib.import_module("wandb")
-    except ImportError:
-        raise ConfigError(
-            "run.wandb is true, but Weights & Biases is not installed; pip install 'interactive-nav[wandb]', or set "
-            "run.wandb=false"
-        ) from None
+    return optional("wandb", missing("run.wandb=true", "wandb", "wandb", ", or set run.wandb=false"))
 
 
 class Tracker:

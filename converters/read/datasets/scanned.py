@@ -23,6 +23,7 @@ from converters.read.surfaces import floor_level
 from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene
 from interactive_nav_common.errors import readable
+from interactive_nav_common.extras import missing, optional
 from interactive_nav_common.records import read_packaged
 
 NYU40 = read_packaged(Path(__file__).with_name("nyu40.yaml"), dict[str, int])
@@ -69,12 +70,7 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
         SceneRejected: missing or damaged files, or scenezoo is not installed.
     """
     source, about = SourceFolder(root, strict), COLLECTIONS[name]
-    try:
-        library = importlib.import_module("scenezoo")
-    except ImportError as error:
-        raise SceneRejected(
-            f"{root}: {name} is read by scenezoo, which is not installed; pip install 'interactive-nav[datasets]'"
-        ) from error
+    library = optional("scenezoo", missing(f"{root}: {name}", "scenezoo", "datasets"), SceneRejected)
     for path in sorted(p for mark in about.marks for p in root.glob(mark)):
         source.use(source.inside(path), "")
     scene = root.resolve()

@@ -94,7 +94,8 @@ def test_a_port_in_use_is_one_line_and_not_another_port():
 def test_without_viser_the_command_names_what_to_install(scan2cad_raw, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["annotate", str(scan2cad_raw), "-o", str(tmp_path / "mine"), "--port", "0"]) == 2
-    assert "viser is not installed, expected it for annotate; pip install 'viser" in capsys.readouterr().err
+    expected = "annotate needs viser, which is not installed; pip install 'interactive-nav[annotate]'"
+    assert expected in capsys.readouterr().err
 
 
 def test_two_people_in_one_folder_and_a_missing_scan_are_one_line(scan2cad_raw, tmp_path, capsys):

@@ -304,7 +304,7 @@ def test_upstream_mjx_jax_still_damps_a_saturated_motor():
 
 def test_warp_is_refused_with_the_remedy_where_it_is_missing(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match="install the gpu extra"):
+    with pytest.raises(UserError, match=r"pip install 'interactive-nav\[warp\]', or choose backend=native"):
         resolve_backend("warp")
     assert "turtlebot" in interactive_nav.robot_names()
 
