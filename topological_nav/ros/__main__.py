@@ -110,6 +110,7 @@ def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
     codes: dict[str, int | None] = {}  # of what ended by itself
     try:
         parent = roslaunch.parent.ROSLaunchParent(run, [launched])
+        roslaunch.pmon._init_signal_handlers()  # before the monitor, which would put them there twice: ours is lost
         parent.pm = roslaunch.pmon.start_process_monitor()  # before the launch: a node may fail at once
         parent.pm.add_process_listener(SimpleNamespace(process_died=codes.__setitem__))
         parent.start()

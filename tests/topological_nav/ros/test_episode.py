@@ -4,9 +4,11 @@ import json
 import math
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,7 +33,7 @@ def ros_or_skip():
     return pytest.importorskip("rosbags.rosbag1", reason="rosbags is not installed (pip install rosbags)")
 
 
-def run_all(base, *words):
+def begin_all(base, *words):
     """`all` in `base`, with a master of its own."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -39,7 +41,15 @@ def run_all(base, *words):
     environment = {**os.environ, "ROS_LOG_DIR": str(base / "log"), "ROS_MASTER_URI": master}
     for name in ("ROS_IP", "ROS_HOSTNAME", "ROS_PACKAGE_PATH"):
         environment.pop(name, None)
-    return subprocess.run([*PROGRAM, "all", *words], capture_output=True, text=True, env=environment, cwd=base)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([*PROGRAM, "all", *words], env=environment, cwd=base, **pipes)
+
+
+def run_all(base, *words):
+    """The same, to its end."""
+    begun = begin_all(base, *words)
+    out, err = begun.communicate()
+    return subprocess.CompletedProcess(words, begun.returncode, out, err)
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +148,22 @@ def test_a_failed_node_is_in_the_exit_code(words, told, tmp_path):
     ran = run_all(tmp_path, *words)
     last = ran.stderr.splitlines()[-1]
     assert ran.returncode == 2 and last.startswith("topological_nav.ros: ") and re.search(told, last), ran.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_is_in_the_exit_code(number, tmp_path):
+    ros_or_skip()
+    idle = tmp_path / "idle"
+    idle.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\nexec sleep 60\n")
+    idle.chmod(0o755)
+    begun = begin_all(tmp_path, "scene:=nowhere", f"python:={idle}")
+    while not (tmp_path / "started").exists():
+        assert begun.poll() is None, begun.communicate()
+        time.sleep(0.05)
+    time.sleep(0.5)  # roslaunch looks after its handlers every 0.1 s
+    begun.send_signal(number)
+    begun.communicate(timeout=60)
+    assert begun.returncode == 128 + number
 
 
 def test_without_a_master_the_navigator_says_so(monkeypatch, tmp_path, capfd):
