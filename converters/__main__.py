@@ -29,6 +29,7 @@ from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
 from interactive_nav_common.words import Command, Commands, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES
+from scenes_mjcf.sets import installed
 
 FORMATS = (
     *("gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf", "sh3d"),
@@ -133,7 +134,7 @@ def _object(arguments: argparse.Namespace, console: Console) -> None:
 def _check(arguments: argparse.Namespace, console: Console) -> int:
     from converters.check.gates import check_folder
 
-    manifest, gates = check_folder(arguments.scene)
+    manifest, gates = check_folder(installed(arguments.scene))
     for gate in gates:
         verdict = "PASS" if gate.passed else "FAIL"
         print(
@@ -150,14 +151,14 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
 def _preview(arguments: argparse.Namespace, console: Console) -> None:
     from converters.check.preview import preview
 
-    preview(arguments.scene, arguments.output, arguments.source)
+    preview(installed(arguments.scene), arguments.output, arguments.source)
     console.print(f"{arguments.output}: picture of {arguments.scene}", soft_wrap=True)
 
 
 def _export(arguments: argparse.Namespace, console: Console) -> None:
     from converters.write.sh3d import export_sh3d
 
-    for line in export_sh3d(arguments.scene, arguments.output):
+    for line in export_sh3d(installed(arguments.scene), arguments.output):
         console.print(f"{arguments.output}: {line}", soft_wrap=True, highlight=False, markup=False)
 
 

@@ -21,6 +21,7 @@ import jax
 import pytest
 from markdown_it import MarkdownIt
 
+from interactive_nav.__main__ import PROGRAMS
 from interactive_nav.config import make_config
 
 ROOT = Path(__file__).parents[1]
@@ -72,6 +73,10 @@ def commands(text: str) -> list[tuple[str, list[str]]]:
                     module, rest = match.groups()
                     if module.split(".")[0] in HOUSE:
                         found.append((module, shlex.split(rest, comments=True)))
+                elif match := re.match(r"(?:.*\s)?interactive-nav ([a-z][\w-]*)(.*)", line.partition("#")[0]):
+                    command, rest = match.groups()
+                    module, _ = PROGRAMS[command]
+                    found.append((module, [command] * (module == "converters") + shlex.split(rest)))
     return found
 
 
@@ -154,6 +159,9 @@ def test_commands_of_a_page_exist(page):
 def test_an_unknown_flag_is_found():
     text = "```sh\npython -m train.evaluate RUN --episodes 3 --episode 3\n```\n"
     assert unknown_flags(text) == ["train.evaluate --episode"]
+    wheel = "```sh\nuvx --from x interactive-nav preview alder -o a.png  # --as\ninteractive-nav train --confg a\n```\n"
+    assert commands(wheel)[0] == ("converters", ["preview", "alder", "-o", "a.png"])
+    assert unknown_flags(wheel) == ["train --confg"]
 
 
 def options(text: str) -> list[tuple[str, str]]:
