@@ -3,8 +3,6 @@
 The line holds in a checkout as well as beside a wheel: pip takes the project that is there, and adds the extra's.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

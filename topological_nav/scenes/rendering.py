@@ -5,8 +5,6 @@ both draw the visual meshes with their textures. Their light differs, so the ima
 learned from the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ The package is an optional extra. Where it writes is its own to say: WANDB_MODE=
 folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
 """
 
-from __future__ import annotations
-
 import uuid
 from pathlib import Path
 from typing import Any
