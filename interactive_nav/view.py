@@ -23,8 +23,7 @@ from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import look_along
-from interactive_nav_common.errors import UserError, reports_errors
-from interactive_nav_common.extras import missing
+from interactive_nav_common.errors import UserError, missing, reports_errors
 from interactive_nav_common.words import program
 
 GAP_M = 0.03

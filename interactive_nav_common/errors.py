@@ -2,10 +2,11 @@
 
 import contextlib
 import functools
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ParamSpec
+from typing import Any, ParamSpec
 
 Arguments = ParamSpec("Arguments")
 
@@ -58,3 +59,24 @@ def reports_errors(program: str) -> Callable[[Callable[Arguments, int]], Callabl
         return reported
 
     return of
+
+
+class MissingPackage(ConfigError, ImportError):
+    """A package that only an extra of this project brings cannot be imported."""
+
+
+def missing(user: str, package: str, extra: str, otherwise: str = "") -> str:
+    """The line: what needs the package, the extra that brings it, and another remedy. It holds beside a wheel, too."""
+    return f"{user} needs {package}, which is not installed; pip install 'interactive-nav[{extra}]'{otherwise}"
+
+
+def optional(module: str, line: str, kind: type[UserError] = MissingPackage) -> Any:
+    """A module of an optional package.
+
+    Raises:
+        UserError: of this kind, with the line and what the import said; it cannot be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise kind(f"{line} ({' '.join(str(error).split())})") from error

@@ -16,8 +16,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.extras import missing, optional
+from interactive_nav_common.errors import ConfigError, missing, optional
 
 
 def is_local(host: str) -> bool:

@@ -27,7 +27,7 @@ from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
-from interactive_nav_common.extras import missing, optional
+from interactive_nav_common.errors import missing, optional
 
 WHEEL_RADIUS_M, HALF_TRACK_M, BODY_RADIUS_M = 0.0352, 0.115, 0.176
 

@@ -25,8 +25,7 @@ from interactive_nav.pictures.views import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
 from interactive_nav.task.wrappers import reset_all, scene_of_slot
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.extras import MissingPackage, missing
+from interactive_nav_common.errors import ConfigError, MissingPackage, missing
 
 try:
     import gymnasium

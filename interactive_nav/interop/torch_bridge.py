@@ -9,8 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.extras import optional
+from interactive_nav_common.errors import ConfigError, optional
 
 MISSING = "PyTorch is not installed; follow https://pytorch.org/get-started"
 

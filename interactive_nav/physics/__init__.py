@@ -7,8 +7,7 @@ import jax
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals
 from interactive_nav.scenes.world import World
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.extras import MissingPackage, missing
+from interactive_nav_common.errors import ConfigError, MissingPackage, missing
 
 
 def resolve_backend(name: str) -> str:

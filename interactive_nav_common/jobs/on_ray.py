@@ -4,8 +4,7 @@ import logging
 import os
 from typing import Any
 
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.extras import missing, optional
+from interactive_nav_common.errors import ConfigError, missing, optional
 from interactive_nav_common.jobs.processes import LOST, Begun, Child, Job, Launcher
 
 

@@ -18,8 +18,7 @@ from docs.studies.pybullet_peer import BulletScene
 from interactive_nav import view
 from interactive_nav.interop.torch_bridge import to_torch
 from interactive_nav.physics import resolve_backend
-from interactive_nav_common.errors import UserError
-from interactive_nav_common.extras import optional
+from interactive_nav_common.errors import UserError, optional
 from interactive_nav_common.jobs.on_ray import RayLauncher
 from topological_nav.scenes.rendering import need_engine
 from train.runs.tracking import import_wandb

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from interactive_nav_common.errors import UserError
-from interactive_nav_common.extras import optional
+from interactive_nav_common.errors import UserError, optional
 
 DIST_PACKAGES = Path("/usr/lib/python3/dist-packages")
 PACKAGES = (

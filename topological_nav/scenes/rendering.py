@@ -19,8 +19,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
-from interactive_nav_common.errors import UserError
-from interactive_nav_common.extras import missing, optional
+from interactive_nav_common.errors import UserError, missing, optional
 from interactive_nav_common.rotations import matrix_from_quat
 
 CPU_IMAGES = (1, 2, 6, 18)

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import flatten
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.extras import missing, optional
+from interactive_nav_common.errors import ConfigError, missing, optional
 from interactive_nav_common.files import write_text
 from train.config import TrainConfig
 

@@ -22,8 +22,7 @@ from converters.read.storeys import label_storeys
 from converters.read.surfaces import floor_level
 from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene
-from interactive_nav_common.errors import readable
-from interactive_nav_common.extras import missing, optional
+from interactive_nav_common.errors import missing, optional, readable
 from interactive_nav_common.records import read_packaged
 
 NYU40 = read_packaged(Path(__file__).with_name("nyu40.yaml"), dict[str, int])
