@@ -7,12 +7,11 @@ import collections
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-# Before JAX: tests compile more than they compute, and often the same as another test, worker or subprocess. Level 0
-# compiles sooner still, but what trains on pictures then takes twice as long. The fusion emitters of jaxlib 0.10 take
-# half of the time that everything else of a compilation takes.
+# Before JAX: tests compile more than they compute, and often the same as another test, worker or subprocess (see also
+# `quick_compilation`). The fusion emitters of jaxlib 0.10 take half of the time that all else of a compilation takes.
 os.environ["XLA_FLAGS"] = (
     f"{os.environ.get('XLA_FLAGS', '')} --xla_llvm_disable_expensive_passes=true "
     "--xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1 --xla_cpu_use_fusion_emitters=false"
@@ -69,6 +68,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     count = collections.Counter(item.path for item in items)
     items.sort(key=lambda item: (item.path not in slow, -count[item.path]))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compilation(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Level 0 compiles in half the time of level 1, but where networks learn on pictures costs more than it saves."""
+    import jax
+
+    quick = "topological_nav" not in request.path.parts
+    jax.config.update("jax_disable_most_optimizations", quick)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="session")

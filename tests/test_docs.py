@@ -17,7 +17,6 @@ import traceback
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import pytest
 from markdown_it import MarkdownIt
 
@@ -99,17 +98,8 @@ with_python = [
 ]
 
 
-@pytest.fixture
-def quick_compilation():
-    """Pages run a few steps only: compiling well would take longer than running badly."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-    jax.clear_caches()
-
-
 @pytest.mark.parametrize("page", with_python)
-def test_python_of_a_page_runs(page, quick_compilation):
+def test_python_of_a_page_runs(page):
     assert run_page(page, page.read_text(encoding="utf-8")) > 0
 
 

@@ -17,7 +17,7 @@ from converters.read.scan2cad import read_scan2cad
 from scenes_mjcf.schema import load_maps
 from tests.converters.structure.test_fill import hits
 
-pytestmark = [pytest.mark.data, pytest.mark.slow]
+pytestmark = pytest.mark.data
 
 LIMIT_S = 180.0
 
@@ -37,6 +37,7 @@ def escaping_share(folder, maps) -> float:
     return float(np.mean(escaped))
 
 
+@pytest.mark.heavy
 def test_the_real_room_converts_and_its_seven_objects_stay_put(sample_data, tmp_path, hull_cache):
     config = ConvertConfig(format="scan2cad", structure_texture=512, object_texture=128)
     start = time.monotonic()

@@ -85,7 +85,7 @@ def test_a_run_of_a_gpu_is_played_without_one(run, tmp_path, monkeypatch, capsys
     ended = program.main([str(copy.path), "--policies", "random", *words])
     said = capsys.readouterr()
     if words:
-        assert ended == 2 and "backend is 'warp'" in said.err
+        assert ended == 2 and "backend=warp needs warp-lang" in said.err
     else:
         assert ended == 0
         assert f"{copy.path}: trained with backend warp, which is not here; played with native" in said.out

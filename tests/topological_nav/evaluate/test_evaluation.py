@@ -313,7 +313,7 @@ def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, mon
     simulator, env = contests._learned(tmp_path, scene, EvaluationConfig())
     assert (simulator.env.backend, env.backend, env.scenes) == ("native", "native", (str(scene.path),))
     assert "trained with backend warp, which is not here; played with native" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="backend is 'warp'"):
+    with pytest.raises(ConfigError, match="backend=warp needs warp-lang"):
         contests._learned(tmp_path, scene, EvaluationConfig.of(backend="warp"))
 
 

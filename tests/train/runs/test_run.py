@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_text
@@ -114,7 +113,7 @@ def test_a_run_that_another_process_trains_is_refused(finished, tmp_path, monkey
     copy = RunFolder(tmp_path / "toy")
     shutil.copytree(folder.path, copy.path)
     before = {path: path.read_bytes() for path in copy.path.rglob("*") if path.is_file()}
-    monkeypatch.setattr(train_run, "__defaults__", (build_toy, AutoResetEnv))
+    monkeypatch.setattr(train_run, "__defaults__", (build_toy,))
     held = take_lock(copy.lock)
     assert program.main(["--resume", str(copy.path), "run.num_timesteps=9999"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
