@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from interactive_nav.robots import get_robot
@@ -13,14 +14,16 @@ from interactive_nav.scenes.scene import load_scene
 from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
 from topological_nav.figures.maps import curves, floor_plan, scene_axes
 from topological_nav.scenes.space import free_space
-from train.figures.style import panels, plt
+from train.figures.style import BLUE, RC, VERMILION, panels, plt
 
 SHOWN = 4
 """Drives whose images are shown."""
-FRAMES = 9
+FRAMES = 8
 """Images of each."""
+TURNS = LinearSegmentedColormap.from_list("turns", (BLUE, "0.6", VERMILION))
 
 
+@plt.rc_context(RC)  # type: ignore[reportCallIssue]
 def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
     """Every drive on the floor plans, kept ones coloured by turning, then images along some and the commands' shares.
 
@@ -32,9 +35,8 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
     drives, robot = load_drives(folder), get_robot(config.robot)
     lines = -(-len(scene_folders) // min(4, len(scene_folders)))
     picked = _some(folder, SHOWN)
-    figure = plt.figure(figsize=(12, 3.8 * lines + 1.2 * len(picked) + 2.4), layout="constrained")
-    parts: Any = figure.subfigures(3, 1, height_ratios=[3.8 * lines, 1.2 * len(picked) + 0.01, 2.4])
-    above, middle, below = parts
+    figure: Any = plt.figure(figsize=(8, 3.8 * lines + 1.2 * len(picked) + 2.4), layout="constrained")
+    above, middle, below = figure.subfigures(3, 1, height_ratios=[3.8 * lines, 1.2 * len(picked) + 0.01, 2.4])
     axes, shade = scene_axes(above, len(scene_folders)), None
     for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
         axis, mine = axes[index], np.flatnonzero(drives.scene == index)
@@ -47,7 +49,7 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
             pieces.append(np.stack([xy[:-1], xy[1:]], 1))
             turns.append(drives.command[drives.rows(k)[:-1], 1])
         if pieces:
-            shade = LineCollection(list(np.concatenate(pieces)), cmap="coolwarm", linewidths=0.7)
+            shade = LineCollection(list(np.concatenate(pieces)), cmap=TURNS, linewidths=0.7)
             shade.set_array(np.concatenate(turns))
             shade.set_clim(-config.angular_rad_s, config.angular_rad_s)
             axis.add_collection(shade)
@@ -56,8 +58,7 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
         axis.scatter(*drives.pose_w[hits, :2].T, s=6, color="k", marker="x", zorder=4)
         axis.set_title(
             f"{about['name']}: {int(drives.kept[mine].sum())} of {len(mine)} drives kept\n"
-            f"(reached {drives.reached[mine].mean():.2f}, in contact {drives.touched[mine].mean():.2f})",
-            fontsize=7.5,
+            f"(reached {drives.reached[mine].mean():.2f}, in contact {drives.touched[mine].mean():.2f})"
         )
     if shade is not None:
         above.colorbar(shade, ax=list(axes), label="turning, rad/s (left +)", shrink=0.6, pad=0.01)
@@ -66,10 +67,11 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
         for axis, (k, images) in zip(grid, picked, strict=True):
             at = np.linspace(0, len(images) - 1, FRAMES).astype(int)
             axis.imshow(np.concatenate(list(images[at]), 1))
-            axis.set_axis_off()
-            asked = drives.command[drives.first[k] + at]
-            said = "   ".join(f"{v:.1f} m/s {w:+.1f}" for v, w in asked)
-            axis.set_title(f"drive {k} in {header['scenes'][drives.scene[k]]['name']}: {said} rad/s", fontsize=6.5)
+            said = [f"{v:.1f}, {w:+.1f}" for v, w in drives.command[drives.first[k] + at]]
+            axis.set_xticks((np.arange(FRAMES) + 0.5) * images.shape[2], said, fontsize=8)
+            axis.set(yticks=[], frame_on=False)
+            axis.tick_params(length=0, grid_linewidth=0)
+            axis.set_title(f"drive {k} in {header['scenes'][drives.scene[k]]['name']}: m/s, rad/s (left +)", loc="left")
     _shares(below.subplots(1, 3), drives)
     return figure
 
@@ -98,16 +100,14 @@ def _thin(files, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _shares(axes: Any, drives: Any) -> None:
     going = np.repeat(drives.kept, drives.steps)
-    for axis, values, name in (
-        (axes[0], drives.command[going, 0], "commanded m/s"),
-        (axes[1], drives.command[going, 1], "commanded rad/s"),
-        (axes[2], drives.steps[drives.kept] / 10.0, "seconds a drive"),
+    for axis, values, name, what in (
+        (axes[0], drives.command[going, 0], "commanded m/s", "steps"),
+        (axes[1], drives.command[going, 1], "commanded rad/s (left +)", "steps"),
+        (axes[2], drives.steps[drives.kept] / 10.0, "seconds a drive", "drives"),
     ):
         if len(values):
-            axis.hist(values, bins=21, color="tab:blue", weights=np.full(len(values), 1 / len(values)))
-        axis.set_xlabel(name, fontsize=8)
-        axis.tick_params(labelsize=7)
-        axis.grid(alpha=0.3)
+            axis.hist(values, bins=21, color=BLUE, weights=np.full(len(values), 1 / len(values)))
+        axis.set(xlabel=name, ylabel=f"share of {what}")
 
 
 def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> Figure:

@@ -47,7 +47,7 @@ def journeys_figure(
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
     columns = len(panels) if extent[1] >= extent[0] or len(panels) == 1 else min(2, len(panels))
     lines = -(-len(panels) // columns)
-    width = 5.4
+    width = max(7.8 / columns, 3.9)
     size = (width * columns, (width * extent[1] / extent[0] + 0.5) * lines)
     figure = plt.figure(figsize=size, layout="constrained")
     axes = scene_axes(figure, len(panels), columns)

@@ -9,13 +9,14 @@ from matplotlib.figure import Figure
 
 from topological_nav.figures.maps import curves
 from topological_nav.weights.export import PRECISION, Exported
-from train.figures.style import panels, plt
+from train.figures.style import BLUE, ORANGE, RC, VERMILION, panels, plt
 
 _SHOWN = 6
 """Pairs of images."""
-_STAGES = {"before": "0.6", "statistics": "tab:orange", "after": "tab:blue"}
+_STAGES = {"before": "0.6", "statistics": ORANGE, "after": BLUE}
 
 
+@plt.rc_context(RC)  # type: ignore[reportCallIssue]
 def features_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
@@ -28,10 +29,10 @@ def features_figure(
         results: of results.json.
     """
     figure, course, scores = _domains(source, target)
+    course.axhline(0.5, color="0.5", linewidth=0.8, zorder=0, label="accuracy by chance")
     labels = {"loss": "extractor's loss", "critic_loss": "critic's loss", "critic_accuracy": "critic's accuracy"}
     curves(course, lines, labels, marker=".")
-    course.axhline(0.5, color="0.7", linewidth=0.8, zorder=0)
-    course.set_ylim(bottom=0)
+    course.set(ylim=(0, max(1.0, course.get_ylim()[1])), title="adaptation: losses (nats), accuracy (share)")
     kinds = (("node", "nearest node"), ("room", "right room"))
     for k, (name, colour) in enumerate(_STAGES.items()):
         values = [results[name]["mean"][kind] for kind, _ in kinds]
@@ -39,12 +40,13 @@ def features_figure(
     for x, (kind, _) in enumerate(kinds):
         best = results["source"]["mean"][kind]
         scores.plot([x - 0.45, x + 0.45], [best, best], "k--", linewidth=1, label="in the source" if not x else None)
-    scores.set(xticks=[0, 1], xticklabels=[label for _, label in kinds], ylim=(0, 1))
-    scores.set_title("share of the target's held-out images localised", fontsize=9)
-    scores.legend(fontsize=7)
+    title = "share of the target's held-out images localised"
+    scores.set(xticks=[0, 1], xticklabels=[label for _, label in kinds], ylim=(0, 1), title=title)
+    scores.legend(loc="upper left")
     return figure
 
 
+@plt.rc_context(RC)  # type: ignore[reportCallIssue]
 def passages_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
@@ -52,20 +54,18 @@ def passages_figure(
     figure, course, scores = _domains(source, target)
     for name, label in (("B", "B: fresh weights"), ("D", "D: the source's")):
         curves(course, [line for line in lines if line["phase"] == name], {"accuracy": label}, marker=".")
-    course.set(xlabel="epoch of fine-tuning", ylim=(0, 1))
-    course.set_title("accuracy on the images learned from", fontsize=9)
-    names = ("A", "B", "C", "D")
-    _bars(scores, np.arange(4), [results[name]["accuracy"] for name in names], 0.6, "tab:blue", None)
+    course.set(xlabel="epoch of fine-tuning", ylim=(0, 1), title="accuracy on the images learned from")
+    _bars(scores, np.arange(4), [results[name]["accuracy"] for name in "ABCD"], 0.6, BLUE, None)
     scores.axhline(0.5, color="0.5", linewidth=0.8)
     words = ("A\nfresh", "B\nfresh,\nfine-tuned", "C\nsource", "D\nsource,\nfine-tuned")
-    scores.set(xticks=range(4), xticklabels=words, ylim=(0, 1))
-    scores.set_title(f"accuracy on {results['tested_on']} held-out target images", fontsize=9)
+    title = f"accuracy on {results['tested_on']} held-out target images"
+    scores.set(xticks=range(4), xticklabels=words, ylim=(0, 1), title=title)
     return figure
 
 
 def _domains(source: np.ndarray, target: np.ndarray) -> tuple[Figure, Axes, Axes]:
     """A figure with images of both domains, and its axes for the course of learning and for the scores."""
-    figure: Any = plt.figure(figsize=(11, 5.6), layout="constrained")
+    figure: Any = plt.figure(figsize=(8, 5.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
     grid = above.subplots(2, _SHOWN, squeeze=False)
     for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):
@@ -73,13 +73,13 @@ def _domains(source: np.ndarray, target: np.ndarray) -> tuple[Figure, Axes, Axes
         for axis, row in zip(line, rows, strict=True):
             axis.imshow(images[row])
             axis.set_axis_off()
-        line[0].set_title(name, fontsize=9, loc="left")
+        line[0].set_title(name, loc="left")
     return figure, *below.subplots(1, 2)
 
 
 def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, colour: str, label: str | None) -> None:
     bars = axis.bar(at, values, width, color=colour, label=label)
-    axis.bar_label(bars, fmt="%.2f", fontsize=7)
+    axis.bar_label(bars, fmt="%.2f", fontsize=8)
 
 
 def export_figure(made: Exported, limit_mib: float) -> Figure:
@@ -109,6 +109,6 @@ def export_figure(made: Exported, limit_mib: float) -> Figure:
     parts = sorted(made.sizes.items(), key=lambda item: item[1])
     total = sum(made.sizes.values()) / 2**20
     right.barh([name for name, _ in parts] + ["all"], [size / 2**20 for _, size in parts] + [total])
-    right.axvline(limit_mib, color="tab:red", lw=1)
+    right.axvline(limit_mib, color=VERMILION, lw=1)
     right.set(xlabel=f"MiB (at most {limit_mib:g}, the line)")
     return figure
