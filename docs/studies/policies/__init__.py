@@ -1,0 +1,1 @@
+"""What learned policies see and do, drawn."""
