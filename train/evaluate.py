@@ -132,6 +132,8 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
     folders = runs or [None]
     configs = [_wanted(folder, policies, arguments, console) for folder in folders]
+    if arguments.policies is None and not all("waypoints" in c.env.sensors.observations for c in configs):
+        policies = tuple(name for name in policies if name != "follower")  # nobody asked for it
     given = arguments.episode_file
     fixed, digest = _read_episodes(given, arguments.episodes) if given else (None, "")
     # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.

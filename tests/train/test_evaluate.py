@@ -43,6 +43,20 @@ def evaluated(run):
     return run.path / "evaluation" / "episodes.parquet"
 
 
+def test_nobody_is_asked_to_follow_waypoints_that_are_not_seen(run, tmp_path, monkeypatch):
+    heard = []
+
+    def played(folder, config, player, asked, *_):
+        heard.append(asked.policies)
+        raise UserError("enough")
+
+    monkeypatch.setattr(evaluate, "evaluate", played)
+    words = [str(run.path), "--out", str(tmp_path / "rows.parquet")]
+    for more in ([], ["env.observations=[goal]"], ["env.observations=[goal]", "--policies", "follower"]):
+        assert evaluate.main(words + more, build_env=build_toy) == 2
+    assert heard == [("learned", "random", "follower"), ("learned", "random"), ("follower",)]
+
+
 def test_rows(evaluated):
     rows = pq.read_table(evaluated)
     assert rows.num_rows == 36
