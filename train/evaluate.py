@@ -46,14 +46,14 @@ def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile,
     return dataclasses.replace(file, episodes=file.episodes[:most]), digest
 
 
-def _config_of_yardsticks(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
+def _config_of_baselines(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
     """The default config, for policies that need no run folder."""
     if LEARNED in policies or not arguments.scenes:
         raise ConfigError(
             "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
             "for example --policies random,follower,avoider,namo:0.5"
         )
-    return dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="yardsticks"))
+    return dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="baselines"))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -98,7 +98,7 @@ def _wanted(
     words = [word for word in arguments.words if "=" in word]
     if folder:
         return config_to_play(folder, words, arguments.scenes, console)
-    config = config_io.apply_overrides(_config_of_yardsticks(policies, arguments), words)
+    config = config_io.apply_overrides(_config_of_baselines(policies, arguments), words)
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 

@@ -79,7 +79,7 @@ def paper_like(robots: Sequence[str] = ("turtlebot", "fetch"), noise: float = 0.
     return pa.concat_tables(tables)
 
 
-def yardstick_rows(robot: str = "turtlebot") -> pa.Table:
+def baseline_rows(robot: str = "turtlebot") -> pa.Table:
     """Policies that never learned: P_eff falls and E_eff rises with the planner's weight."""
     tables = []
     for name, p, e in (("namo:0", 0.9, 0.6), ("namo:0.5", 0.8, 0.8), ("namo:1", 0.6, 0.9), ("follower", 0.85, 0.55)):
@@ -87,7 +87,7 @@ def yardstick_rows(robot: str = "turtlebot") -> pa.Table:
         count = len(rows)
         for column, values in (
             ("policy", pa.array([name] * count)),
-            ("run", pa.array(["yardsticks"] * count)),
+            ("run", pa.array(["baselines"] * count)),
             ("algorithm", pa.nulls(count, pa.string())),
             ("seed", pa.nulls(count, pa.int64())),
         ):
@@ -99,5 +99,5 @@ def yardstick_rows(robot: str = "turtlebot") -> pa.Table:
 def write_results(folder: Path) -> Path:
     """A results folder with all of it."""
     write_parquet(paper_like(), folder / "rows.parquet")
-    write_parquet(yardstick_rows(), folder / "yardsticks.parquet")
+    write_parquet(baseline_rows(), folder / "baselines.parquet")
     return folder

@@ -176,7 +176,7 @@ def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--scenes", "plane", "--policies", "random", "--episodes", "3"]
     assert evaluate.main(words, build_env=build_toy) == 0
-    rows = tmp_path / "runs" / "yardsticks" / "evaluation" / "episodes.parquet"
+    rows = tmp_path / "runs" / "baselines" / "evaluation" / "episodes.parquet"
     assert pq.read_table(rows)["policy"].to_pylist() == ["random"] * 3 and paths_beside(rows).is_file()
 
 

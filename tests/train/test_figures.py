@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from interactive_nav_common.rows import write_parquet
-from tests.train.synthetic import paper_like, run_rows, write_results, yardstick_rows
+from tests.train.synthetic import baseline_rows, paper_like, run_rows, write_results
 from train import figures
 from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
@@ -125,7 +125,7 @@ def test_ins_over_alpha_shows_means_and_intervals_of_seeds():
 
 
 def test_the_plane_has_cells_in_front_of_what_never_learned():
-    rows = pa.concat_tables([paper_like(), yardstick_rows()], promote_options="permissive")
+    rows = pa.concat_tables([paper_like(), baseline_rows()], promote_options="permissive")
     figure = scores.efficiency_plane(rows, "turtlebot", "test")
     (axis,) = figure.axes
     drawn = np.concatenate([xy(line) for line in axis.lines])
@@ -139,7 +139,7 @@ def test_the_plane_has_cells_in_front_of_what_never_learned():
 def test_what_lies_far_from_the_runs_is_named_beside_them():
     """All runs within 0.02 of each other: who never learned would squeeze them into one blot."""
     runs = [run_rows("turtlebot", a, 0.1, 0, p, (0.98, 0.98)) for a, p in (("ppo", 0.95), ("sac", 0.96))]
-    known = yardstick_rows()
+    known = baseline_rows()
     known = known.filter(pa.array([name == "follower" for name in known["policy"].to_pylist()]))
     rows = pa.concat_tables([*runs, known], promote_options="permissive")
     figure = scores.efficiency_plane(rows, "turtlebot", "test")
@@ -250,7 +250,7 @@ def test_tables_say_what_the_rows_say(results, capsys):
 
 
 def test_tables_need_learned_rows(tmp_path, capsys):
-    write_parquet(yardstick_rows(), tmp_path / "y.parquet")
+    write_parquet(baseline_rows(), tmp_path / "y.parquet")
     assert figures.main([str(tmp_path), "--tables"]) == 2
     assert "no rows of learned runs; evaluate them first" in capsys.readouterr().err
 

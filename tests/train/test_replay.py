@@ -20,7 +20,7 @@ from train.runs.run_folder import RunFolder
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, room):
-    """A run that has not trained yet: yardsticks need no checkpoint."""
+    """A run that has not trained yet: baselines need no checkpoint."""
     config = toy_config(tmp_path_factory.mktemp("runs"))
     env = EnvConfig.of(scenes=(str(room),), backend="native", episode_steps=15, num_objects=1)
     folder = RunFolder(tmp_path_factory.mktemp("run"))

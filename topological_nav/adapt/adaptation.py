@@ -125,7 +125,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
 def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: int = 3) -> Trained:
     """The network with batch normalisation's running statistics of other images, its weights as they were.
 
-    Li et al. 2016 (AdaBN): the least that can be done, and a yardstick for more. Images [N, H, W, 3] u8.
+    Li et al. 2016 (AdaBN): the least that can be done, and a baseline for more. Images [N, H, W, 3] u8.
     """
     step = jax.jit(lambda stats, x: embed_training(trained.network, {**trained.variables, "batch_stats": stats}, x)[1])
     stats, size = trained.variables["batch_stats"], min(batch, len(images))

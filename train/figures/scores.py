@@ -111,7 +111,7 @@ def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
     for algorithm in looks.algorithms:
         runs = [run for run in means if run.algorithm == algorithm]
         _chain(axis, runs, looks, looks.algorithm(algorithm))
-    _yardsticks(axis, rows, robot, split)
+    _baselines(axis, rows, robot, split)
     step = _finish_plane(axis)
     handles = [*looks.algorithm_handles(), *looks.k_int_handles(linestyle="")]
     planner = [style.handle("planner that knows all poses, weight w of pushing", color="0.45", marker=".")]
@@ -226,7 +226,7 @@ def _chain(axis: Axes, runs: Sequence[RunMean], looks: style.Looks, look: dict[s
     axis.plot(*np.array(places).T, color=look["color"], linewidth=0.9, alpha=0.7, zorder=3)
 
 
-def _yardsticks(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> None:
+def _baselines(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> None:
     """Policies that never learned, in grey: the planner's weights as a line, the others as named points.
 
     What lies far from runs and planners is named in a corner instead: the runs would be one blot beside it.

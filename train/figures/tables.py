@@ -33,7 +33,7 @@ def score_cells(rows: pa.Table) -> str:
     return markdown(("robot", "algorithm", "k_int", "scenes", "runs", "episodes", *COLUMNS), lines)
 
 
-def yardsticks(rows: pa.Table) -> str:
+def baselines(rows: pa.Table) -> str:
     """Scores of policies that never learned: mean over episodes and their 95 % interval; empty where there are none."""
     policy = np.asarray(rows["policy"].to_pylist())
     keys = sorted({key for key in zip(rows["robot"].to_pylist(), policy, rows["split"].to_pylist(), strict=True)})
@@ -177,7 +177,7 @@ def document(rows: pa.Table, split: str | None) -> str:
             "far each of them was moved on average, in centimetres of its centre's path.",
             moved,
         ]
-    if known := yardsticks(rows):
+    if known := baselines(rows):
         parts += ["## Policies that never learned", "Mean over episodes [95 % interval].", known]
     if runs := provenance(rows):
         parts += ["## Runs", runs]

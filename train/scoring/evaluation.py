@@ -24,13 +24,13 @@ from train.runs.run import check_fits
 from train.runs.run_folder import RunFolder
 from train.scoring.brought import BroughtPolicy
 from train.scoring.planners import HostPolicy
-from train.scoring.policies import YARDSTICKS, PolicyFn, make_yardstick
+from train.scoring.policies import BASELINES, PolicyFn, make_baseline
 from train.scoring.rollout import BatchPlayer, PlayedEpisodes, episode_keys
 from train.scoring.row_files import EvaluationAsked
 from train.scoring.rows import episode_table
 
 LEARNED = "learned"
-POLICIES = (LEARNED, *YARDSTICKS)
+POLICIES = (LEARNED, *BASELINES)
 SEED = 1_000_000
 """Of the fixed episodes where none is given."""
 OF_LEARNED = (
@@ -88,13 +88,13 @@ def make_policies(
 ) -> dict[str, tuple[Any, CheckpointMeta | None]]:
     """Policies by name, and the checkpoints of those that learned.
 
-    See `load_policy`, `make_yardstick`, and `BroughtPolicy` for `name=module:factory`.
+    See `load_policy`, `make_baseline`, and `BroughtPolicy` for `name=module:factory`.
     """
 
     def made(name: str) -> tuple[Any, CheckpointMeta | None]:
         if name == LEARNED and folder:
             return load_policy(folder, config, env, which, deterministic, known)
-        return BroughtPolicy(name, env) if "=" in name else make_yardstick(name, env), None
+        return BroughtPolicy(name, env) if "=" in name else make_baseline(name, env), None
 
     return {name.partition("=")[0]: made(name) for name in names}
 

@@ -1,4 +1,4 @@
-"""Observation and key in, action out: the learned policy and two yardsticks that never learned.
+"""Observation and key in, action out: the learned policy and two baselines that never learned.
 
 Every policy is a pure function (observation, key) -> action (A,) in [-1, 1] of one environment, its observation
 a vector (O,) or a dict with images; batch it with `jax.vmap` and a key for each, so that an episode does not
@@ -55,12 +55,12 @@ def waypoint_follower(robot: RobotSpec, waypoint: int, observation: Observation,
 
 
 def make_random(env: Any) -> PolicyFn:
-    """The random yardstick."""
+    """The random baseline."""
     return functools.partial(random_policy, env.action_size)
 
 
 def make_follower(env: Any) -> PolicyFn:
-    """The yardstick that follows the shortest path.
+    """The baseline that follows the shortest path.
 
     Raises:
         UserError: the observation has no waypoints, or the robot's control mode takes no base velocity.
@@ -76,19 +76,19 @@ def make_follower(env: Any) -> PolicyFn:
     return functools.partial(waypoint_follower, env.robot, waypoint)
 
 
-YARDSTICKS: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
+BASELINES: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
 PLANNERS = ("avoider", "namo:W")
 """Planners on the host; W is the weight of pushing against detour, 0 to 1."""
 
 
-def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
+def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
     """A policy or planner that never learns, by name: random, follower, avoider or namo:W.
 
     Raises:
         UserError: unknown name or weight, or a robot or observations that it cannot use.
     """
-    if name in YARDSTICKS:
-        return YARDSTICKS[name](env)
+    if name in BASELINES:
+        return BASELINES[name](env)
     if name == "avoider":
         return Planner(env, None)
     kind, _, weight = name.partition(":")
@@ -98,5 +98,5 @@ def make_yardstick(name: str, env: Any) -> PolicyFn | Planner:
         except ValueError:
             raise UserError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
         return Planner(env, share)
-    known = ", ".join(("learned", *YARDSTICKS, *PLANNERS))
+    known = ", ".join(("learned", *BASELINES, *PLANNERS))
     raise UserError(f"--policies: got {name!r}, expected a choice from {known}")

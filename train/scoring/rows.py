@@ -30,7 +30,7 @@ TYPES: dict[str, pa.DataType] = {
     **dict.fromkeys(("k_int", "evaluation_wall_s", "train_wall_s"), pa.float64()),
     "deterministic": pa.bool_(),
 }
-"""Of the constant columns, which are empty where they mean nothing (a yardstick has no seed)."""
+"""Of the constant columns, which are empty where they mean nothing (a baseline has no seed)."""
 
 
 BY_CATEGORY = pa.list_(

@@ -340,7 +340,7 @@ def test_in_a_real_home_true_sight_finds_most_goals(tmp_path):
 
 
 def test_a_policy_told_the_goal_plays_the_same_episodes(first, toy):
-    """By the yardstick that follows waypoints, in an environment with small objects, which stay away."""
+    """By the baseline that follows waypoints, in an environment with small objects, which stay away."""
     contest, (venue,), _ = first
     env = interactive_nav.make("ttbot", [toy], control_mode="twist", backend="native", num_objects=1)
     simulator = Simulator(env)

@@ -14,7 +14,7 @@ from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 from train.scoring.planners import Planner
-from train.scoring.policies import make_yardstick
+from train.scoring.policies import make_baseline
 from train.scoring.rollout import BatchPlayer, episode_keys
 
 
@@ -44,7 +44,7 @@ def starts() -> EpisodeStart:
 def played(env):
     out = {}
     for name in ("avoider", "namo:0", "namo:0.9"):
-        planner = make_yardstick(name, env)
+        planner = make_baseline(name, env)
         out[name] = (planner, BatchPlayer(env).play(planner, episode_keys(0, 2), 2, starts=starts()))
     return out
 
@@ -75,10 +75,10 @@ def test_weight_0_pushes_and_a_large_weight_goes_round(played):
 
 def test_names_and_weights_are_checked(env):
     with pytest.raises(UserError, match="got 'namo', expected a weight, as in namo:0.5"):
-        make_yardstick("namo", env)
+        make_baseline("namo", env)
     with pytest.raises(UserError, match="weight is 1.5, expected between 0 and 1"):
         Planner(env, 1.5)
     with pytest.raises(UserError, match="expected a choice from learned, random, follower, avoider, namo:W"):
-        make_yardstick("greedy", env)
-    action = jax.vmap(cast(Any, make_yardstick("random", env)))(jnp.zeros((3, 29)), episode_keys(0, 3))
+        make_baseline("greedy", env)
+    action = jax.vmap(cast(Any, make_baseline("random", env)))(jnp.zeros((3, 29)), episode_keys(0, 3))
     assert action.shape == (3, 2)

@@ -10,14 +10,14 @@ import pyarrow.compute
 import pytest
 
 from interactive_nav_common.statistics import estimate, p_text, welch
-from tests.train.synthetic import K_INTS, paper_like, run_rows, yardstick_rows
+from tests.train.synthetic import K_INTS, baseline_rows, paper_like, run_rows
 from train.scoring.claims import LARGE, MEDIUM, SMALL, claims
 from train.scoring.rows import BY_CATEGORY
 from train.scoring.statistics import contrast, correlation, run_means, seen_unseen
 
 
 def test_a_run_counts_once_whatever_its_episodes():
-    rows = pa.concat_tables([run_rows("fetch", "sac", 0.1, 2, 0.6, (0.8, 0.5)), yardstick_rows("fetch")])
+    rows = pa.concat_tables([run_rows("fetch", "sac", 0.1, 2, 0.6, (0.8, 0.5)), baseline_rows("fetch")])
     (train,) = run_means(rows, "train")
     assert (train.cell, train.seed, train.episodes) == (("fetch", "sac", 0.1), 2, 20)
     assert train.scores["path_efficiency"] == pytest.approx(0.6) and train.scores["success"] == pytest.approx(0.95)
