@@ -2,7 +2,8 @@
 
     python -m topological_nav data scenes_mjcf/{alder,cedar,hazel} -o runs/look positions=12 max_per_room=1 \\
       headings=3 passage_sources=1 passage_targets=3
-    python -m docs.studies.policies.transfer results/topological/full/features --data runs/look -o docs/topological-transfer.png
+    python -m docs.studies.policies.transfer results/topological/full/features --data runs/look \\
+      -o docs/topological-transfer.png
 
 Curves and scores are the run's own; the pairs of images show the domains, and need not be of its dataset.
 """
