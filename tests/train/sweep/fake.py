@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import whole_file, write_text
 from train.scoring.row_files import EvaluationAsked
 
 
@@ -57,7 +57,7 @@ def train(path: str) -> int:
             file.write(json.dumps({"env_steps": steps, "env_steps_per_s": 100.0, "pid": os.getpid()}) + "\n")
     done = steps >= total
     summary = {"completed": done, "env_steps": steps, "wall_s": 1.0}
-    (run / "summary.json").write_text(json.dumps(summary))
+    write_text(run / "summary.json", json.dumps(summary))  # whole, as runs write it: the sweep reads it meanwhile
     return 0 if done else 128 + stops[0]
 
 
