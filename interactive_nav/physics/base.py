@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.batching import one_of_batch
 from interactive_nav.config import TaskRules
+from interactive_nav.physics.batching import one_of_batch
 from interactive_nav.scenes.contacts import combine
 
 TOUCH_FORCE_N = 1e-4
