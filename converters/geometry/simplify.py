@@ -155,7 +155,7 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
     target, left = most_faces, faces
     for _ in range(RIM_ROUNDS):
         # Which corner went where is told by the replay alone, but its places are in single precision, kilometres off.
-        made, _, collapses = fast_simplification.simplify(points, whole, target_count=target, return_collapses=True)
+        made, *_, collapses = fast_simplification.simplify(points, whole, target_count=target, return_collapses=True)
         place = fast_simplification.replay_simplification(points, whole, collapses)[2]
         corners = np.asarray(place, np.int64)[faces]
         left = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
