@@ -1,5 +1,7 @@
 """The picture of drives: every step of those that are kept, coloured by how it turned."""
 
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -11,7 +13,8 @@ from topological_nav.figures.drive_figures import drives_figure
 def test_every_kept_step_is_a_line_of_its_turning(driven, painted):
     drives = load_drives(driven)
     figure = drives_figure([painted], driven)
-    plan, *_, speeds, turns, seconds = [axis for axis in figure.axes if axis.get_label() != "<colorbar>"]
+    axes: list[Any] = [axis for axis in figure.axes if axis.get_label() != "<colorbar>"]
+    plan, *_, speeds, turns, seconds = axes
     lines = next(c for c in plan.collections if isinstance(c, LineCollection))
     kept = np.flatnonzero(drives.kept)
     assert len(lines.get_segments()) == (drives.steps[kept] - 1).sum()

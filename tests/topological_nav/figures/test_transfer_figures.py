@@ -1,5 +1,7 @@
 """Pictures of what transfer did: the courses, and the bars of each stage."""
 
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -8,8 +10,12 @@ from topological_nav.figures.transfer_figures import features_figure, passages_f
 IMAGES = np.zeros((7, 8, 8, 3), np.uint8)
 
 
-def heights(axis) -> list[float]:
+def heights(axis: Any) -> list[float]:
     return [bar.get_height() for bar in axis.patches]
+
+
+def values(line: Any) -> list[float]:
+    return list(line.get_ydata())
 
 
 def test_localisation_before_and_after_stands_beside_the_source():
@@ -17,12 +23,13 @@ def test_localisation_before_and_after_stands_beside_the_source():
     means = {"before": (0.2, 0.4), "statistics": (0.3, 0.5), "after": (0.6, 0.7), "source": (0.9, 0.95)}
     results = {name: {"mean": {"node": node, "room": room}} for name, (node, room) in means.items()}
     figure = features_figure(IMAGES, IMAGES + 255, lines, results)
-    *shown, course, scores = figure.axes
-    assert [axis.images[0].get_array().max() for axis in shown] == [0] * 6 + [255] * 6  # type: ignore[union-attr]
+    shown: Any = figure.axes[:-2]
+    course, scores = figure.axes[-2:]
+    assert [axis.images[0].get_array().max() for axis in shown] == [0] * 6 + [255] * 6
     chance, loss, *_ = course.lines
-    assert chance.get_ydata()[0] == 0.5 and list(loss.get_ydata()) == [1.0, 0.9, 0.8]
+    assert values(chance)[0] == 0.5 and values(loss) == [1.0, 0.9, 0.8]
     assert heights(scores) == [0.2, 0.4, 0.3, 0.5, 0.6, 0.7]
-    assert [line.get_ydata()[0] for line in scores.lines] == [0.9, 0.95]
+    assert [values(line)[0] for line in scores.lines] == [0.9, 0.95]
     plt.close("all")
 
 
@@ -31,6 +38,6 @@ def test_the_four_configurations_of_passages_have_a_bar_each():
     accuracy = {"A": 0.5, "B": 0.7, "C": 0.6, "D": 0.8}
     results = {name: {"accuracy": value} for name, value in accuracy.items()} | {"tested_on": 40}
     *_, course, scores = passages_figure(IMAGES, IMAGES, lines, results).axes
-    assert [list(line.get_ydata()) for line in course.lines] == [[0.5, 0.6, 0.7]] * 2
+    assert [values(line) for line in course.lines] == [[0.5, 0.6, 0.7]] * 2
     assert heights(scores) == list(accuracy.values()) and "40 held-out" in scores.get_title()
     plt.close("all")
