@@ -9,7 +9,7 @@ from rich.console import Console
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.progress import stage_progress
-from scenes_mjcf.sets import PACKAGED, in_cache, packaged_set
+from scenes_mjcf.sets import PACKAGED, in_cache, is_listed, packaged_set
 
 
 def _generate(arguments: argparse.Namespace, console: Console) -> None:
@@ -54,7 +54,9 @@ def _list_scenes(arguments: argparse.Namespace, console: Console) -> None:
     for name, folder in PACKAGED.items():
         for scene, member in packaged_set(name).scenes.items():
             place = next((p for p in (folder / scene, in_cache(folder / scene)) if p.exists()), None)
-            print(f"{name:<10} {member.split:<6} {scene:<15} {place or 'not made'}")
+            other = place and place == in_cache(folder / scene) and not is_listed(place, member)
+            what = "in the cache is another scene of this name: make it again" if other else place or "not made"
+            print(f"{name:<10} {member.split:<6} {scene:<15} {what}")
 
 
 def _models(arguments: argparse.Namespace, console: Console) -> None:

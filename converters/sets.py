@@ -5,6 +5,7 @@ so that any machine that sees the folder can make it.
 """
 
 import dataclasses
+import shutil
 import sys
 import tempfile
 import time
@@ -25,6 +26,7 @@ from scenes_mjcf.sets import (
     Member,
     SceneSet,
     in_cache,
+    is_listed,
     packaged_set,
     read_set,
     scene_digest,
@@ -207,6 +209,8 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
 def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callable[[str], None]) -> list[str]:
     """Makes scenes of the package's own sets in the cache folder, unless the package has them.
 
+    What the cache has in a scene's place and is not the listed scene is replaced.
+
     Args:
         names: of scenes, of sets, or of splits of them.
         jobs: scenes side by side.
@@ -233,10 +237,14 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
         if not wanted:
             continue
         out = in_cache(folder)
+        for scene in (n for n, m in wanted.items() if (out / n).exists() and not is_listed(out / n, m)):
+            tell(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
+            shutil.rmtree(out / scene)
         failed += generate_scenes(
             Wanted(out, folder / RECIPES, None, None, None, tuple(wanted), False, jobs, "local", None), report, tell
         )
-        for scene in (n for n, m in wanted.items() if n not in failed and scene_digest(out / n) != m.digest):
-            tell(f"{scene}: not the scene that the set {name} lists")
+        for scene in (n for n, m in wanted.items() if n not in failed and not is_listed(out / n, m)):
+            own = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
+            tell(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {own}")
             failed.append(scene)
     return failed

@@ -109,11 +109,31 @@ def in_cache(path: Path) -> Path:
     return cache_folder() / path.relative_to(HERE.parent)
 
 
+def is_listed(folder: Path, member: Member) -> bool:
+    """Whether a folder holds the scene of a set's list; not where it cannot be read."""
+    try:
+        return scene_digest(folder) == member.digest
+    except SceneError:
+        return False
+
+
 def installed(path: str | Path) -> Path:
-    """A path as it is; else, where nothing is there, the package's or the cache's of the same name."""
+    """A path as it is; else, where nothing is there, the package's or the cache's of the same name.
+
+    Raises:
+        SceneError: the cache has another scene there than the package's set lists.
+    """
     found = Path(path)
     roots = () if found.exists() or found.is_absolute() else (HERE.parent, cache_folder())
-    return next((root / found for root in roots if (root / found).exists()), found)
+    place = next((root / found for root in roots if (root / found).exists()), found)
+    name = next((n for n, folder in PACKAGED.items() if place == in_cache(folder / place.name)), None)
+    member = packaged_set(name).scenes.get(place.name) if name else None
+    if member and not is_listed(place, member):
+        raise SceneError(
+            f"{place}: not the scene that the set {name} lists; make it again with 'python -m converters scenes make "
+            f"{place.name}'"
+        )
+    return place
 
 
 def _file_of(name: str) -> Path | None:
@@ -137,12 +157,15 @@ def _members(word: str) -> list[str] | None:
         root = Path(os.path.normpath(file.parent / scenes.folder))
         names = [n for n, member in scenes.scenes.items() if split in ("", member.split)]
         places = {n: root / n for n in names}
-        if root.is_relative_to(HERE):
-            places |= {n: p for n in names if not places[n].exists() and (p := in_cache(places[n])).exists()}
+        cached = {n: in_cache(p) for n, p in places.items() if not p.exists()} if root.is_relative_to(HERE) else {}
+        places |= {n: p for n, p in cached.items() if is_listed(p, scenes.scenes[n])}
         missing = [n for n in names if not (places[n] / "scene.json").is_file()]
         what = f"the set has no scene to {split} in" if not names else None
         if missing:
             what = f"{len(missing)} of {len(names)} scenes are missing (the first is '{missing[0]}')"
+            what += (
+                ", or not those that the set lists" if any(cached[n].exists() for n in missing if n in cached) else ""
+            )
         if what:
             own = next((f"scenes make {name}" for name, folder in PACKAGED.items() if folder == root), None)
             command = own or f"generate-scenes {os.path.relpath(root)}"

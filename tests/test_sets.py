@@ -184,16 +184,51 @@ def test_what_is_not_here_is_the_packages_or_the_caches(tmp_path: Path, monkeypa
     monkeypatch.chdir(tmp_path)
     assert scene_folders(["scenes_mjcf/alder"]) == (str(ROOT / "scenes_mjcf" / "alder"),)
     assert installed("scenes_mjcf/nowhere") == Path("scenes_mjcf/nowhere")
-    made = tmp_path / "cache" / "scenes_mjcf" / "furnished"
-    for number in (8, 9, 10):
-        (made / f"furnished_{number:03d}").mkdir(parents=True)
-        (made / f"furnished_{number:03d}" / "scene.json").write_text("{}")
-    if not (ROOT / "scenes_mjcf" / "furnished" / "furnished_008").exists():
-        expected = tuple(f"cache/scenes_mjcf/furnished/furnished_{n:03d}" for n in (8, 9, 10))
-        assert scene_folders(["furnished/test"]) == expected
-    assert installed("scenes_mjcf/furnished/furnished_009") == made / "furnished_009"
     (tmp_path / "scenes_mjcf" / "alder").mkdir(parents=True)
     assert installed("scenes_mjcf/alder") == Path("scenes_mjcf/alder"), "what is here comes first"
+
+
+@pytest.fixture
+def cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The cache's folder of a package whose furnished set is one scene, which is alder."""
+    home = tmp_path / "package" / "furnished"
+    digest = read_set(COMMITTED / "sparse.json").scenes["alder"].digest
+    write_set(SceneSet("furnished", {"one": Member("test", 1, digest)}), home / "set.json")
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("scenes_mjcf.sets.HERE", tmp_path / "package")
+    for module in ("scenes_mjcf.sets", "converters.sets", "converters.generating"):
+        monkeypatch.setattr(f"{module}.PACKAGED", {"furnished": home})
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "cache" / "package" / "furnished"
+
+
+def test_a_scene_in_the_cache_is_found(cached: Path) -> None:
+    shutil.copytree(ROOT / "scenes_mjcf" / "alder", cached / "one")
+    assert scene_folders(["furnished/test"]) == ("cache/package/furnished/one",)
+    assert installed("package/furnished/one") == cached / "one"
+
+
+@pytest.mark.parametrize("left", ["another", "no scene.xml", "empty"])
+def test_what_is_not_the_listed_scene_is_not_found_and_is_made_again(
+    cached: Path, left: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(ROOT / "scenes_mjcf" / ("birch" if left == "another" else "alder"), cached / "one")
+    for path in (cached / "one").iterdir() if left == "empty" else [cached / "one" / "scene.xml"] * (left[:2] == "no"):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with pytest.raises(SceneError, match="1 of 1 .*'one'.*not those that the set lists.* scenes make furnished'"):
+        scene_folders(["furnished"])
+    with pytest.raises(SceneError, match="not the scene that the set furnished lists; .* scenes make one'"):
+        installed("package/furnished/one")
+    assert main(["scenes", "list"]) == 0
+    assert "one             in the cache is another scene" in capsys.readouterr().out
+
+    def generate(wanted, report, tell):
+        shutil.copytree(ROOT / "scenes_mjcf" / "alder", wanted.out / "one")
+        return []
+
+    monkeypatch.setattr("converters.sets.generate_scenes", generate)
+    assert main(["scenes", "make", "one"]) == 0
+    assert scene_folders(["furnished"]) == ("cache/package/furnished/one",)
 
 
 def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
