@@ -92,6 +92,7 @@ def batch_of(crops: Sequence[Crop], config: SegmentConfig, rng: np.random.Genera
     return index, features, classes
 
 
+@functools.partial(jax.jit, static_argnums=(0, 4))
 def _scores_at(net: VoxelNet, params: Any, index: jax.Array, features: jax.Array, side: int) -> jax.Array:
     out = net.apply({"params": params}, dense(index, features, (side, side)))
     assert isinstance(out, jax.Array)
@@ -123,11 +124,10 @@ def make_step(net: VoxelNet, config: SegmentConfig) -> tuple[Callable[[Any], Sta
 
 def score_crops(net: VoxelNet, params: Any, crops: Sequence[Crop], config: SegmentConfig) -> dict[str, float]:
     """Class -> IoU over all voxels of the crops."""
-    scores = jax.jit(functools.partial(_scores_at, net), static_argnums=3)
     truth, found = [], []
     for first in range(0, len(crops), config.batch):
         index, features, classes = batch_of(crops[first : first + config.batch], config, None)
-        found.append(np.asarray(scores(params, index, features, config.side).argmax(axis=-1)).ravel())
+        found.append(np.asarray(_scores_at(net, params, index, features, config.side).argmax(axis=-1)).ravel())
         truth.append(classes.ravel())
     return intersection_over_union(np.concatenate(truth), np.concatenate(found)) if crops else {}
 
@@ -175,7 +175,7 @@ class _Learner:
         self.net = VoxelNet(config.widths, jnp.bfloat16 if config.half else jnp.float32)
         start, self.step = make_step(self.net, config)
         nothing = jnp.zeros((1, 8, 8, 8, FEATURES + 2))
-        params = self.net.init(jax.random.key(config.seed), nothing)["params"]
+        params = jax.jit(self.net.init)(jax.random.key(config.seed), nothing)["params"]
         self.at: dict[str, Any] = {"state": start(params), "steps": 0, "seconds": 0.0}
         self.loss: Any = float("nan")
         if (out / "checkpoint.msgpack").is_file():

@@ -113,7 +113,7 @@ def stair() -> Crop:
 def test_a_few_steps_learn_one_sample_by_heart_and_weights_keep_it(tmp_path):
     net = VoxelNet(TINY.widths)
     start, step = make_step(net, TINY)
-    state = start(net.init(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2)))["params"])
+    state = start(jax.jit(net.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2)))["params"])
     batch, losses = batch_of([stair()], TINY, None), []
     for _ in range(25):
         state, loss = step(state, 3e-3, *batch)
@@ -192,7 +192,7 @@ def test_labels_of_a_room_are_read_back(room):
 
 def test_the_command_writes_what_the_reader_takes_and_replaces_nothing(room, tmp_path, capsys):
     net = VoxelNet((8,))
-    write_weights(tmp_path / "w.npz", net, net.init(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2))))
+    write_weights(tmp_path / "w.npz", net, jax.jit(net.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2))))
     words = ["segment", str(room), "--weights", str(tmp_path / "w.npz")]
     assert main(words) == 0
     with np.load(labels_beside(room)) as file:
