@@ -44,7 +44,7 @@ class Surface:
         self._mesh = vertices, faces
         self._spacing_m = max(float(np.sqrt(2 * face_areas(vertices, faces).sum() / SPREAD)), 1e-4)
         samples, self._face = sample_faces(vertices, faces, self._spacing_m)
-        self._tree = KDTree(samples)
+        self._tree = KDTree(samples, balanced_tree=False)  # as exact, and sooner built
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """(n,) distance of points, m: to the nearest of the faces whose samples are nearest.
