@@ -34,6 +34,7 @@ _MOVERS = 2
 FAR_M = 1e6
 _PLACES = 4000
 """Of the robot, at which a window's size is measured: of all scenes together, but at least 200 in each."""
+_AT_ONCE = 100
 _SHARE = 0.999
 """Of these places a window has room for what stands near."""
 Measured = tuple[Any, Any, Any]
@@ -42,7 +43,7 @@ Measured = tuple[Any, Any, Any]
 
 @flax.struct.dataclass
 class Boxes:
-    """Bounding boxes in the world, seen from above."""
+    """Bounding boxes in the world, seen from above; leading axes may stand before these."""
 
     centre: Array
     """[M, 2] m"""
@@ -54,15 +55,15 @@ class Boxes:
     def gap_m(self, centre: Array, axes: Array, half: Array) -> Array:
         """[M] from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
         xp = namespace(self.centre, centre)
-        between = self.centre - centre[None]
-        others = xp.broadcast_to(axes[None], self.axes.shape)
-        edges = xp.concatenate([self.axes, others], -1)
-        across = xp.stack([-edges[:, 1], edges[:, 0]], 1)
-        ways = xp.concatenate([between[:, :, None], across], -1)
-        ways = ways / xp.maximum(xp.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
-        apart = xp.abs(xp.einsum("mpw,mp->mw", ways, between))
-        own = xp.einsum("mwa,ma->mw", xp.abs(xp.einsum("mpw,mpa->mwa", ways, self.axes)), self.half)
-        theirs = xp.abs(xp.einsum("mpw,pa->mwa", ways, axes)) @ half
+        between = self.centre - centre[..., None, :]
+        mine, others = xp.broadcast_arrays(self.axes, axes[..., None, :, :])
+        edges = xp.concatenate([mine, others], -1)
+        across = xp.stack([-edges[..., 1, :], edges[..., 0, :]], -2)
+        ways = xp.concatenate([between[..., None], across], -1)
+        ways = ways / xp.maximum(xp.linalg.norm(ways, axis=-2, keepdims=True), 1e-6)
+        apart = xp.abs(xp.einsum("...pw,...p->...w", ways, between))
+        own = xp.einsum("...wa,...a->...w", xp.abs(xp.einsum("...pw,...pa->...wa", ways, mine)), self.half)
+        theirs = (xp.abs(xp.einsum("...pw,...pa->...wa", ways, others)) * half[..., None, None, :]).sum(-1)
         return (apart - own - theirs).max(-1)
 
 
@@ -80,27 +81,28 @@ class Nearness:
         self._offset_m, self._half_m, self._frame, self._anchor_m, self._sense, *self._walls = tables
 
     def boxes(self, scene: Array, state: PhysicsState) -> Boxes:
-        """Of all slots of one environment."""
+        """Of all slots of one environment, or, in NumPy, of many of one scene."""
         xp = namespace(state.qpos)
         sense, frame, anchor, offset, half = (
             xp.asarray(t)[scene] for t in (self._sense, self._frame, self._anchor_m, self._offset_m, self._half_m)
         )
-        qpos = state.qpos[self._qpos]
-        angle = qpos[:, 0] * sense
+        qpos = state.qpos[..., self._qpos]
+        angle = qpos[..., 0] * sense
         turn = matrix_from_quat(xp.stack([xp.cos(angle / 2), 0 * angle, 0 * angle, xp.sin(angle / 2)], -1))
-        hung = anchor + xp.einsum("mij,mj->mi", turn, offset)
-        free = matrix_from_quat(qpos[:, 3:] / xp.maximum(xp.linalg.norm(qpos[:, 3:], axis=-1, keepdims=True), 1e-6))
-        placed = qpos[:, :3] + xp.einsum("mij,mj->mi", free, offset)
+        hung = anchor + xp.einsum("...mij,mj->...mi", turn, offset)
+        quat = qpos[..., 3:]
+        free = matrix_from_quat(quat / xp.maximum(xp.linalg.norm(quat, axis=-1, keepdims=True), 1e-6))
+        placed = qpos[..., :3] + xp.einsum("...mij,mj->...mi", free, offset)
         hinge = xp.asarray(self.hinge)
         axes = xp.where(hinge[:, None, None], turn @ frame, free)
         centre = xp.where(hinge[:, None], hung, placed)
-        return Boxes(centre[:, :2], axes[:, :2], half)
+        return Boxes(centre[..., :2], axes[..., :2, :], half)
 
     def walls_m(self, scene: Array, state: PhysicsState) -> Array:
         """[W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
         xp = namespace(state.qpos)
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
-        offset = xp.einsum("wi,wij->wj", state.qpos[self._robot][None] - xpos, xmat)
+        offset = xp.einsum("...wi,wij->...wj", state.qpos[..., None, self._robot] - xpos, xmat)
         outside = xp.maximum(xp.abs(offset) - half, 0.0)
         return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
 
@@ -118,12 +120,13 @@ class Nearness:
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
         walls = Boxes(xpos, xp.pad(xmat, ((0, 0), (0, 0), (0, 1))), xp.pad(half, ((0, 0), (0, 1))))
         nearest = xp.argsort(push_m)
-        for k in range(min(_PUSHED, len(push_m))):
-            one = nearest[k]
-            if xp is np and push_m[one] >= 0:
+        for k in range(min(_PUSHED, push_m.shape[-1])):
+            one = nearest[..., k]
+            at = (np.arange(len(one)), one) if one.ndim else one
+            if xp is np and (push_m[at] >= 0).all():
                 break
-            behind = walls.gap_m(boxes.centre[one], boxes.axes[one], boxes.half[one]) - TOUCH_M
-            gap = xp.where((push_m[one] < 0) & (used > 0), xp.minimum(gap, behind), gap)
+            behind = walls.gap_m(boxes.centre[at], boxes.axes[at], boxes.half[one]) - TOUCH_M
+            gap = xp.where((push_m[at] < 0)[..., None] & (used > 0), xp.minimum(gap, behind), gap)
         return gap
 
     def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> Measured:
@@ -153,27 +156,24 @@ class Nearness:
 
         Small objects lie anywhere, too.
         """
-        world, rng = self.world, np.random.default_rng(0)
-        kinds = np.asarray(world.layout.slot_kind)
-        small = np.flatnonzero(kinds == "small")
-        counts: dict[str, list[int]] = {kind: [] for kind in ("small", "free", "hinge", "walls")}
+        world, rng, kinds = self.world, np.random.default_rng(0), np.asarray(self.world.layout.slot_kind)
+        small, most = np.flatnonzero(kinds == "small"), max(200, _PLACES // len(self.world.scenes))
+        counts: dict[str, list[np.ndarray]] = {kind: [] for kind in ("small", "free", "hinge", "walls")}
         for scene, (source, rest) in enumerate(zip(world.scenes, world.rest_qpos, strict=True)):
-            maps, qpos = source.maps, np.array(rest, np.float32)
-            cells = np.argwhere(maps.traversable)[:, ::-1]
-            state = PhysicsState(qpos, np.zeros(0), np.zeros(0))
-            for _ in range(max(200, _PLACES // len(world.scenes))):
-                places = cells[rng.integers(len(cells), size=1 + len(small))] + rng.random((1 + len(small), 2))
-                places = np.asarray(maps.origin_w) + maps.resolution_m * places
-                qpos[self._robot] = places[0]
-                qpos[self._qpos[small, :2]] = places[1:]
+            maps, cells, shape = source.maps, np.argwhere(source.maps.traversable)[:, ::-1], (1 + len(small), 2)
+            for first in range(0, most, _AT_ONCE):
+                many = range(first, min(first + _AT_ONCE, most))
+                drawn = [cells[rng.integers(len(cells), size=shape[0])] + rng.random(shape) for _ in many]
+                places = (np.asarray(maps.origin_w) + maps.resolution_m * np.stack(drawn)).astype(np.float32)
+                qpos = np.tile(np.asarray(rest, np.float32), (len(places), 1))
+                qpos[:, self._robot], qpos[:, self._qpos[small, :2]] = places[:, 0], places[:, 1:]
+                state = PhysicsState(qpos, np.zeros(0), np.zeros(0))
                 boxes = self.boxes(scene, state)
-                gap = np.where(world.occupied[scene], boxes.gap_m(qpos[self._robot], np.eye(2, 3), np.zeros(3)), FAR_M)
-                near = gap < reach_m
-                walls = self._walls_gap_m(scene, state, reach_m, boxes, gap - reach_m + (REACH_M - _PUSH_M))
-                for kind in ("small", "free", "hinge"):
-                    counts[kind].append(int(near[kinds == kind].sum()))
-                counts["walls"].append(int((walls < 0).sum()))
-        return {kind: np.asarray(values) for kind, values in counts.items()}
+                gap = np.where(world.occupied[scene], boxes.gap_m(places[:, 0], np.eye(2, 3), np.zeros(3)), FAR_M)
+                walls = self._walls_gap_m(scene, state, reach_m, boxes, gap - reach_m + (REACH_M - _PUSH_M)) < 0
+                for kind, own in counts.items():
+                    own.append((walls if kind == "walls" else (gap < reach_m)[:, kinds == kind]).sum(-1))
+        return {kind: np.concatenate(values) for kind, values in counts.items()}
 
 
 def widths_at(counts: Mapping[str, np.ndarray], share: float = _SHARE) -> dict[str, int]:
