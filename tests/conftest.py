@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import collections
+import gc
 import os
 import shutil
 import tempfile
@@ -38,6 +39,9 @@ from hypothesis import settings
 import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
 from tests.changed import changed_files, chosen
 from tests.toys import write_room
+
+# Tracing makes objects by the million, and next to none of them is garbage: looking for it took a tenth of the time.
+gc.set_threshold(100_000, 5, 5)
 
 # The same examples in every run, so that a red run shows what was changed; `HYPOTHESIS_PROFILE=explore` draws new ones.
 settings.register_profile("same", derandomize=True)

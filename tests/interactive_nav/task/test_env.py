@@ -28,12 +28,23 @@ def programs(env):
 
 @pytest.fixture(scope="module")
 def batched(env):
-    auto = AutoResetEnv(env)
-    return jax.jit(auto.reset), jax.jit(auto.step)
+    """Reset and step of a batch that resets itself, and a list that grows with each time the step is traced."""
+    auto, traces = AutoResetEnv(env), []
+
+    def step(state, action):
+        traces.append(1)
+        return auto.step(state, action)
+
+    return jax.jit(auto.reset), jax.jit(step), traces
 
 
 def keys(seed, n=N):
     return jax.random.split(jax.random.PRNGKey(seed), n)
+
+
+def drawn(reset, seed, n):
+    """States of at least n episodes, N at a time: [batches, N, ...]."""
+    return jax.tree.map(lambda *x: np.stack(x), *(reset(k) for k in keys(seed, n).reshape(-1, N, 2)))
 
 
 def drive(obs):
@@ -81,10 +92,10 @@ def test_observation_holds_goal_waypoints_and_velocity_in_the_robot_frame(env, p
     np.testing.assert_allclose(obs[free, 24:29], 0, atol=0.1)
 
 
-def test_waypoints_are_equally_spaced_and_end_at_the_goal(env):
-    state = jax.jit(jax.vmap(env.reset))(keys(2, 40))
+def test_waypoints_are_equally_spaced_and_end_at_the_goal(programs):
+    state = jax.tree.map(np.concatenate, drawn(programs[0], 2, 42))
     nav = state.info["nav"]
-    points = np.concatenate([np.zeros((40, 1, 2)), np.asarray(nav.waypoints_b)], 1)
+    points = np.concatenate([np.zeros((42, 1, 2)), np.asarray(nav.waypoints_b)], 1)
     steps = np.linalg.norm(np.diff(points, axis=1), axis=-1)
     assert steps.max() <= 0.2 + 1e-3  # chords of arcs of 0.2 m
     near = np.asarray(nav.geodesic_m) < 1.7
@@ -107,8 +118,9 @@ def test_same_key_same_trajectory(programs):
 
 
 def test_starts_and_goals_keep_their_distance_and_nothing_touches_at_the_start(env, programs):
-    state = jax.jit(jax.vmap(env.reset))(keys(4, 64))
-    nav = state.info["nav"]
+    reset, step = programs
+    batches = drawn(reset, 4, 66)
+    nav = jax.tree.map(np.concatenate, batches).info["nav"]
     apart = np.linalg.norm(np.asarray(nav.goal_xy_w - nav.start_xy_w), axis=-1)
     assert apart.min() >= 1.0 - 1e-5
     assert np.asarray(nav.objects_dropped).sum() == 0
@@ -119,8 +131,9 @@ def test_starts_and_goals_keep_their_distance_and_nothing_touches_at_the_start(e
     assert {0, 1} == set(np.asarray(nav.scene_index).tolist())
     # Standing still for a step touches nothing.
     still = (0 + 12.5) / 18.75 - 1
-    after = jax.jit(jax.vmap(env.step))(state, jnp.full((64, 2), still))
-    assert float(after.info["nav"].force_sum_n.max()) == 0.0
+    for i in range(11):
+        after = step(jax.tree.map(lambda x, i=i: x[i], batches), jnp.full((N, 2), still))
+        assert float(after.info["nav"].force_sum_n.max()) == 0.0
 
 
 def test_following_the_path_succeeds_and_the_reward_adds_up(programs):
@@ -212,7 +225,7 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
 
 
 def test_auto_reset_draws_a_new_episode_and_nothing_leaks(batched):
-    reset, step = batched
+    reset, step, _ = batched
     state = reset(keys(8))
     seen = [set() for _ in range(N)]
     for _ in range(90):
@@ -233,7 +246,7 @@ def test_auto_reset_draws_a_new_episode_and_nothing_leaks(batched):
 
 
 def test_a_broken_world_ends_its_own_episode_only(batched):
-    reset, step = batched
+    reset, step, _ = batched
     state = reset(keys(9))
     qpos = state.pipeline_state.qpos.at[2, 0].set(jnp.nan)
     state = state.replace(pipeline_state=state.pipeline_state.replace(qpos=qpos))
@@ -267,16 +280,9 @@ def test_single_environment_and_nested_vmap_equal_the_batch(env, programs):
     np.testing.assert_allclose(got.obs.reshape(N, -1), want.obs, atol=1e-5)
 
 
-def test_the_loop_is_traced_once(env):
-    traces = []
-    auto = AutoResetEnv(env)
-
-    @jax.jit
-    def step(state, action):
-        traces.append(1)
-        return auto.step(state, action)
-
-    state = jax.jit(auto.reset)(keys(12))
+def test_the_loop_is_traced_once(batched):
+    reset, step, traces = batched
+    state = reset(keys(12))
     for _ in range(3):
         state = step(state, jnp.zeros((N, 2)))
     assert len(traces) == 1

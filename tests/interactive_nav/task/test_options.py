@@ -316,7 +316,7 @@ def test_unchecked_goals_may_lie_under_furniture_and_objects_may_face_alike(push
     goals = np.asarray(free.tables.goal_xy_w[0])[: int(free.tables.num_goals[0])]
     assert (np.abs(goals) < 0.15).all(1).any()  # the block covers |x|, |y| < 0.2 m
     env = interactive_nav.make("turtlebot", [pushed], backend="native", num_objects=3, random_object_yaw=False)
-    draws = jax.vmap(env.draw_start)(jax.random.split(jax.random.PRNGKey(1), 20))
+    draws = jax.jit(jax.vmap(env.draw_start))(jax.random.split(jax.random.PRNGKey(1), 20))
     assert (np.asarray(draws.small_yaw_rad) == 0).all() and np.asarray(draws.start_yaw_rad).std() > 0.5
 
 

@@ -31,18 +31,37 @@ def keys(seed, n=N):
     return jax.random.split(jax.random.PRNGKey(seed), n)
 
 
-def played(env, steps, seed=0):
-    """The states of `steps` steps straight ahead."""
-    step, states = jax.jit(env.step), [jax.jit(env.reset)(keys(seed))]
+def played(env, steps, first=None):
+    """The states of `steps` steps straight ahead from `first`; None: from the environment's own reset.
+
+    How an episode is scored and paid is in no reset: what differs in that alone begins with the same state."""
+    step, states = jax.jit(env.step), [jax.jit(env.reset)(keys(0)) if first is None else first]
     for _ in range(steps):
         states.append(step(states[-1], AHEAD))
     return states
 
 
+@pytest.fixture(scope="module")
+def batch(env):
+    """A batch that goes on after its end: the state of its reset."""
+    return jax.jit(_Batch(env).reset)(keys(0))
+
+
+@pytest.fixture(scope="module")
+def auto(env):
+    """The states of four steps of a batch that resets itself."""
+    return played(AutoResetEnv(env), 4)
+
+
+@pytest.fixture(scope="module")
+def brax_first(env):
+    return jax.jit(training.wrap(env, episode_length=LIMIT).reset)(keys(0))
+
+
 @pytest.mark.parametrize("limit", [LIMIT, 4])
-def test_brax_own_wrappers_begin_again_after_each_time_limit(env, limit):
+def test_brax_own_wrappers_begin_again_after_each_time_limit(env, brax_first, limit):
     # Whichever limit comes first ends an episode: the environment's (6) or the wrapper's (4).
-    states = played(training.wrap(env, episode_length=limit), 2 * limit + 1)
+    states = played(training.wrap(env, episode_length=limit), 2 * limit + 1, brax_first)
     ends = np.stack([np.asarray(s.done) for s in states[1:]])
     want = (np.arange(1, 2 * limit + 2) % limit == 0).astype(float)
     np.testing.assert_array_equal(ends, np.repeat(want[:, None], N, 1))
@@ -56,12 +75,12 @@ def test_brax_own_wrappers_begin_again_after_each_time_limit(env, limit):
     assert (np.asarray(states[limit - 1].info["nav"].robot_path_m) > 0.02).all()
 
 
-def test_success_is_paid_once_and_the_end_stays(room):
+def test_success_is_paid_once_and_the_end_stays(room, batch, auto):
     # With a goal region as large as the room, the first step succeeds.
     env = interactive_nav.make(
         "turtlebot", [room], backend="native", num_objects=1, episode_steps=LIMIT, success_distance_m=20.0
     )
-    states = played(_Batch(env), LIMIT + 2)
+    states = played(_Batch(env), LIMIT + 2, batch)
     paid = np.stack([np.asarray(s.reward) for s in states[1:]])
     assert (paid[0] > 9.0).all() and (paid[1:] == 0).all()
     for state in states[1:]:
@@ -69,14 +88,14 @@ def test_success_is_paid_once_and_the_end_stays(room):
         assert (np.asarray(state.metrics["success"]) == 1).all()
         assert (np.asarray(state.metrics["episode_steps"]) == 1).all()
     # A batch that resets itself begins anew, and is paid anew.
-    again = played(AutoResetEnv(env), 3)
+    again = played(AutoResetEnv(env), 3, auto[0])
     assert all((np.asarray(s.reward) > 9.0).all() and (np.asarray(s.done) == 1).all() for s in again[1:])
 
 
-def test_what_a_backend_does_not_tell_is_nan_at_the_end(env, monkeypatch):
+def test_what_a_backend_does_not_tell_is_nan_at_the_end(env, batch, monkeypatch):
     assert not JaxPhysics.tells_convergence
     monkeypatch.setattr(env.physics, "tells_convergence", False)
-    states = played(_Batch(env), LIMIT)
+    states = played(_Batch(env), LIMIT, batch)
     assert [np.isnan(s.metrics["unconverged_steps"]).all() for s in states] == [False] * LIMIT + [True]
 
 
@@ -85,8 +104,8 @@ class _Batch(Wrapper):
     step = functools.partialmethod(lambda self, *args: jax.vmap(self.env.step)(*args))  # type: ignore[assignment]
 
 
-def test_an_action_can_be_held_for_several_steps(env):
-    once, twice = played(AutoResetEnv(env), 4), played(wrap_for_brax_training(env, 1000, action_repeat=2), 2)
+def test_an_action_can_be_held_for_several_steps(env, auto):
+    once, twice = auto, played(wrap_for_brax_training(env, 1000, action_repeat=2), 2, auto[0])
     for k in (1, 2):
         np.testing.assert_allclose(twice[k].obs, once[2 * k].obs, atol=1e-5)
         np.testing.assert_allclose(twice[k].reward, once[2 * k].reward + once[2 * k - 1].reward, atol=1e-5)
@@ -110,12 +129,12 @@ class Asked(Thousandfold):
         return state.replace(reward=1000 * state.reward)
 
 
-def test_wrappers_that_would_be_passed_over_are_refused(env):
+def test_wrappers_that_would_be_passed_over_are_refused(env, auto):
     with pytest.raises(ConfigError, match="Thousandfold overrides `step`, .* expected `advance`"):
         AutoResetEnv(Wrapper(Thousandfold(env)))
     with pytest.raises(ConfigError, match="FirstOnly overrides `reset`, .* expected `draw`"):
         wrap_for_brax_training(FirstOnly(env))
-    plain, asked = (played(AutoResetEnv(e), 1)[1] for e in (env, Asked(env)))
+    plain, asked = auto[1], played(AutoResetEnv(Asked(env)), 1, auto[0])[1]
     np.testing.assert_allclose(asked.reward, 1000 * plain.reward, rtol=1e-5)
     assert float(jnp.abs(plain.reward).min()) > 0
     with pytest.raises(
