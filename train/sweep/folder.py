@@ -18,7 +18,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from interactive_nav.episodes import load_all
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_partial, write_text
 from interactive_nav_common.locks import is_locked
@@ -110,8 +109,7 @@ class SweepFolder:
             state = "failed"
         else:
             state = "stopped" if steps else "waiting"
-        reason = "" if state == "done" else failed
-        return RunState(run.name, state, steps, max(total, steps), metrics, reason, over)
+        return RunState(run.name, state, steps, max(total, steps), metrics, "" if state == "done" else failed, over)
 
     def _failure(self, run: str) -> str:
         """Why a run was given up; empty where it was not. Read once: another sweep may try the run again meanwhile."""
@@ -139,15 +137,12 @@ class SweepFolder:
 
     def episode_files(self, run: RunSpec) -> tuple[str, ...]:
         """Files of the fixed episodes that a run is to play."""
-        files = self.sweep.config.evaluate.episode_files
-        return tuple(file.replace("{robot}", run.config.env.robot) for file in files)
+        return tuple(f.replace("{robot}", run.config.env.robot) for f in self.sweep.config.evaluate.episode_files)
 
     def evaluated(self, run: RunSpec) -> bool:
         """Rows are there, as wanted, of the run as far as it is trained."""
         path = self.rows / self.asked(run).file_name(run.name)
-        if not path.is_file():
-            return False
-        steps = read_notes(path).get("trained_steps")
+        steps = read_notes(path).get("trained_steps") if path.is_file() else None
         return steps == json.dumps(RunFolder(self.runs / run.name).origin()["env_steps"])
 
     def drop_old_rows(self, run: RunSpec) -> None:
@@ -169,7 +164,11 @@ class SweepFolder:
         (self.root / "failed" / f"{run}.json").unlink(missing_ok=True)
 
 
-_read = functools.cache(load_all)
+@functools.cache
+def _read(files: tuple[str, ...]) -> tuple[Any, str]:
+    from interactive_nav.episodes import load_all  # Brax and MJX: seconds, which a sweep of drawn episodes saves
+
+    return load_all(files)
 
 
 def _tail(path: Path) -> list[str]:
