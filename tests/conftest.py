@@ -81,8 +81,10 @@ def quick_compilation(request: pytest.FixtureRequest) -> Iterator[None]:
 
     quick = "topological_nav" not in request.path.parts
     jax.config.update("jax_disable_most_optimizations", quick)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # for programs that a test starts
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+    del os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"]
 
 
 @pytest.fixture(scope="session")

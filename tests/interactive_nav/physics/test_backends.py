@@ -25,7 +25,7 @@ from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None
-STEPS, PUSH_STEPS = 20, 40
+STEPS, PUSH_STEPS = 20, 30
 STEADY = slice(15, PUSH_STEPS)
 """Control steps in which the last scenario's robot pushes at constant speed."""
 BLOCK_KG, BLOCK_FRICTION = 1.0, 0.2
