@@ -30,7 +30,7 @@ def test_the_follower_reaches_its_goal(name, room):
         max_goal_distance_m=2.3,
     )
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
-    follow = jax.vmap(make_follower(env))
+    follow = jax.jit(jax.vmap(make_follower(env)))
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
     state = reset(keys)
     apart = np.linalg.norm(np.asarray(state.info["nav"].goal_xy_w - state.info["nav"].robot_pos_w[:, :2]), axis=1)

@@ -42,10 +42,10 @@ def starts() -> EpisodeStart:
 
 @pytest.fixture(scope="module")
 def played(env):
-    out = {}
+    out, player = {}, BatchPlayer(env)
     for name in ("avoider", "namo:0", "namo:0.9"):
         planner = make_baseline(name, env)
-        out[name] = (planner, BatchPlayer(env).play(planner, episode_keys(0, 2), 2, starts=starts()))
+        out[name] = (planner, player.play(planner, episode_keys(0, 2), 2, starts=starts()))
     return out
 
 
