@@ -52,7 +52,8 @@ def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
     window = Window(world, NavConfig.of(num_objects=2, **ALL))
     assert sum(group.width for group in window.groups) == world.layout.num_slots
     chosen, walls, missed = _select(window)(jnp.asarray(scene), _state(world, scene))
-    fields, model, inner, outer = window.fields(jnp.asarray(scene), chosen, walls), world.models[scene], window, world
+    fields = jax.jit(window.fields)(jnp.asarray(scene), chosen, walls)
+    model, inner, outer = world.models[scene], window, world
     assert int(missed) == 0 and set(fields) == set(FIELDS)
     for a, b in zip(inner.layout.slot_body, outer.layout.slot_body, strict=True):
         for name in ("body_mass", "body_inertia", "body_ipos", "body_invweight0", "body_subtreemass"):
@@ -119,10 +120,10 @@ def test_enter_and_leave_are_inverse(world):
     key = jax.random.PRNGKey(0)
     state = state.replace(qpos=state.qpos + 0.01 * jax.random.normal(key, state.qpos.shape))
     chosen, _, _ = _select(window)(jnp.asarray(0), state)
-    inner = window.enter(state, chosen)
-    back = window.leave(state, inner, chosen)
+    inner, leave = jax.jit(window.enter)(state, chosen), jax.jit(window.leave)
+    back = leave(state, inner, chosen)
     np.testing.assert_array_equal(back.qpos, state.qpos)
-    moved = window.leave(state, inner.replace(qpos=inner.qpos + 1.0), chosen)
+    moved = leave(state, inner.replace(qpos=inner.qpos + 1.0), chosen)
     changed = np.asarray(moved.qpos != state.qpos)
     left_out = [s for i, g in enumerate(window.groups) for s in np.delete(g.slots, np.asarray(chosen[i]))]
     assert len(left_out) == 2
