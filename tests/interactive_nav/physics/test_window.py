@@ -205,9 +205,11 @@ def test_walls_left_out_behind_what_may_be_pushed_are_told(narrow):
     one, two = (Window(narrow, NavConfig.of(num_objects=0, active_walls=n)) for n in (1, 2))
     beside = _state(narrow, 0, (0.6, 0.4))  # 0.4 m from a side wall, 1.9 m from the wall behind the sofa
     far = _state(narrow, 0, (-0.5, 0.4))  # out of the sofa's reach
-    left = {n: [int(_select(w)(0, s)[2]) for s in (beside, far)] for n, w in ((1, one), (2, two))}
+    selects = {1: _select(one), 2: _select(two)}
+    left = {n: [int(select(0, s)[2]) for s in (beside, far)] for n, select in selects.items()}
     assert left == {1: [1, 0], 2: [0, 0]}
-    counts = [int(one.needs(one.measure(jnp.asarray(0), s))["walls"]) for s in (beside, far)]
+    needs = jax.jit(lambda state: one.needs(one.measure(jnp.asarray(0), state)))
+    counts = [int(needs(s)["walls"]) for s in (beside, far)]
     assert counts == [2, 1]
 
 
