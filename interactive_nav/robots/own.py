@@ -21,6 +21,8 @@ from interactive_nav_common.errors import ConfigError
 _GEOM = mujoco.mjtGeom
 _SPHERE_WIDTH = 0.25
 """Half width of a wheel that the file gives as a sphere or capsule, over its radius."""
+_LARGEST_WHEEL_M = 2.0
+"""Radius above which a file is taken to be in other units than metres."""
 
 
 def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mapping[str, int]) -> Facts:
@@ -74,10 +76,16 @@ def _outline(robot: RobotSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
 
 def _sides(left_wheels: tuple[str, ...], right_wheels: tuple[str, ...]) -> dict[str, int]:
     """Wheel joint -> -1 on the left, 1 on the right."""
+    for side, names in (("left_wheels", left_wheels), ("right_wheels", right_wheels)):
+        if isinstance(names, str):
+            raise ConfigError(f"{side} is the text '{names}', expected a tuple: ('{names}',)")
     if not left_wheels or len(left_wheels) != len(right_wheels):
         raise ConfigError(
             f"left_wheels has {len(left_wheels)} and right_wheels {len(right_wheels)} joints, expected as many on both"
         )
+    for joint in left_wheels:
+        if joint in right_wheels:
+            raise ConfigError(f"wheel joint '{joint}' is on both sides, expected it in left_wheels or in right_wheels")
     return dict.fromkeys(left_wheels, -1) | dict.fromkeys(right_wheels, 1)
 
 
@@ -103,6 +111,17 @@ def _base(
     radii = [w.radius_m for w in facts.wheels]
     if max(radii) - min(radii) > 1e-3:
         raise ConfigError(f"robot file {path}: its driven wheels differ in radius, expected one radius")
+    if radii[0] > _LARGEST_WHEEL_M:
+        raise ConfigError(
+            f"robot file {path}: its wheels have a radius of {radii[0]:g} m, expected at most {_LARGEST_WHEEL_M:g}; "
+            "is the file in millimetres? Give lengths in metres"
+        )
+    left, right = (float(np.mean([w.pos_m[1] for w in facts.wheels if w.side == side])) for side in (-1, 1))
+    if left <= right:
+        raise ConfigError(
+            f"robot file {path}: the left wheels lie at y = {left:.3g} m, the right ones at {right:.3g} m, expected "
+            "the left ones at the larger y (x forward, y left); swap left_wheels and right_wheels, or turn the robot"
+        )
     if track_m is None:
         across = float(np.ptp([w.pos_m[1] for w in facts.wheels]))
         along = float(np.ptp([w.pos_m[0] for w in facts.wheels]))
@@ -216,6 +235,8 @@ def from_file(
     Raises:
         ConfigError: a file that cannot be used; the message says what to change.
     """
+    if not 0 < max_wheel_speed_rad_s < np.inf:
+        raise ConfigError(f"max_wheel_speed_rad_s is {max_wheel_speed_rad_s}, expected a number above 0, in rad/s")
     sides = _sides(left_wheels, right_wheels)
     driven, limits, path = dict(joints or {}), dict(torque_limits or {}), Path(path).resolve()
     child = read_file(path)

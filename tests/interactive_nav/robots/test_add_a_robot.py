@@ -159,6 +159,16 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
         (URDF.replace('rpy="1.5708 0 0"/><axis', 'rpy="0 0 0"/><axis'), {}, "expected its y axis"),
         (URDF.replace('cylinder radius="0.07" length="0.04"', 'box size="0.1 0.1 0.04"'), {}, "no round one"),
         (URDF.replace('sphere radius="0.03"', 'box size="0.1 0.1 0.04"'), {}, "caster 'front_caster' is no sphere"),
+        (URDF, {"left_wheels": "left_wheel_joint"}, r"left_wheels is the text 'left_wheel_joint', expected a tuple"),
+        (URDF, {"right_wheels": ("left_wheel_joint",)}, "'left_wheel_joint' is on both sides"),
+        (
+            URDF,
+            {"left_wheels": ("right_wheel_joint",), "right_wheels": ("left_wheel_joint",)},
+            r"left wheels lie at y = -0.18 m, the right ones at 0.18 m, .* swap",
+        ),
+        (URDF.replace('radius="0.07" length="0.04"', 'radius="70" length="40"'), {}, "radius of 70 m, .* millimetres"),
+        (URDF, {"max_wheel_speed_rad_s": 0.0}, "max_wheel_speed_rad_s is 0.0, expected a number above 0"),
+        (URDF, {"max_wheel_speed_rad_s": float("nan")}, "max_wheel_speed_rad_s is nan, expected a number above 0"),
         ("<robot name='x'><link", {}, "MuJoCo cannot read it"),
     ],
 )
