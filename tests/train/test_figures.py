@@ -332,3 +332,9 @@ def test_effort_without_walls_leaves_their_episodes_out():
     assert len(lines) == 2 and all(line.endswith("| holds |") and "P_eff" not in line for line in lines)
     assert tables.effort_lines(free, "test") == ""  # rows that do not tell
     assert "## Effort without walls" in tables.document(rows, "test")
+
+
+def test_a_scene_in_place_of_a_run_is_refused(tmp_path, capsys):
+    np.savez(tmp_path / "maps.npz", height=np.zeros((2, 2)))  # an archive, but no recorded paths
+    assert figures.main([str(tmp_path), "-o", str(tmp_path / "figures")]) == 2
+    assert "nothing to draw" in capsys.readouterr().err

@@ -173,9 +173,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             )
         print(document(found.rows, chosen_split(found.rows, split)), end="")
         return 0
+    drawn = False
     for name, draw in figures_of(Path(arguments.results), split):
         path = Path(arguments.out) / f"{name}.{arguments.format}"
         with style.plt.rc_context(style.RC):
             style.save(draw(), path, arguments.format)
         print(path)
+        drawn = True
+    if not drawn:
+        raise FileError(f"{arguments.results}: nothing to draw (no rows and no recorded paths); expected a run folder")
     return 0

@@ -143,6 +143,10 @@ class BroughtPolicy(HostPolicy):
         count = len(next(iter(self._seen.values())))
         seen = {name: value.copy() for name, value in self._seen.items()}  # it may keep them, or write into them
         got = self._call("policy", self._act, seen, np.full(count, step == 0))
+        if got is None:
+            raise self._error(
+                f"returned None at step {step}, expected actions {(count, self._size)}; is there a return?"
+            )
         actions = self._call("policy's actions", _on_host, got)
         if actions.shape != (count, self._size):
             raise self._error(f"actions have shape {actions.shape}, expected {(count, self._size)}")

@@ -62,6 +62,9 @@ def not_callable(env):
 def wrong_shape(env):
     return lambda obs, first: np.zeros((len(first), 3))
 
+def no_return(env):
+    return lambda obs, first: None
+
 def no_numbers(env):
     return lambda obs, first: [["left", "right"]] * len(first)
 
@@ -250,9 +253,10 @@ def test_rows_of_a_command(module, tmp_path):
         (["m=my_policy:broken"], "policy m: factory: raised RuntimeError: no weights here at my_policy.py:32"),
         (["m=my_policy:not_callable"], "policy m: its factory returned type int, expected a callable"),
         (["m=my_policy:wrong_shape"], "policy m: actions have shape (2, 3), expected (2, 2)"),
+        (["m=my_policy:no_return"], "policy m: returned None at step 0, expected actions (2, 2); is there a return?"),
         (["m=my_policy:no_numbers"], "policy m: policy's actions: raised ValueError: could not convert string"),
         (["m=my_policy:not_finite"], "policy m: actions of episode 1 at step 1 are [inf  0.], expected finite numbers"),
-        (["m=my_policy:raises"], "policy m: policy: raised KeyError: 'stat' at my_policy.py:52"),
+        (["m=my_policy:raises"], "policy m: policy: raised KeyError: 'stat' at my_policy.py:55"),
         (["m=my_policy:raises", "m=my_policy:broken"], "--policy: name 'm' is taken, expected one of its own"),
     ],
 )
