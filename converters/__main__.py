@@ -27,7 +27,8 @@ from converters.tables import alignment_table, bounds, gate_table, proposal_tabl
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
-from interactive_nav_common.words import Command, Commands, add_words, read_commands
+from interactive_nav_common.signals import heard, interrupts_heard
+from interactive_nav_common.words import Command, Commands, Parser, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES
 from scenes_mjcf.sets import installed
 
@@ -229,7 +230,7 @@ def _add(commands: Commands, name: str, row: Command, run: Any) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
+    parser = Parser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, row in read_commands(Path(__file__).with_name("words.yaml")).items():
         _add(commands, name, row, RUNS[name])
@@ -270,10 +271,11 @@ def _standing(arguments: argparse.Namespace) -> dict[str, int]:
     return found
 
 
+@interrupts_heard()
 def main(argv: list[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
     arguments = _parse(argv)
-    signal.signal(signal.SIGTERM, _on_sigterm)
+    signal.signal(signal.SIGTERM, heard(_on_sigterm))
     console = Console()
     before = _standing(arguments)
 

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import functools
+import shlex
 
 from rich.console import Console
 
@@ -22,7 +23,7 @@ def _generate(arguments: argparse.Namespace, console: Console) -> None:
         generate_building(arguments.out, arguments.seed, report, config)
     console.print(
         f"{arguments.out}: building of seed {arguments.seed}; convert it with "
-        f"'python -m converters convert {arguments.out} SCENE_DIR'",
+        f"'python -m converters convert {shlex.quote(str(arguments.out))} SCENE_DIR'",
         soft_wrap=True,
     )
 

@@ -7,7 +7,6 @@ the same episodes on every machine and backend; with other scenes, another robot
 Files made before that digest was there name the digest of scene.xml and maps.npz, and are held to that.
 """
 
-import argparse
 import dataclasses
 import functools
 import gzip
@@ -33,7 +32,7 @@ from interactive_nav_common.config import Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import Reader
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import Parser, add_words, read_commands
 
 FORMAT = "interactive-nav-episodes"
 VERSION = 1
@@ -292,7 +291,7 @@ def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
 @reports_errors("interactive_nav.episodes")
 def main(argv: Sequence[str] | None = None) -> int:
     """Makes a file; 0 when done, 2 on a user's error."""
-    parser = argparse.ArgumentParser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
+    parser = Parser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
     commands = parser.add_subparsers(dest="command", required=True)
     row = read_commands(Path(__file__).with_name("words.yaml"))["episodes"]
     make_parser = commands.add_parser("make", help=row.help)

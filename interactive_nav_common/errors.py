@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ParamSpec
 
+from interactive_nav_common.signals import interrupts_heard
+
 Arguments = ParamSpec("Arguments")
 
 
@@ -41,6 +43,7 @@ def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "
         raise
     except Exception as error:  # noqa: BLE001
         told = " ".join(f"{type(error).__name__}: {error}".replace(str(path), Path(path).name).split())[:300]
+        told = "it is empty" if Path(path).is_file() and not Path(path).stat().st_size else told
         raise kind(f"{path}: not readable{what} ({told}); {remedy}") from error
 
 
@@ -51,7 +54,8 @@ def reports_errors(program: str) -> Callable[[Callable[Arguments, int]], Callabl
         @functools.wraps(main)
         def reported(*arguments: Arguments.args, **keywords: Arguments.kwargs) -> int:
             try:
-                return main(*arguments, **keywords)
+                with interrupts_heard():
+                    return main(*arguments, **keywords)
             except UserError as error:
                 print(f"{program}: {error}", file=sys.stderr)
                 return 2

@@ -1,13 +1,51 @@
-"""SIGINT and SIGTERM: collected by programs that save before they end, or held back for an instant."""
+"""SIGINT and SIGTERM: collected by programs that save before they end, held back for an instant, or never lost."""
 
 import contextlib
+import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
 STOPS = (signal.SIGINT, signal.SIGTERM)
+Handler = Callable[[int, FrameType | None], Any]
+_AGAIN_S = 0.05
+
+
+def heard(handler: Handler) -> Handler:
+    """A handler that raises, where what it raises is not lost.
+
+    Some modules catch all that happens while they import others, and nothing leaves a callback of the garbage
+    collector. There the signal comes again a moment later.
+    """
+
+    def again(number: int, frame: FrameType | None) -> None:
+        within = frame
+        while within:
+            code = within.f_code
+            if code.co_filename.startswith("<frozen importlib") or code.co_name == "_xla_gc_callback":
+                timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
+                timer.daemon = True
+                return timer.start()
+            within = within.f_back
+        handler(number, frame)
+
+    return again
+
+
+@contextlib.contextmanager
+def interrupts_heard() -> Iterator[None]:
+    """SIGINT raises KeyboardInterrupt as always, but where it is not lost; without effect where others handle it."""
+    usual = signal.getsignal(signal.SIGINT)
+    mine = threading.current_thread() is threading.main_thread() and usual is signal.default_int_handler
+    if mine:
+        signal.signal(signal.SIGINT, heard(signal.default_int_handler))
+    try:
+        yield
+    finally:
+        if mine:
+            signal.signal(signal.SIGINT, usual)
 
 
 @contextlib.contextmanager

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
+from interactive_nav_common.config import nearest
 from interactive_nav_common.records import read_packaged
 
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 
 def positive(text: str) -> int:
@@ -83,6 +84,23 @@ def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, A
         to.add_argument(*names.split(", "), **about)
 
 
+class Parser(argparse.ArgumentParser):
+    """Says which option, of its own or of its commands, a wrong one looks like."""
+
+    def error(self, message: str) -> NoReturn:
+        """Usage, the message, exit code 2."""
+        wrong = [word for word in message.split() if word.startswith("--")]
+        about = nearest(wrong[0].split("=")[0], list(_options(self))) if wrong and "unrecognized" in message else ""
+        super().error(message + about)
+
+
+def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    for action in parser._actions:
+        yield from action.option_strings
+        for command in action.choices.values() if isinstance(action, argparse._SubParsersAction) else ():
+            yield from _options(command)
+
+
 def program(table: Path, name: str, epilog: str | None = None, **known: Any) -> argparse.ArgumentParser:
     """The parser of `python -m PACKAGE.name`, where PACKAGE is the table's folder.
 
@@ -94,6 +112,6 @@ def program(table: Path, name: str, epilog: str | None = None, **known: Any) -> 
     """
     row, how = read_commands(table)[name], argparse.RawDescriptionHelpFormatter
     prog = f"python -m {table.parent.name}.{name}"
-    made = argparse.ArgumentParser(prog=prog, description=row.help, epilog=epilog, formatter_class=how)
+    made = Parser(prog=prog, description=row.help, epilog=epilog, formatter_class=how)
     add_words(made, row.words, **known)
     return made

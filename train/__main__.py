@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.words import Parser
 from train import config_io
 from train.config import TrainConfig
 from train.runs.run_folder import RunFolder
@@ -16,7 +17,7 @@ from train.runs.run_folder import RunFolder
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog="python -m train",
         description="Trains a policy. The same command continues a run that was stopped or killed.",
         epilog=f"settings (key=default):\n{config_io.help_text()}",

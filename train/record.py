@@ -3,6 +3,7 @@
 `python -m train.replay`, then `python -m interactive_nav.record` of the replay.
 """
 
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -29,7 +30,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     try:
         check_picture_words(arguments)
         words = [arguments.run, *played, "--checkpoint", arguments.checkpoint, *arguments.overrides]
-        refused = replay.main(words, build_env)
+        refused = inspect.unwrap(replay.main)(words, build_env)  # errors are this program's
         if refused:
             return refused
         path = replay_path(Path(arguments.run), arguments.policy, arguments.episode)

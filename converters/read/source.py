@@ -43,7 +43,7 @@ def detect_format(source: Path) -> str:
         if source.is_dir() and shows(source):
             return name
     if not source.exists():
-        raise SceneRejected(f"{source}: no such folder; give the folder that holds the raw scene")
+        raise SceneRejected(f"{source}: no such file or folder; give the raw scene")
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
         f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad), worlds/*.world (sdf), "

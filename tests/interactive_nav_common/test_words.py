@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from interactive_nav_common.words import add_words, program, read_commands
+from interactive_nav_common.words import Parser, add_words, program, read_commands
 
 TABLE = """
 draw:
@@ -47,3 +47,15 @@ def test_a_row_becomes_a_programs_parser(tmp_path):
     made = program(tmp_path / "words.yaml", "draw", "told\n  as it is", cores=3, shares=(0.5, 2.0))
     assert made.prog == f"python -m {tmp_path.name}.draw" and made.description == "draw it"
     assert made.format_help().endswith("told\n  as it is\n") and made.parse_args(["a"]).count == 3
+
+
+def test_a_wrong_option_of_a_command_says_which_it_looks_like(capsys):
+    parser = Parser(prog="tool")
+    command = parser.add_subparsers().add_parser("convert")
+    command.add_argument("--segment", action="store_true")
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["convert", "--segmnt=3"])
+    assert "tool: error: unrecognized arguments: --segmnt=3, did you mean '--segment'?" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["convert", "--unlike"])
+    assert "did you mean" not in capsys.readouterr().err

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import settings_help
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import Parser, add_words, read_commands
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import (
     ADAPTED,
@@ -35,7 +35,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog="python -m topological_nav",
         description="Navigation by images and a graph. Words key=value change settings: COMMAND --help lists them.",
     )

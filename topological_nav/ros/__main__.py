@@ -19,7 +19,7 @@ from typing import Any
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.signals import stop_signals
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import Parser, add_words, read_commands
 from topological_nav.commands.progress import say
 from topological_nav.config import RUNS, NavigatorConfig
 from topological_nav.ros import debian
@@ -33,7 +33,7 @@ _DELIVERY_S = 1.0
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog="python -m topological_nav.ros",
         description="The simulator and the navigator as ROS 1 nodes. Words key=value change settings.",
     )

@@ -368,4 +368,4 @@ def test_a_damaged_texture_costs_colour_only(gibson_raw):
 
 def test_no_known_layout(tmp_path):
     refused(detect_format, tmp_path, "no known layout", "mesh_z_up.obj", "full_annotations.json")
-    refused(detect_format, tmp_path / "absent", "no such folder")
+    refused(detect_format, tmp_path / "absent", "no such file or folder")
