@@ -7,6 +7,7 @@ import collections
 import gc
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,6 +40,10 @@ from hypothesis import settings
 import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
 from tests.changed import changed_files, chosen
 from tests.toys import write_room
+
+# A shell starts what runs in its background with SIGINT ignored, and what that starts ignores it too.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tracing makes objects by the million, and next to none of them is garbage: looking for it took a tenth of the time.
 gc.set_threshold(100_000, 5, 5)

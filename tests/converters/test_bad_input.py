@@ -24,15 +24,6 @@ from interactive_nav_common.errors import FileError
 from scenes_mjcf.schema import load_manifest
 from tests.converters import tiny_raw
 
-
-@pytest.fixture(autouse=True)
-def interruptible():
-    """A shell starts what runs in its background with SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 SMALL = ConvertConfig(structure_texture=64, object_texture=32)
 
 

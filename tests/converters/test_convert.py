@@ -265,8 +265,6 @@ def _start_conversion(source: Path, out: Path, cache: Path) -> subprocess.Popen[
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # A test run in the background of a shell ignores SIGINT, and its children would too.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while not (out.parent.is_dir() and list(out.parent.iterdir())) and time.monotonic() < deadline:

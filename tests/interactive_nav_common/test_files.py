@@ -23,14 +23,6 @@ from interactive_nav_common.files import (
 )
 
 
-@pytest.fixture(autouse=True)
-def interruptible():
-    """A shell starts what runs in its background with SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.parametrize("name", ["", ".", "..", ".a", "a/b", "a\\b", "/", "a\0b", "a\nb", "é" * 51])
 def test_what_is_no_single_part_of_a_path_is_no_name(name):
     with pytest.raises(FileError, match=r"^x: name is .*expected one folder name.*$"):
