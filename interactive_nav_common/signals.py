@@ -1,6 +1,7 @@
 """SIGINT and SIGTERM: collected by programs that save before they end, held back for an instant, or never lost."""
 
 import contextlib
+import gc
 import os
 import signal
 import threading
@@ -21,10 +22,10 @@ def heard(handler: Handler) -> Handler:
     """
 
     def again(number: int, frame: FrameType | None) -> None:
-        within = frame
+        within, callbacks = frame, [getattr(callback, "__code__", None) for callback in gc.callbacks]
         while within:
             code = within.f_code
-            if code.co_filename.startswith("<frozen importlib") or code.co_name == "_xla_gc_callback":
+            if code.co_filename.startswith("<frozen importlib") or code in callbacks:
                 timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
                 timer.daemon = True
                 return timer.start()

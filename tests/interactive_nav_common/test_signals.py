@@ -34,7 +34,7 @@ def test_an_interrupt_within_an_import_that_catches_all_comes_after_it(tmp_path,
 def test_one_within_a_callback_of_the_collector_comes_after_it():
     came = []
 
-    def _xla_gc_callback(phase: str, info: dict) -> None:
+    def at_collection(phase: str, info: dict) -> None:
         if not came:
             came.append(phase)
             os.kill(os.getpid(), signal.SIGINT)
@@ -42,11 +42,11 @@ def test_one_within_a_callback_of_the_collector_comes_after_it():
 
     try:
         with pytest.raises(KeyboardInterrupt), interrupts_heard():
-            gc.callbacks.append(_xla_gc_callback)
+            gc.callbacks.append(at_collection)
             gc.collect()
             time.sleep(5)
     finally:
-        gc.callbacks.remove(_xla_gc_callback)
+        gc.callbacks.remove(at_collection)
     assert came
 
 
