@@ -5,7 +5,6 @@ so that any machine that sees the folder can make it.
 """
 
 import dataclasses
-import shutil
 import sys
 import tempfile
 import time
@@ -234,16 +233,18 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
         wanted = {n: members[n] for n in asked if not (folder / n / "scene.json").is_file()}
         for scene in (n for n in asked if n not in wanted):
             tell(f"{scene}: is there, {folder / scene}")
-        if not wanted:
-            continue
         out = in_cache(folder)
-        for scene in (n for n, m in wanted.items() if (out / n).exists() and not is_listed(out / n, m)):
+        todo = tuple(n for n, m in wanted.items() if not is_listed(out / n, m))
+        others = [n for n in todo if (out / n).exists()]
+        for scene in (n for n in wanted if n not in todo):
+            tell(f"{scene}: is there, {out / scene}")
+        for scene in others:
             tell(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
-            shutil.rmtree(out / scene)
-        failed += generate_scenes(
-            Wanted(out, folder / RECIPES, None, None, None, tuple(wanted), False, jobs, "local", None), report, tell
-        )
-        for scene in (n for n, m in wanted.items() if n not in failed and not is_listed(out / n, m)):
+        if not todo:
+            continue
+        asks = Wanted(out, folder / RECIPES, None, None, None, todo, bool(others), jobs, "local", None)
+        failed += generate_scenes(asks, report, tell)
+        for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
             own = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
             tell(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {own}")
             failed.append(scene)

@@ -223,12 +223,15 @@ def test_what_is_not_the_listed_scene_is_not_found_and_is_made_again(
     assert "one             in the cache is another scene" in capsys.readouterr().out
 
     def generate(wanted, report, tell):
+        assert wanted.only == ("one",) and wanted.overwrite and (wanted.out / "one").exists()
+        shutil.rmtree(wanted.out / "one")
         shutil.copytree(ROOT / "scenes_mjcf" / "alder", wanted.out / "one")
         return []
 
     monkeypatch.setattr("converters.sets.generate_scenes", generate)
     assert main(["scenes", "make", "one"]) == 0
     assert scene_folders(["furnished"]) == ("cache/package/furnished/one",)
+    assert main(["scenes", "make", "one"]) == 0, "nothing is made a second time"
 
 
 def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

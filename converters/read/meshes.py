@@ -27,6 +27,7 @@ from converters.read.surfaces import check_extent, floor_level, labelled, with_o
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, check_count
 from converters.records.raw import RawScene
+from interactive_nav_common.errors import readable
 from interactive_nav_common.records import Reader
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
@@ -115,20 +116,17 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
     path = source.use(relative, remedy)
     resolver = SourceResolver(source, path)
     try:
-        if path.suffix.lower() in (".glb", ".gltf"):
-            _check_gltf(path)
-        with path.open("rb") as file:
+        with readable(path, SceneRejected, "expected OBJ, PLY, STL, GLB or DAE", " as a mesh"), path.open("rb") as file:
+            if path.suffix.lower() in (".glb", ".gltf"):
+                _check_gltf(path)
             loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
-        assert isinstance(loaded, trimesh.Scene)
-        parts = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
-        turn = _collada_turn(path) if path.suffix.lower() == ".dae" else np.eye(3)
-    except Exception as error:  # trimesh's loaders raise anything on a broken file
-        if isinstance(error, SceneRejected):
+            assert isinstance(loaded, trimesh.Scene)
+            parts = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
+            turn = _collada_turn(path) if path.suffix.lower() == ".dae" else np.eye(3)
+    except SceneRejected:
+        if resolver.refusal is None:
             raise
-        reason = " ".join(str(error).split())
-        raise resolver.refusal or SceneRejected(
-            f"{path}: not readable as a mesh ({type(error).__name__}: {reason}); expected OBJ, PLY, STL, GLB or DAE"
-        ) from error
+        raise resolver.refusal from None
     if resolver.refusal is not None:
         raise resolver.refusal
     if not parts:

@@ -35,6 +35,7 @@ FAR_M = 1e6
 _PLACES = 4000
 """Of the robot, at which a window's size is measured: of all scenes together, but at least 200 in each."""
 _AT_ONCE = 100
+"""Places that are measured in one go."""
 _SHARE = 0.999
 """Of these places a window has room for what stands near."""
 Measured = tuple[Any, Any, Any]
@@ -53,7 +54,7 @@ class Boxes:
     """[M, 3] half sizes, m"""
 
     def gap_m(self, centre: Array, axes: Array, half: Array) -> Array:
-        """[M] from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
+        """[..., M] m from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
         xp = namespace(self.centre, centre)
         between = self.centre - centre[..., None, :]
         mine, others = xp.broadcast_arrays(self.axes, axes[..., None, :, :])
@@ -99,7 +100,7 @@ class Nearness:
         return Boxes(centre[..., :2], axes[..., :2, :], half)
 
     def walls_m(self, scene: Array, state: PhysicsState) -> Array:
-        """[W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
+        """[..., W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
         xp = namespace(state.qpos)
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
         offset = xp.einsum("...wi,wij->...wj", state.qpos[..., None, self._robot] - xpos, xmat)
@@ -107,14 +108,14 @@ class Nearness:
         return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
 
     def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
-        """[W] m to where each wall box can be met: within `reach_m` of the robot, or `TOUCH_M` of what it may push.
+        """[..., W] m to where each wall can be met: within `reach_m` of the robot, or `TOUCH_M` of what it may push.
 
         Args:
             scene: [] i32.
-            state: of one environment.
+            state: of one environment, or, in NumPy, of many of one scene.
             reach_m: from the robot's centre.
             boxes: of all slots.
-            push_m: [M] m to where each may be pushed; negative where it may.
+            push_m: [..., M] m to where each may be pushed; negative where it may.
         """
         xp, gap = namespace(state.qpos), self.walls_m(scene, state) - reach_m
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)

@@ -142,7 +142,9 @@ class SweepFolder:
     def evaluated(self, run: RunSpec) -> bool:
         """Rows are there, as wanted, of the run as far as it is trained."""
         path = self.rows / self.asked(run).file_name(run.name)
-        steps = read_notes(path).get("trained_steps") if path.is_file() else None
+        if not path.is_file():
+            return False
+        steps = read_notes(path).get("trained_steps")
         return steps == json.dumps(RunFolder(self.runs / run.name).origin()["env_steps"])
 
     def drop_old_rows(self, run: RunSpec) -> None:

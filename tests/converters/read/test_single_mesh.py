@@ -77,7 +77,7 @@ def test_a_tilted_scan_in_centimetres_becomes_the_scene_of_the_right_one(room, t
     ("arguments", "message"),
     [
         (["room.txt"], "is no mesh file; expected one of .ply"),
-        (["empty.ply"], "not readable as a mesh"),
+        (["empty.ply"], "not readable as a mesh (it is empty); expected OBJ"),
         (["flat.ply"], "shows one direction of surface only; say which axis points up with --up"),
         (["absent.ply"], "no such file or folder"),
         (["folder", "--up", "y"], "--up, --unit and --mirror are for a single mesh file"),
