@@ -1,9 +1,9 @@
 """SIGINT and SIGTERM: collected by programs that save before they end, held back for an instant, or never lost."""
 
 import contextlib
-import gc
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -17,22 +17,41 @@ _AGAIN_S = 0.05
 def heard(handler: Handler) -> Handler:
     """A handler that raises, where what it raises is not lost.
 
-    Some modules catch all that happens while they import others, and nothing leaves a callback of the garbage
-    collector. There the signal comes again a moment later.
+    Some modules catch all that happens while they import others, and nothing leaves a destructor or a callback of the
+    garbage collector or of a weak reference. There the signal comes again a moment later.
     """
 
-    def again(number: int, frame: FrameType | None) -> None:
-        within, callbacks = frame, [getattr(callback, "__code__", None) for callback in gc.callbacks]
+    def raising(number: int, frame: FrameType | None) -> None:
+        within = frame
         while within:
-            code = within.f_code
-            if code.co_filename.startswith("<frozen importlib") or code in callbacks:
-                timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
-                timer.daemon = True
-                return timer.start()
+            if within.f_code.co_filename.startswith("<frozen importlib"):
+                return _come_again(number)
             within = within.f_back
-        handler(number, frame)
+        try:
+            handler(number, frame)
+        except BaseException as raised:
+            raised.lost_signal = number  # type: ignore[attr-defined]
+            raise
 
-    return again
+    if not hasattr(sys.unraisablehook, "before"):
+        sys.unraisablehook = _lost_again(sys.unraisablehook)
+    return raising
+
+
+def _lost_again(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def hook(unraisable: Any) -> None:
+        """What Python cannot raise: a signal comes again, all else is for the hook before."""
+        number = getattr(unraisable.exc_value, "lost_signal", None)
+        _come_again(number) if number else before(unraisable)
+
+    hook.before = before  # type: ignore[attr-defined]
+    return hook
+
+
+def _come_again(number: int) -> None:
+    timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
 
 
 @contextlib.contextmanager

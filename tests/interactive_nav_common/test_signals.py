@@ -1,20 +1,19 @@
 """Signals that come where Python loses what their handlers raise."""
 
 import gc
-import os
 import signal
 import sys
 import time
+import weakref
 
 import pytest
 
 from interactive_nav_common.signals import heard, interrupts_heard
 
 DEAF = """
-import os, signal, time
+import signal
 try:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(0.01)
+    signal.raise_signal(signal.SIGINT)
 except BaseException:
     pass
 """
@@ -31,23 +30,37 @@ def test_an_interrupt_within_an_import_that_catches_all_comes_after_it(tmp_path,
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_one_within_a_callback_of_the_collector_comes_after_it():
-    came = []
+def interrupted(*_: object) -> None:
+    signal.raise_signal(signal.SIGINT)
 
-    def at_collection(phase: str, info: dict) -> None:
-        if not came:
-            came.append(phase)
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.01)
 
+class Interrupted(set):
+    __del__ = interrupted
+
+
+def collected() -> None:
+    gc.callbacks.append(lambda phase, _: interrupted() if phase == "stop" else None)
     try:
-        with pytest.raises(KeyboardInterrupt), interrupts_heard():
-            gc.callbacks.append(at_collection)
-            gc.collect()
-            time.sleep(5)
+        gc.collect()
     finally:
-        gc.callbacks.remove(at_collection)
-    assert came
+        gc.callbacks.pop()
+
+
+def unreferenced() -> None:
+    held = type("Held", (), {})()
+    reference = weakref.ref(held, interrupted)
+    del held
+    assert reference() is None
+
+
+@pytest.mark.parametrize("lose", [collected, unreferenced, Interrupted], ids=["collector", "weak reference", "__del__"])
+def test_one_where_nothing_can_be_raised_comes_after_it(lose):
+    reached = []
+    with pytest.raises(KeyboardInterrupt), interrupts_heard():
+        lose()
+        reached.append(lose)
+        time.sleep(5)
+    assert reached
 
 
 def test_elsewhere_a_handler_acts_at_once():
