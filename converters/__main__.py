@@ -15,7 +15,6 @@ import signal
 import sys
 import threading
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -27,7 +26,7 @@ from converters.tables import alignment_table, bounds, gate_table, proposal_tabl
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
-from interactive_nav_common.signals import heard, interrupts_heard
+from interactive_nav_common.signals import interrupts_heard
 from interactive_nav_common.words import Command, Commands, Parser, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES
 from scenes_mjcf.sets import installed
@@ -40,14 +39,6 @@ FORMATS = (
 
 if TYPE_CHECKING:
     from converters.pipeline import ConvertConfig
-
-
-class Interrupted(BaseException):
-    """SIGTERM arrived; unwinds like Ctrl-C so that every `finally` runs."""
-
-
-def _on_sigterm(signum: int, frame: FrameType | None) -> None:
-    raise Interrupted
 
 
 def _words_of(config: type[Any], arguments: argparse.Namespace) -> dict[str, Any]:
@@ -271,11 +262,10 @@ def _standing(arguments: argparse.Namespace) -> dict[str, int]:
     return found
 
 
-@interrupts_heard()
+@interrupts_heard(signal.SIGTERM)
 def main(argv: list[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
     arguments = _parse(argv)
-    signal.signal(signal.SIGTERM, heard(_on_sigterm))
     console = Console()
     before = _standing(arguments)
 
@@ -287,12 +277,10 @@ def main(argv: list[str] | None = None) -> int:
         if "launcher" in arguments and arguments.launcher != "ray":
             refuse_unused(arguments, "--ray-address", "without --launcher ray")
         return arguments.run(arguments, console) or 0
-    except KeyboardInterrupt:
-        print(f"interrupted; {written()}", file=sys.stderr)
-        return 130
-    except Interrupted:
-        print(f"terminated; {written()}", file=sys.stderr)
-        return 143
+    except KeyboardInterrupt as stop:
+        number = getattr(stop, "lost_signal", signal.SIGINT)
+        print(f"{'terminated' if number == signal.SIGTERM else 'interrupted'}; {written()}", file=sys.stderr)
+        return 128 + number
     except OSError as error:
         where = error.filename or getattr(arguments, "out", None) or "file system"
         print(f"error: {where}: {error.strerror or error}; {written()}", file=sys.stderr)

@@ -10,6 +10,7 @@ from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.signals import heard
+from interactive_nav_common.words import TYPED
 
 PROGRAMS = read_packaged(Path(__file__).with_name("programs.yaml"), dict[str, tuple[str, str]])
 """Command -> module that is run, and what it does."""
@@ -26,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if words[0] not in PROGRAMS:
         raise ConfigError(f"no command {words[0]!r}{nearest(words[0], list(PROGRAMS))}; --help lists them")
     module, _ = PROGRAMS[words[0]]
+    TYPED[f"python -m {module}"] = "interactive-nav" if module == "converters" else f"interactive-nav {words[0]}"
     sys.argv = [module, *words[module != "converters" :]]
     signal.signal(signal.SIGTERM, heard(lambda number, _: sys.exit(128 + number)))  # programs that save have their own
     try:

@@ -55,17 +55,23 @@ def _come_again(number: int) -> None:
 
 
 @contextlib.contextmanager
-def interrupts_heard() -> Iterator[None]:
-    """SIGINT raises KeyboardInterrupt as always, but where it is not lost; without effect where others handle it."""
-    usual = signal.getsignal(signal.SIGINT)
-    mine = threading.current_thread() is threading.main_thread() and usual is signal.default_int_handler
-    if mine:
-        signal.signal(signal.SIGINT, heard(signal.default_int_handler))
+def interrupts_heard(*also: int) -> Iterator[None]:
+    """SIGINT raises KeyboardInterrupt as always, but where it is not lost; without effect where others handle it.
+
+    Args:
+        *also: signals that raise it, too, unless they are ignored. The exception's `lost_signal` is the number.
+    """
+    mine = threading.current_thread() is threading.main_thread()
+    usual = {n: signal.getsignal(n) for n in (signal.SIGINT, *also) if mine}
+    others = (signal.SIG_IGN, None)
+    usual = {n: h for n, h in usual.items() if h is signal.default_int_handler or n in also and h not in others}
+    for number in usual:
+        signal.signal(number, heard(signal.default_int_handler))
     try:
         yield
     finally:
-        if mine:
-            signal.signal(signal.SIGINT, usual)
+        for number, handler in usual.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

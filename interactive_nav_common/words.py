@@ -84,8 +84,16 @@ def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, A
         to.add_argument(*names.split(", "), **about)
 
 
+TYPED: dict[str, str] = {}
+"""`python -m MODULE` -> what was typed instead of it; filled by programs that run others."""
+
+
 class Parser(argparse.ArgumentParser):
-    """Says which option, of its own or of its commands, a wrong one looks like."""
+    """Shows what was typed; says which option, of its own or of its commands, a wrong one looks like."""
+
+    def __init__(self, *arguments: Any, **about: Any) -> None:
+        super().__init__(*arguments, **about)
+        self.prog = TYPED.get(self.prog, self.prog)
 
     def error(self, message: str) -> NoReturn:
         """Usage, the message, exit code 2."""

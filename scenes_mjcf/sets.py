@@ -7,6 +7,7 @@ is looked for beside the package and in the cache folder, by the same path (`sce
 """
 
 import dataclasses
+import difflib
 import hashlib
 import json
 import os
@@ -134,6 +135,16 @@ def installed(path: str | Path) -> Path:
             f"{place.name}'"
         )
     return place
+
+
+def meant(word: str) -> str:
+    """`, did you mean 'X'?` for the package's scene or set that a wrong word looks like, or nothing."""
+    places = {name: name for sets in PACKAGED for name in (sets, *(f"{sets}/{split}" for split in SPLITS))}
+    scenes = {HERE / name for name in os.listdir(HERE) if (HERE / name / "scene.json").is_file()}
+    scenes |= {PACKAGED[name] / scene for name in PACKAGED for scene in packaged_set(name).scenes}
+    places |= {scene.name: scene.relative_to(HERE.parent).as_posix() for scene in sorted(scenes)}
+    near = difflib.get_close_matches(word, places, 1) or difflib.get_close_matches(Path(word).name, places, 1)
+    return f", did you mean {places[near[0]]!r}?" if near else ""
 
 
 def _file_of(name: str) -> Path | None:

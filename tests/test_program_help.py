@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,3 +52,11 @@ def test_help_is_that_of_the_parser_and_of_its_commands():
     assert "generate-scenes" in help_of("interactive_nav")["python -m interactive_nav"]
     with pytest.raises(AttributeError):
         help_of("train.config")
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "convert"])
+def test_help_shows_what_was_typed(command):
+    done = subprocess.run(
+        [sys.executable, "-m", "interactive_nav", command, "--help"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith(f"usage: interactive-nav {command} [")

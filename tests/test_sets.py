@@ -11,6 +11,7 @@ from converters.__main__ import main
 from converters.generate.homes.config import TIERS, HomeConfig
 from converters.recipes import load_recipes
 from interactive_nav.episodes import load
+from interactive_nav.scenes.scene import load_scene
 from scenes_mjcf.schema import SceneError, load_manifest
 from scenes_mjcf.sets import (
     COMMITTED,
@@ -259,3 +260,23 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
     assert asked == [(out, recipes, ("alder",)), (out, recipes, ("birch", "rowan", "willow"))]
     assert main(["scenes", "make", "cedar", "aldr"]) == 2 and len(asked) == 2, "refused before anything is made"
     assert "no scene or set 'aldr', did you mean 'alder'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "right"),
+    [
+        ("aldr", "scenes_mjcf/alder"),
+        ("scenes_mjcf/apartmnt_0", "scenes_mjcf/apartment_0"),
+        ("clutered", "cluttered"),
+        ("furnished/tset", "furnished/test"),
+        ("some/where/cluttered010", "scenes_mjcf/cluttered/cluttered_010"),
+    ],
+)
+def test_a_wrong_name_is_told_the_nearest(word: str, right: str) -> None:
+    with pytest.raises(SceneError, match=f"expected a scene folder or a set .*, did you mean '{right}'"):
+        load_scene(word)
+
+
+def test_a_name_like_none_is_told_the_sets() -> None:
+    with pytest.raises(SceneError, match=r"yscen: no such file; expected a scene folder or a set \(sparse, furnished"):
+        load_scene("yscen")

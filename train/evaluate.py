@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
+from interactive_nav_common.signals import interrupts_heard
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
@@ -119,8 +121,20 @@ def _checked_seed(arguments: argparse.Namespace) -> int:
 
 @reports_errors("train.evaluate")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
-    """Evaluates; 0 when done, 2 on a user's error."""
-    arguments = parser().parse_intermixed_args(argv)
+    """Evaluates; 0 when done, 2 on a user's error, 128 + signal when stopped, which keeps what has been played."""
+    kept: dict[Path, str] = {}
+    try:
+        with interrupts_heard(signal.SIGTERM):
+            return _run(parser().parse_intermixed_args(argv), build_env, kept)
+    except KeyboardInterrupt as stop:
+        told = "; ".join(kept.values()) or "nothing, no policy had played all"
+        number = getattr(stop, "lost_signal", signal.SIGINT)
+        print(f"train.evaluate: stopped by {signal.Signals(number).name}; kept: {told}", file=sys.stderr)
+        return 128 + number
+
+
+def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], kept: dict[Path, str]) -> int:
+    """Fills `kept` with what has been written: a run's file of rows -> how to say it."""
     console = Console()
     seed = _checked_seed(arguments)
     policies = _policies(arguments)
@@ -155,6 +169,8 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         )
         out = _place(arguments, folder, config, asked)
         claim(out.parent)
+        told = f"{asked.episodes} episodes by each of {', '.join(policies)} in {', '.join(asked.scenes)}"
+        console.print(f"{config.run.name}: {told}; loading and compiling first", highlight=False, soft_wrap=True)
         if player is None or kinds[i] != built:
             player = None  # the old one's memory goes before the new one's comes
             player, built = BatchPlayer(build_env(config.env)), kinds[i]
@@ -167,6 +183,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             place = out if len(played) == len(policies) or not stood else unfinished
             write_paths(paths_beside(place), played, player.env)  # first: rows are never without paths as new as they
             write_parquet(rows, place, notes)
+            kept[out] = f"rows of {', '.join(played)} in {place}"
             if place == unfinished:
                 console.print(f"until all have played: {place}; {out} stays as it is", highlight=False, soft_wrap=True)
         for path in (unfinished, paths_beside(unfinished)):

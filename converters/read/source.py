@@ -26,7 +26,7 @@ FILES = {
     (".world", ".sdf"): (sdf.root_of, sdf.read_sdf),
     (habitat.SCENE,): (habitat.root_of, habitat.read_habitat),
     (".xml",): (lambda path: path.resolve().parent, mjcf.read_mjcf),
-    (sh3d.ENDING,): (lambda path: path.resolve().parent, sh3d.read_sh3d),
+    (sh3d.ENDING, f"{sh3d.ENDING}.zip"): (lambda path: path.resolve().parent, sh3d.read_sh3d),
 }
 """Ending of a file that says which home of a folder is meant -> its folder, its reader."""
 WITHIN = (sdf.read_sdf, mjcf.read_mjcf)

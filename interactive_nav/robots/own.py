@@ -6,6 +6,7 @@ Control modes come from `build.py`.
 """
 
 import functools
+import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -190,6 +191,16 @@ def _factory(
     return build
 
 
+def _check(name: str, wheel_rad_s: float, optional: Mapping[str, float | None]) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name, re.ASCII):
+        raise ConfigError(f"name is {name!r}, expected letters, digits, _ and -, such as 'my_robot'")
+    if not 0 < wheel_rad_s < np.inf:
+        raise ConfigError(f"max_wheel_speed_rad_s is {wheel_rad_s}, expected a number above 0, in rad/s")
+    for setting, value in optional.items():
+        if value is not None and not 0 < value < np.inf:
+            raise ConfigError(f"{setting} is {value}, expected a number above 0; leave it out to take the file's own")
+
+
 def from_file(
     path: str | Path,
     *,
@@ -235,8 +246,8 @@ def from_file(
     Raises:
         ConfigError: a file that cannot be used; the message says what to change.
     """
-    if not 0 < max_wheel_speed_rad_s < np.inf:
-        raise ConfigError(f"max_wheel_speed_rad_s is {max_wheel_speed_rad_s}, expected a number above 0, in rad/s")
+    speeds = {"max_linear_m_s": max_linear_m_s, "max_angular_rad_s": max_angular_rad_s}
+    _check(name, max_wheel_speed_rad_s, {"body_width_m": body_width_m, "track_m": track_m} | speeds)
     sides = _sides(left_wheels, right_wheels)
     driven, limits, path = dict(joints or {}), dict(torque_limits or {}), Path(path).resolve()
     child = read_file(path)

@@ -144,6 +144,9 @@ def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         elif body.joints and body.name != base_body:
             raise FileError(f"robot file {path}: moving body '{body.name}' has neither inertia nor collision shapes")
     model = child.copy().compile()
+    base, mass = child.body(base_body), float(model.body(base_body).mass[0])
+    if mass < 1e-3 and (base.explicitinertial or any(g.group == 3 for g in base.geoms)):
+        raise FileError(f"robot file {path}: base '{base_body}' weighs {mass:g} kg, expected its mass; give it inertia")
     for body in child.bodies:
         if body.name == "world":
             continue

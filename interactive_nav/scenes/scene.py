@@ -10,7 +10,7 @@ import numpy as np
 
 from interactive_nav_common.rotations import rotate
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
-from scenes_mjcf.sets import installed
+from scenes_mjcf.sets import PACKAGED, installed, meant
 
 TASK_DIGEST = "task-1:"
 """Begins a digest of what decides a task, and says how it was made; what does not begin so is `Scene.digest`."""
@@ -185,7 +185,12 @@ def load_scene(folder: str | Path) -> Scene:
     Raises:
         SceneError: a file is missing or unreadable, or scene.xml and scene.json disagree.
     """
-    folder = installed(folder)
+    folder, word = installed(folder), str(folder)
+    if not folder.exists():
+        raise SceneError(
+            f"{folder}: no such file; expected a scene folder or a set ({', '.join(PACKAGED)}){meant(word)}; "
+            "'python -m converters scenes list' shows them, 'python -m converters convert SRC OUT' makes one"
+        )
     manifest, maps = load_manifest(folder), load_maps(folder)
     xml = folder / "scene.xml"
     if not xml.is_file():

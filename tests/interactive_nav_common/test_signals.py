@@ -69,6 +69,20 @@ def test_elsewhere_a_handler_acts_at_once():
     assert seen == [signal.SIGTERM]
 
 
+def test_others_raise_it_too_and_are_told_apart():
+    usual = signal.signal(signal.SIGTERM, lambda *_: pytest.fail("replaced"))
+    try:
+        with pytest.raises(KeyboardInterrupt) as stop, interrupts_heard(signal.SIGTERM):
+            signal.raise_signal(signal.SIGTERM)
+        assert getattr(stop.value, "lost_signal") == signal.SIGTERM  # noqa: B009
+        mine = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        with interrupts_heard(signal.SIGTERM):
+            signal.raise_signal(signal.SIGTERM)
+        assert mine is not signal.SIG_DFL and signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+
+
 def test_who_handles_interrupts_goes_on_doing_so():
     usual = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -180,8 +181,9 @@ def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
     assert pq.read_table(rows)["policy"].to_pylist() == ["random"] * 3 and paths_beside(rows).is_file()
 
 
-def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monkeypatch):
-    """Ctrl-C in the second policy: the first one's rows are there; whole rows of before are not given up for them."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monkeypatch, capsys, number):
+    """A signal in the second policy: the first one's rows are there; whole rows of before are not given up for them."""
     out, words = tmp_path / "rows.parquet", [str(run.path), "--episodes", "3", "--policies", "random,follower"]
     played = rollout.BatchPlayer.play
     count = []
@@ -189,25 +191,41 @@ def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monk
     def stopped(self, *arguments):
         count.append(1)
         if len(count) % 2 == 0:
-            raise KeyboardInterrupt
+            signal.raise_signal(number)
         return played(self, *arguments)
 
     with monkeypatch.context() as patch:
         patch.setattr(rollout.BatchPlayer, "play", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            evaluate.main([*words, "--out", str(out)], build_env=build_toy)
+        assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 128 + number
+    told = f"train.evaluate: stopped by {number.name}; kept: rows of random in "
+    assert capsys.readouterr().err == f"{told}{out}\n"
     assert pq.read_table(out)["policy"].to_pylist() == ["random"] * 3
     assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 0
     whole = out.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr(rollout.BatchPlayer, "play", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            evaluate.main([*words, "--out", str(out)], build_env=build_toy)
-    assert out.read_bytes() == whole and pq.read_table(out).num_rows == 6
+        assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 128 + number
     begun = tmp_path / ".unfinished-rows.parquet"
+    assert capsys.readouterr().err == f"{told}{begun}\n"
+    assert out.read_bytes() == whole and pq.read_table(out).num_rows == 6
     assert pq.read_table(begun)["policy"].to_pylist() == ["random"] * 3 and paths_beside(begun).is_file()
     assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rows.npz", "rows.parquet"]
+
+
+def test_what_is_stopped_before_any_has_played_keeps_nothing_and_says_what_was_to_be_played(run, tmp_path, capsys):
+    usual = signal.getsignal(signal.SIGTERM)
+
+    def build(config):
+        said.append(capsys.readouterr().out)
+        signal.raise_signal(signal.SIGTERM)
+
+    said: list[str] = []
+    words = [str(run.path), "--episodes", "3", "--policies", "random,follower", "--out", str(tmp_path / "rows.parquet")]
+    assert evaluate.main(words, build_env=build) == 143
+    assert said == ["toy: 3 episodes by each of random, follower in toy; loading and compiling first\n"]
+    assert capsys.readouterr().err == "train.evaluate: stopped by SIGTERM; kept: nothing, no policy had played all\n"
+    assert signal.getsignal(signal.SIGTERM) is usual and list(tmp_path.iterdir()) == []
 
 
 def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):

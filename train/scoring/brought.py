@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
 from train.errors import PolicyError
 from train.scoring.planners import HostPolicy
@@ -96,8 +97,12 @@ def _load(place: str) -> Callable[[PlayedEnv], Any]:
         raise PolicyError(f"--policy: cannot import {module} ({_first_line(error)}); {EXPECTED}") from error
     made = getattr(loaded, name, None)
     if not callable(made):
-        got = "nothing" if made is None else f"of type {type(made).__name__}"
-        raise PolicyError(f"--policy: {name} of {module} is {got}, expected a function of one description")
+        own = [n for n, v in vars(loaded).items() if callable(v) and getattr(v, "__module__", "") == loaded.__name__]
+        has = hasattr(loaded, name)
+        got = f"{name!r} of type {type(made).__name__}" if has else f"no {name!r}{nearest(name, own)}"
+        raise PolicyError(
+            f"--policy: {module} has {got}; expected a function of one description: {', '.join(own) or 'it has none'}"
+        )
     return made
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from interactive_nav.pictures.replay import policy_key_of
 from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.rows import Rows
+from interactive_nav_common.signals import signals_wait
 from train.scoring.planners import HostPolicy
 from train.scoring.policies import PolicyFn
 
@@ -158,7 +159,8 @@ class BatchPlayer:
             if isinstance(policy, HostPolicy):
                 carry, track = _play_planned(self._step, policy, carry, done + episode_of, step)
             else:
-                carry, track = self._chunk(act, carry, policy_keys[episode_of], step)
+                with signals_wait():  # what is raised within the physics' callbacks is another error, and may crash
+                    carry, track = jax.block_until_ready(self._chunk(act, carry, policy_keys[episode_of], step))
             _, ended, final, moved = carry
             step += CHUNK_STEPS
             new = np.flatnonzero(np.asarray(ended) & ~finished[episode_of])
@@ -240,7 +242,9 @@ def _play_planned(one_step: Any, planner: Any, carry: Any, episode_of: np.ndarra
         running = ~np.asarray(carry[1])
         if not running.any():
             break
-        carry, track = one_step(carry, planner.act(carry[0], episode_of, running, step + t))
+        actions = planner.act(carry[0], episode_of, running, step + t)
+        with signals_wait():
+            carry, track = jax.block_until_ready(one_step(carry, actions))
         tracks.append(np.asarray(track))
     tracks += [np.full_like(tracks[0], np.nan)] * (CHUNK_STEPS - len(tracks))
     return carry, np.stack(tracks)

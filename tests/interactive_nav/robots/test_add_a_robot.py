@@ -18,6 +18,7 @@ from tests.toys import write_room
 DOC = Path(__file__).parents[3] / "docs" / "add-a-robot.md"
 TEXT = DOC.read_text(encoding="utf-8")
 URDF = re.findall(r"```xml\n(.*?)```", TEXT, re.S)[0]
+WEIGHTLESS = re.sub(r"<mass value=\"12\"/>", '<mass value="0"/>', URDF)
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.S)
 PORTER = dict(
     name="porter",
@@ -169,6 +170,12 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
         (URDF.replace('radius="0.07" length="0.04"', 'radius="70" length="40"'), {}, "radius of 70 m, .* millimetres"),
         (URDF, {"max_wheel_speed_rad_s": 0.0}, "max_wheel_speed_rad_s is 0.0, expected a number above 0"),
         (URDF, {"max_wheel_speed_rad_s": float("nan")}, "max_wheel_speed_rad_s is nan, expected a number above 0"),
+        (URDF, {"track_m": -0.4}, "track_m is -0.4, expected a number above 0;"),
+        (URDF, {"max_linear_m_s": 0.0}, "max_linear_m_s is 0.0, expected a number above 0;"),
+        (URDF, {"name": ""}, "name is '', expected letters, digits, _ and -"),
+        (URDF, {"name": "my robot"}, "name is 'my robot', expected letters"),
+        (URDF, {"name": "a/b"}, "name is 'a/b', expected letters"),
+        (WEIGHTLESS, {}, "base 'base_link' weighs 0.0001 kg, expected its mass"),
         ("<robot name='x'><link", {}, "MuJoCo cannot read it"),
     ],
 )

@@ -248,8 +248,12 @@ def test_rows_of_a_command(module, tmp_path):
             "--policy: cannot import nowhere (ModuleNotFoundError: No module named 'nowhere'); expected",
         ),
         (["nowhere.py:make"], "--policy: cannot import nowhere.py (FileNotFoundError: "),
-        (["my_policy:none"], "--policy: none of my_policy is nothing, expected a function of one description"),
-        (["my_policy:number"], "--policy: number of my_policy is of type int, expected a function"),
+        (
+            ["my_policy:folower"],
+            "--policy: my_policy has no 'folower', did you mean 'Follower'?; expected a function of one description: "
+            "Follower, Constant, broken, not_callable, ",
+        ),
+        (["my_policy:number"], "--policy: my_policy has 'number' of type int; expected a function"),
         (["m=my_policy:broken"], "policy m: factory: raised RuntimeError: no weights here at my_policy.py:32"),
         (["m=my_policy:not_callable"], "policy m: its factory returned type int, expected a callable"),
         (["m=my_policy:wrong_shape"], "policy m: actions have shape (2, 3), expected (2, 2)"),

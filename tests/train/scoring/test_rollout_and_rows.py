@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import signal
 from types import SimpleNamespace
 
 import jax
@@ -16,6 +17,7 @@ from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from interactive_nav_common.statistics import interval
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.scoring import rollout
+from train.scoring.planners import HostPolicy
 from train.scoring.policies import make_follower, make_random
 from train.scoring.rollout import BatchPlayer, episode_keys
 from train.scoring.row_files import EvaluationAsked, files_of_run
@@ -50,6 +52,34 @@ def test_paths_end_where_the_episode_ends():
         # The summed path is the metric.
         travelled = np.linalg.norm(np.diff(paths.robot_xy_w[i, : steps + 1], axis=0), axis=-1).sum()
         assert travelled == pytest.approx(played.metrics["robot_path_m"][i], rel=1e-4)
+
+
+class Signalled(ToyEnv):
+    """The toy, stepped by a callback as physics on the host is; within the third one a signal comes."""
+
+    steps = 0
+
+    def step(self, state, action):
+        def on_host(action):
+            self.steps += 1
+            if self.steps == 3:
+                signal.raise_signal(signal.SIGINT)
+            return np.asarray(action)
+
+        return super().step(state, jax.pure_callback(on_host, action, action, vmap_method="expand_dims"))
+
+
+class Ahead(HostPolicy):
+    def act(self, state, episode, running, step):
+        return np.ones((len(episode), 2), np.float32)
+
+
+def test_a_signal_within_a_callback_comes_after_it():
+    """Raised within it, it would be an error of JAX's."""
+    env = Signalled(ToyConfig(episode_steps=120))
+    with pytest.raises(KeyboardInterrupt):
+        BatchPlayer(env).play(Ahead(), episode_keys(seed=1, episodes=2))
+    assert env.steps == 3
 
 
 class TwoScenes(ToyEnv):

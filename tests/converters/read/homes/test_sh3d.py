@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import shutil
 import time
 import zipfile
 from pathlib import Path
@@ -157,6 +158,12 @@ def test_it_is_found_and_named(drawing, raw):
     assert detect_format(drawing.parent) == "sh3d"
     assert (raw.name, raw.source_format, list(raw.sources)) == ("flat", "sh3d", ["flat.sh3d"])
     assert raw.floor_height_m == 0.0 and raw.storeys == ()
+
+
+def test_the_name_that_a_download_gives_it_is_read_too(drawing, raw, tmp_path):
+    path = shutil.copy(drawing, tmp_path / "flat.sh3d.zip")
+    again = read_source(path)
+    assert (again.name, set(again.sources.values())) == (raw.name, set(raw.sources.values()))
 
 
 def test_the_plan_is_the_right_way_round(raw):
