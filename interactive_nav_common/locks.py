@@ -56,10 +56,10 @@ def is_locked(path: Path) -> bool:
     """Whether somebody holds a lock for itself; asking does not take it."""
     try:
         descriptor = _open(path, os.O_RDONLY)
-    except FileError:
-        if path.exists():
-            raise
-        return False
+    except FileError as error:
+        if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):  # by now another may have made it
+            return False
+        raise
     try:
         return not _flock(descriptor, path, fcntl.LOCK_SH)
     finally:
@@ -98,7 +98,7 @@ def _open(path: Path, flags: int) -> int:
     try:
         return os.open(path, flags, 0o644)
     except OSError as error:
-        raise FileError(f"{path}: cannot be opened ({error.strerror}); expected a writable folder") from None
+        raise FileError(f"{path}: cannot be opened ({error.strerror}); expected a writable folder") from error
 
 
 def _flock(descriptor: int, path: Path, kind: int) -> bool:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -35,18 +36,37 @@ def test_who_looks_never_keeps_one_from_taking_it(tmp_path):
         while looking.is_set():
             is_locked(path)
 
-    lookers = [threading.Thread(target=look) for _ in range(2)]
-    for thread in lookers:
-        thread.start()
     taken = []
-    for _ in range(50):
-        descriptor = take_lock(path)
-        taken.append(descriptor is not None)
-        release(descriptor)
-    looking.clear()
-    for thread in lookers:
-        thread.join()
-    assert all(taken)
+    with ThreadPoolExecutor(2) as threads:
+        lookers = [threads.submit(look) for _ in range(2)]
+        try:
+            for _ in range(50):
+                descriptor = take_lock(path)
+                taken.append(descriptor is not None)
+                release(descriptor)
+        finally:
+            looking.clear()
+    assert all(taken) and [looker.result() for looker in lookers] == [None, None]
+
+
+def test_a_lock_made_while_one_looks_was_not_held(tmp_path, monkeypatch):
+    path, opens = tmp_path / "lock", os.open
+
+    def late(name, *arguments):
+        try:
+            return opens(name, *arguments)
+        except FileNotFoundError:
+            path.touch()  # another makes it just then
+            raise
+
+    monkeypatch.setattr(os, "open", late)
+    assert not is_locked(path) and path.exists()
+
+
+def test_a_lock_that_cannot_be_opened_is_told(tmp_path):
+    (tmp_path / "lock").symlink_to("lock")
+    with pytest.raises(FileError, match="lock: cannot be opened"):
+        is_locked(tmp_path / "lock")
 
 
 def test_the_other_process_is_named_and_frees_it_by_ending(tmp_path):
