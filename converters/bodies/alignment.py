@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri  # the quantile of F, without the 0.3 s that importing scipy.stats takes
 
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix
@@ -209,9 +209,9 @@ def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
         rest = found.rms_m**2 * len(keep)
         if rest < 1e-18 * max(float((q - q.mean(axis=0)).var()), 1e-12) * k:
             rest = 1e-18  # exact pairs: only the rounding is left
-        limit = float(f_distribution.isf(OUTLIER_P / math.comb(k, count), 3 * count, freedom))
+        limit = float(fdtri(3 * count, freedom, 1 - OUTLIER_P / math.comb(k, count)))
         off = np.delete(np.arange(k), keep)
-        single = float(f_distribution.isf(OUTLIER_P / k, 3, freedom)) * 3 * rest / freedom
+        single = float(fdtri(3, freedom, 1 - OUTLIER_P / k)) * 3 * rest / freedom
         each_far = (_squared(found, p[off], q[off]) > single).all()
         if each_far and (full - rest) / (3 * count) > limit * rest / freedom:
             every[off] = False

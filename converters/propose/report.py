@@ -5,13 +5,7 @@ import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Patch, Polygon
 from shapely import MultiPoint
 
 from converters.bodies.alignment import apply_alignment
@@ -84,6 +78,12 @@ def _nearest_proposal(raw: RawScene, proposals: tuple[Proposal, ...], k: int) ->
 
 def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
     """The scan from above, proposals as boxes with class and confidence, retrieved models as outlines."""
+    import matplotlib  # 0.3 s that no conversion needs
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import Patch, Polygon
+
     figure, axes = plt.subplots(figsize=(9, 9), dpi=110)
     keep = raw.scan.labels != CEILING
     vertices = raw.scan.vertices[keep]
