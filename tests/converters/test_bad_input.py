@@ -25,6 +25,7 @@ from scenes_mjcf.schema import load_manifest
 from tests.converters import tiny_raw
 
 SMALL = ConvertConfig(structure_texture=64, object_texture=32)
+WORDS = ("structure_texture=64", "object_texture=32")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -85,9 +86,9 @@ def test_coacd_failing_on_one_object(gibson_raw, tmp_path, monkeypatch):
 def test_the_timeout_is_an_option(gibson_raw, tmp_path, monkeypatch):
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
     source, out = str(gibson_raw), tmp_path / "out"
-    assert main(["convert", source, str(out), "--timeout", "0.001", "--strict"]) == 2
+    assert main(["convert", source, str(out), "--timeout", "0.001", "--strict", *WORDS]) == 2
     assert not out.exists()
-    assert main(["convert", source, str(out), "--timeout", "0.001"]) == 1  # the gate on what is hit unseen
+    assert main(["convert", source, str(out), "--timeout", "0.001", *WORDS]) == 1  # the gate on what is hit unseen
     assert not load_manifest(out).gates["unseen_hulls"]["passed"]
     assert load_manifest(out).collision["convex_hull_only"] == ["basket-a", "table-a"]
 
@@ -161,7 +162,7 @@ def test_disk_full_at_any_file(pristine, tmp_path, capsys, cached, monkeypatch, 
     out = tmp_path / "scenes" / "out"
     out.mkdir(parents=True)
     (out / "old.bin").write_bytes(b"old")
-    assert main(["convert", str(pristine / "gibson"), str(out), "--overwrite"]) == 2
+    assert main(["convert", str(pristine / "gibson"), str(out), "--overwrite", *WORDS]) == 2
     error = one_line(capsys)
     assert "No space left on device" in error and str(out) in error and "nothing was written" in error
     assert [p.name for p in out.parent.iterdir()] == ["out"] and contents(out) == {"old.bin": b"old"}
@@ -200,7 +201,7 @@ def test_a_signal_in_any_stage_leaves_nothing(pristine, tmp_path, capsys, cached
     before = signal.getsignal(signal.SIGTERM)
     out = tmp_path / "scenes" / "out"
     try:
-        assert main(["convert", str(pristine / "gibson"), str(out)]) == code
+        assert main(["convert", str(pristine / "gibson"), str(out), *WORDS]) == code
     finally:
         signal.signal(signal.SIGTERM, before)
     assert capsys.readouterr().err == f"{word}; nothing was written\n"
@@ -271,7 +272,7 @@ def test_a_map_of_the_wrong_place_names_both_extents(gibson_raw):
 
 def test_warnings_are_printed_and_kept(gibson_raw, tmp_path, capsys, cached):
     (gibson_raw / "paint.png").unlink()
-    assert main(["convert", str(gibson_raw), str(tmp_path / "out")]) == 0
+    assert main(["convert", str(gibson_raw), str(tmp_path / "out"), *WORDS]) == 0
     out = " ".join(capsys.readouterr().out.split())
     (kept,) = json.loads((tmp_path / "out" / "scene.json").read_text())["warnings"]
     assert f"warning: {kept}" in out

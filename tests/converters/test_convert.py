@@ -186,7 +186,8 @@ def test_convert_exits_one_when_a_gate_fails_and_keeps_the_scene(pristine, tmp_p
     monkeypatch.setitem(LIMITS, "walls", Limit("count", most=0))
     monkeypatch.setattr("converters.check.gates.free_space_warnings", lambda maps: ("a room is cut off",))
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
-    assert main(["convert", str(pristine / "gibson"), str(tmp_path / "out")]) == 1
+    words = ["structure_texture=128", "object_texture=32"]
+    assert main(["convert", str(pristine / "gibson"), str(tmp_path / "out"), *words]) == 1
     printed = capsys.readouterr().out
     assert "gates that fail: walls" in printed and "warning: a room is cut off" in printed
     assert load_manifest(tmp_path / "out").gates["walls"]["passed"] is False

@@ -94,6 +94,7 @@ def tab(address: str, profile: Path) -> Iterator[Tab]:
         pytest.skip(f"no Chromium on this machine (one of {', '.join(PROGRAMS)}; Debian: apt install chromium)")
     words = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--remote-debugging-port=0"]
     words += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", f"--window-size={WIDTH},{HEIGHT}"]
+    words += ["--disable-background-networking", "--disable-component-update", "--disable-extensions", "--disable-sync"]
     with subprocess.Popen(
         [program, *words, f"--user-data-dir={profile}", address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as running:

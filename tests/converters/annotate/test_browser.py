@@ -34,6 +34,9 @@ def opened(source, folder):
     store, proposals = Store(folder, read_library(source)), propose_instances(raw.scan)
     session = store.save(store.open(raw, lambda: start(raw, proposals)))
     server, address = guarded_server("127.0.0.1", 0, raw.name)
+    # Without a GPU reflections and shadows take half of the time, and no test looks at them.
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(cast_shadow=False)
     try:
         yield Page(server, store, session, raw, proposals), address
     finally:

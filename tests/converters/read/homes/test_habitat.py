@@ -121,7 +121,7 @@ def test_one_scene_of_many_is_named_by_its_file_and_converts(source, tmp_path):
     try:
         with pytest.raises(SceneRejected, match="scenes are apt_0, apt_1, expected one; give the file of one"):
             read_habitat(source)
-        assert main(["convert", str(one), str(tmp_path / "flat")]) == 0
+        assert main(["convert", str(one), str(tmp_path / "flat"), "structure_texture=64"]) == 0
     finally:
         other.unlink()
     manifest = load_manifest(tmp_path / "flat")

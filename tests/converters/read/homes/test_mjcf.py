@@ -206,7 +206,7 @@ def test_a_folder_that_may_be_read_is_named(tmp_path, capsys, monkeypatch, hull_
     (root / "parts").rename(tmp_path / "assets" / "parts")
     change(root, ('meshdir="parts"', 'meshdir="../parts"'))
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
-    command = ["convert", str(root / "home.xml"), str(tmp_path / "out"), "--jobs", "1"]
+    command = ["convert", str(root / "home.xml"), str(tmp_path / "out"), "--jobs", "1", "structure_texture=64"]
     assert main(command) == 2 and "--root DIR" in " ".join(capsys.readouterr().err.split())
     assert main([*command, "--root", str(tmp_path / "assets")]) == 0
     assert {o.category for o in load_manifest(tmp_path / "out").objects} == {"chair", "table"}
