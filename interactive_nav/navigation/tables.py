@@ -114,9 +114,10 @@ def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndar
         return jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(tables.start_xy_w[scene])  # type: ignore[arg-type]
 
     known, rng = [], np.random.default_rng(0)
+    all_starts, all_goals = np.asarray(tables.start_xy_w), np.asarray(tables.goal_xy_w)
     for i, scene in enumerate(world.scenes):
-        starts = np.asarray(tables.start_xy_w[i, : tables.num_starts[i]])
-        goals = np.asarray(tables.goal_xy_w[i, : tables.num_goals[i]])
+        starts = all_starts[i, : tables.num_starts[i]]
+        goals = all_goals[i, : tables.num_goals[i]]
         farthest_m = _farthest(starts, goals)
         most_m = farthest_m.max(initial=0.0)
         if not len(farthest_m) or most_m < least_m:
@@ -176,17 +177,18 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
 
     seen = [np.where(g.seen < len(g.corner_xy_w), g.seen, count) for g in graphs]
     extent = max(math.hypot(*g.free.shape) * g.fine_m for g in graphs)
-    return {
-        "node_of_cell": jnp.asarray(_pad([g.node_of_cell for g in graphs], 2), jnp.int32),
-        "grid_origin_w": jnp.asarray([g.origin_w for g in graphs], jnp.float32),
-        "node_xy_w": jnp.asarray(_pad([g.node_xy_w for g in graphs], 1), jnp.float32),
-        "seen": jnp.asarray(_pad(seen, 2, fill=count).astype(index)),
-        "corner_xy_w": jnp.asarray(
-            np.stack([np.pad(g.corner_xy_w, [(0, count + 1 - len(g.corner_xy_w)), (0, 0)]) for g in graphs])
-        ),
-        "corner_distance_m": jnp.asarray(np.stack([squared(g.distance_m, np.inf) for g in graphs]), jnp.float32),
-        "next_corner": jnp.asarray(np.stack([squared(g.next_corner, count) for g in graphs]).astype(index)),
-        "free": jnp.asarray(_pad([g.free for g in graphs], 2)),
+    corners = [np.pad(g.corner_xy_w, [(0, count + 1 - len(g.corner_xy_w)), (0, 0)]) for g in graphs]
+    arrays = {
+        "node_of_cell": np.int32(_pad([g.node_of_cell for g in graphs], 2)),
+        "grid_origin_w": np.asarray([g.origin_w for g in graphs], np.float32),
+        "node_xy_w": np.float32(_pad([g.node_xy_w for g in graphs], 1)),
+        "seen": _pad(seen, 2, fill=count).astype(index),
+        "corner_xy_w": np.stack(corners),
+        "corner_distance_m": np.asarray([squared(g.distance_m, np.inf) for g in graphs], np.float32),
+        "next_corner": np.stack([squared(g.next_corner, count) for g in graphs]).astype(index),
+        "free": _pad([g.free for g in graphs], 2),
+    }
+    return jax.device_put(arrays) | {
         "cell_m": graphs[0].cell_m,
         "fine_m": graphs[0].fine_m,
         "sight_samples": math.ceil(extent / (SIGHT_STEP_CELLS * graphs[0].fine_m)),
@@ -205,10 +207,10 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
     mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.mass_kg], 1)
 
     def f32(value) -> jnp.ndarray:
-        return jnp.asarray(value, jnp.float32)
+        return jax.device_put(np.asarray(value, np.float32))
 
     def i32(value) -> jnp.ndarray:
-        return jnp.asarray(value, jnp.int32)
+        return jax.device_put(np.asarray(value, np.int32))
 
     tables = SceneTables(
         rest_qpos=f32(world.rest_qpos),
@@ -221,6 +223,6 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         num_goals=i32([len(p[2]) for p in places]),
         clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
         num_clutter=i32([len(p[3]) for p in places]),
-        known_pairs_xy_w=jnp.zeros((len(places), 1, 2, 2)),
+        known_pairs_xy_w=f32(np.zeros((len(places), 1, 2, 2))),
     )
     return tables.replace(known_pairs_xy_w=f32(_known_pairs(world, tables, rules)))

@@ -118,7 +118,7 @@ class Window:
         self._wall_rows = self.model.body_geomadr[self.layout.structure_body] + np.arange(self.n_walls)
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
-        self._xpos, self._xmat = jnp.asarray(xpos, jnp.float32), jnp.asarray(xmat, jnp.float32)
+        self._xpos, self._xmat = jax.device_put((np.float32(xpos), np.float32(xmat)))
 
     @functools.cached_property
     def needs_at_rest(self) -> dict[str, np.ndarray]:
@@ -136,7 +136,7 @@ class Window:
                 if name in hidden:
                     values = np.where(padding.reshape(padding.shape + (1,) * (values.ndim - 2)), hidden[name], values)
                 tables[name].append(values)
-        return {name: jnp.asarray(np.stack(values), jnp.float32) for name, values in tables.items()}, outer
+        return jax.device_put({name: np.float32(np.stack(values)) for name, values in tables.items()}), outer
 
     def _walls(self) -> dict[str, jax.Array]:
         world, body = self.world, self.world.layout.structure_body
@@ -146,7 +146,7 @@ class Window:
         poses = [_static_poses(m) for m in world.models]
         tables["xpos"] = np.stack([xpos[own] for xpos, _ in poses])
         tables["xmat"] = np.stack([xmat[own] for _, xmat in poses])
-        return {k: jnp.asarray(v, jnp.float32) for k, v in tables.items()}
+        return jax.device_put({k: np.float32(v) for k, v in tables.items()})
 
     def measure(self, scene: jax.Array, state: PhysicsState) -> Measured:
         """See `Nearness.measure`: of one environment's scene, [] i32, and state of the whole world."""

@@ -196,7 +196,7 @@ def make_encoder(
         )
     module, zeros = Encoder(config, images), {name: jnp.zeros((1, *shape)) for name, shape in size.items()}
     return FeedForwardNetwork(
-        init=lambda key: module.init(key, zeros),
+        init=jax.jit(lambda key: module.init(key, zeros)),  # as one program, not one for each operation
         apply=lambda statistics, params, observation: module.apply(params, prepare(observation, statistics)),
     )
 
@@ -253,7 +253,7 @@ def make_split(
         assert isinstance(out, jax.Array)
         return out[..., 0] if squeeze else out
 
-    return Split(encoder, FeedForwardNetwork(init=lambda key: head.init(key, features, *action), apply=apply))
+    return Split(encoder, FeedForwardNetwork(init=jax.jit(lambda key: head.init(key, features, *action)), apply=apply))
 
 
 @dataclasses.dataclass(frozen=True)

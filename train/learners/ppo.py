@@ -83,7 +83,7 @@ class PPOParts:
         else:
             params = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
         return PPOState(
-            optimizer_state=self.optimizer.init(params),
+            optimizer_state=jax.jit(self.optimizer.init)(params),
             params=params,
             normalizer_params=nets.init_normalizer(self.observation_size),
             key=key,
