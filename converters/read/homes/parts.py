@@ -266,6 +266,8 @@ def _furniture(
     name, pose, hinge = "other" if category is None else category.name, part.pose, None
     if name == "door":
         turn = leaf_turn(vertices)
+        if part.swing is not None and ((vertices.mean(axis=0) - part.swing[0]) @ turn)[0] < 0:
+            turn = turn * [-1.0, -1.0, 1.0]  # one of its two frames: a leaf lies along x from its hinge
         vertices, pose = vertices @ turn, pose.copy()
         surface = dataclasses.replace(surface, vertices=surface.vertices @ turn)
         pose[:3, :3] = pose[:3, :3] @ turn

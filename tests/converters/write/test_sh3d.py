@@ -97,6 +97,8 @@ def test_leaves_turn_as_far_to_the_same_side(drawing):
         hinge = ends[int(np.argmin(off))].hinge
         assert min(off) < 0.002 and hinge is not None
         assert hinge.range_rad == pytest.approx(body.joints[0].range, abs=0.1)
+        pose = ends[int(np.argmin(off))].pose
+        assert np.hypot(*(pose[:2, 0] - turn[:2, 0])) < 0.1, f"door_{k}: its frame is turned, not only the leaf"
 
 
 def test_hulls_come_back_in_their_pieces(drawing):
