@@ -16,6 +16,8 @@ ALPHAS = tuple(k / 10 for k in range(11))
 LARGE = ("sofa", "table", "desk", "bed", "sideboard", "dresser", "bookcase")
 MEDIUM = ("basket", "laundry_basket", "bin", "box", "bag", "stool")
 SMALL = ("shoe", "pot", "toy")
+Cells = dict[tuple[str, str, float], list[RunMean]]
+"""Runs by robot, algorithm and k_int."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,16 +58,26 @@ def _of_sac(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
                 what = f"{robot}: INS_{alpha:g}, SAC minus {other.upper()}, mean over k_int"
                 yield _compared(means, claim, what, "higher", alpha, "algorithm", "sac", other, robot=robot)
     of_robot = {cell: runs for cell, runs in cells(means).items() if cell[0] == robot}
-    best = collections.Counter(
-        max(of_robot, key=lambda cell: estimate(run.ins(alpha) for run in of_robot[cell]).mean) for alpha in ALPHAS[1:]
-    )
+    best = collections.Counter(_best(of_robot, alpha) for alpha in ALPHAS[1:])
     told = (f"{algorithm.upper()}, k_int = {k_int:g}: {count}" for (_, algorithm, k_int), count in best.most_common())
     yield Finding(
         "SAC with k_int = 0.1 is best at every alpha but 0",
         f"{robot}: cell of the highest mean INS at alpha 0.1, 0.2, ... 1",
         "; ".join(told),
-        "holds" if set(best) == {(robot, "sac", 0.1)} else "does not hold",
+        _best_verdict(of_robot, ("sac", 0.1) in {cell[1:] for cell in of_robot}, set(best) == {(robot, "sac", 0.1)}),
     )
+
+
+def _best(of_robot: Cells, alpha: float) -> tuple[str, str, float]:
+    """The cell of the highest mean INS."""
+    return max(of_robot, key=lambda cell: estimate(run.ins(alpha) for run in of_robot[cell]).mean)
+
+
+def _best_verdict(of_robot: Cells, is_there: bool, holds: bool) -> str:
+    """On a claim that one cell is the best of several."""
+    if not is_there or len(of_robot) < 2:
+        return "no runs to compare"
+    return "holds" if holds else "does not hold"
 
 
 def _of_things(means: Sequence[RunMean]) -> Iterator[Finding]:
@@ -103,15 +115,13 @@ def _of_things(means: Sequence[RunMean]) -> Iterator[Finding]:
 
 def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
     """What k_int does to one robot's scores."""
-    by_cell = {
-        cell: estimate(run.ins(0.0) for run in runs).mean for cell, runs in cells(means).items() if cell[0] == robot
-    }
-    best = max(by_cell, key=lambda cell: by_cell[cell])
+    of_robot = {cell: runs for cell, runs in cells(means).items() if cell[0] == robot}
+    best = _best(of_robot, 0.0)
     yield Finding(
         "k_int = 1 is best at alpha = 0",
         f"{robot}: cell of the highest mean INS_0",
-        f"{best[1].upper()}, k_int = {best[2]:g}: {by_cell[best]:.3f}",
-        "holds" if best[2] == 1.0 else "does not hold",
+        f"{best[1].upper()}, k_int = {best[2]:g}: {estimate(run.ins(0.0) for run in of_robot[best]).mean:.3f}",
+        _best_verdict(of_robot, 1.0 in {cell[2] for cell in of_robot}, best[2] == 1.0),
     )
     for k, claim, expectations in (
         (1.0, "k_int = 1 gains effort efficiency and loses path efficiency", ("higher", "lower")),

@@ -137,8 +137,12 @@ def test_claims_that_fail_say_so_and_missing_runs_too():
     seen = next(f for f in found.values() if f.claim == "Seen and unseen scenes do not differ")
     assert seen.verdict == "does not hold: lower" and "18 runs" in seen.compared
     only_ppo = [table for table in tables if table["algorithm"][0].as_py() == "ppo"]
-    first = claims(pa.concat_tables(only_ppo), "train")[0]
-    assert first.verdict == "no runs of sac and ppo to compare"
+    found = {f.compared: f for f in claims(pa.concat_tables(only_ppo), "train")}
+    assert found["turtlebot: INS_0.5, SAC minus PPO, mean over k_int"].verdict == "no runs of sac and ppo to compare"
+    assert found["turtlebot: cell of the highest mean INS at alpha 0.1, 0.2, ... 1"].verdict == "no runs to compare"
+    assert found["turtlebot: cell of the highest mean INS_0"].verdict == "does not hold"
+    found = {f.compared: f for f in claims(pa.concat_tables(only_ppo[:3]), "train")}  # k_int 0 alone
+    assert found["turtlebot: cell of the highest mean INS_0"].verdict == "no runs to compare"
 
 
 def things_touched(rows: pa.Table, wanted: bool) -> pa.Table:
