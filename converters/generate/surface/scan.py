@@ -61,8 +61,7 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
     for owner, item in [(-1, i) for i in plan.built_in] + list(enumerate(items)):
         label = NYU40[item.model.category]
         for part in item.model.parts:
-            mesh = item.to_floor(part.vertices), part.faces
-            solid = solid_from_mesh(*mesh, label, part.material, owner)
+            solid = solid_from_mesh(item.to_floor(part.vertices), part.faces, label, part.material, owner)
             solids.append(dataclasses.replace(solid, item=item))
     return solids
 
@@ -92,19 +91,20 @@ def seen_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volu
     seen = np.zeros(len(points), bool)
     start = points + normals * 1.6 * volume.voxel_m
     step = 1.5 * volume.voxel_m
+    free = dataclasses.replace(volume, sdf=volume.sdf > 0)
     for camera in cameras:
         ray = camera - start
         length = np.linalg.norm(ray, axis=1)
         facing = np.einsum("ij,ij->i", ray, normals) > GRAZING * length
         index = np.flatnonzero(~seen & facing & (length < RANGE_M))
-        direction = ray[index] / length[index, None]
         at, left = start[index], length[index]
+        stride = ray[index] / left[:, None] * step
         while len(index):
-            keep = volume.sample(at) > 0
+            keep = free.sample(at)
             seen[index[keep & (left <= 0)]] = True
-            keep &= left > 0
-            index, direction, left = index[keep], direction[keep], left[keep] - step
-            at = at[keep] + direction * step
+            on = np.flatnonzero(keep & (left > 0))
+            index, left, stride = index[on], left[on] - step, stride.take(on, axis=0)
+            at = at.take(on, axis=0) + stride
     return seen
 
 
@@ -125,11 +125,9 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
 
 
 def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
-    """For each point the solid whose surface is nearest, and the label of the nearest one of another class.
+    """For each of (n, 3) points the solid whose surface is nearest, and the label of the nearest one of another class.
 
     Args:
-        points: (n, 3).
-        solids: candidates.
         reach_m: how far a solid may be to count.
 
     Returns:
@@ -139,8 +137,13 @@ def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.1
     best = np.full(len(points), np.inf)
     index = np.zeros(len(points), np.int64)
     by_label = {s.label: np.full(len(points), np.inf) for s in solids}
+    order = np.argsort(points[:, 0])
+    x, yz = points[order, 0], points[:, 1:].T.copy()
     for k, s in enumerate(solids):
-        near = np.flatnonzero(((points > s.low - reach_m) & (points < s.high + reach_m)).all(axis=1))
+        near = order[np.searchsorted(x, s.low[0] - reach_m, "right") : np.searchsorted(x, s.high[0] + reach_m)]
+        for column, low, high in zip(yz, s.low[1:] - reach_m, s.high[1:] + reach_m, strict=True):
+            near = near[(column[near] > low) & (column[near] < high)]
+        near.sort()
         # Signed, so that a point inside two solids belongs to the one it is deepest in.
         distance = s.distance(points[near])
         labelled = by_label[s.label]
@@ -151,9 +154,7 @@ def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.1
     own = np.array([s.label for s in solids])[index]
     labels = np.array(sorted(by_label))
     table = np.stack([np.where(own == lab, np.inf, by_label[int(lab)]) for lab in labels], axis=1)
-    closest = table.argmin(axis=1)
-    other = np.where(table.min(axis=1) < 0.05, labels[closest], 0)
-    return index, other
+    return index, np.where(table.min(axis=1) < 0.05, labels[table.argmin(axis=1)], 0)
 
 
 def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: np.random.Generator) -> Scan:
@@ -173,8 +174,7 @@ def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: n
     # Glossy spots return no depth either.
     spots = vertices[rng.integers(len(vertices), size=max(3, int(0.15 * o.area_m2)))]
     for spot in spots:
-        radius = rng.uniform(0.04, 0.11)
-        seen &= ((vertices - spot) ** 2).sum(axis=1) > radius**2
+        seen &= ((vertices - spot) ** 2).sum(axis=1) > rng.uniform(0.04, 0.11) ** 2
     vertices, faces = compact(vertices, faces[seen[faces].all(axis=1)], 60)
     index, _ = nearest_solids(vertices, solids)
     movable = np.array([s.owner for s in solids])[index] >= 0

@@ -70,9 +70,9 @@ class Volume:
 
     def sample(self, points: np.ndarray) -> np.ndarray:
         """(n, 3) -> (n,) value at the nearest voxel; outside the grid: that of its border."""
-        index = ((points - self.origin) / self.voxel_m + 0.5).astype(np.int32)
-        i, j, k = (np.clip(index[:, d], 0, self.sdf.shape[d] - 1) for d in range(3))
-        return self.sdf[i, j, k]
+        index = (points - self.origin) / self.voxel_m + 0.5
+        i, j, k = (np.clip(index[:, d].astype(np.int32), 0, size - 1) for d, size in enumerate(self.sdf.shape))
+        return self.sdf.ravel().take((i * self.sdf.shape[1] + j) * self.sdf.shape[2] + k)
 
 
 def fuse(solids: list[Solid], low: np.ndarray, high: np.ndarray, voxel_m: float) -> Volume:
@@ -108,8 +108,7 @@ def surface_nets(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     points, cells, flips = [], [], []
     for axis in range(3):
-        first = [slice(None)] * 3
-        second = [slice(None)] * 3
+        first, second = [slice(None)] * 3, [slice(None)] * 3
         first[axis], second[axis] = slice(None, -1), slice(1, None)
         # Only edges with all four neighbouring cells inside the grid make a quad.
         for other in {0, 1, 2} - {axis}:
