@@ -12,19 +12,21 @@ from typing import Any
 STOPS = (signal.SIGINT, signal.SIGTERM)
 Handler = Callable[[int, FrameType | None], Any]
 _AGAIN_S = 0.05
+_LOST_IN = ("<frozen importlib._bootstrap>", "jax/_src/compiler.py", "jax/_src/callback.py")
 
 
 def heard(handler: Handler) -> Handler:
     """A handler that raises, where what it raises is not lost.
 
     Some modules catch all that happens while they import others, and nothing leaves a destructor or a callback of the
-    garbage collector or of a weak reference. There the signal comes again a moment later.
+    garbage collector or of a weak reference. JAX makes an error of its own of what leaves a callback, and a compilation
+    that is left runs on and crashes the interpreter at its end. There the signal comes again a moment later.
     """
 
     def raising(number: int, frame: FrameType | None) -> None:
         within = frame
         while within:
-            if within.f_code.co_filename.startswith("<frozen importlib"):
+            if within.f_code.co_filename.endswith(_LOST_IN):
                 return _come_again(number)
             within = within.f_back
         try:

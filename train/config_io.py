@@ -79,6 +79,10 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
         ConfigError: no such config, or one of its values or an override is wrong.
     """
     path, plain = read_file(name_or_path, PRESET_DIR, "preset", "--config: ")
+    if isinstance(plain, dict) and {"preset", "grid"} & plain.keys():
+        raise ConfigError(
+            f"--config: {path.name} is a sweep, expected one run; python -m train.sweep {path} trains all"
+        )
     config = apply_overrides(from_dict(plain, where=path.name), overrides)
     if not config.run.name:
         run = dataclasses.replace(config.run, name=f"{path.stem}-seed{config.run.seed}")

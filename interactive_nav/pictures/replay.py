@@ -22,6 +22,7 @@ from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
 from interactive_nav_common.errors import UserError, readable
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.signals import signals_wait
 from scenes_mjcf.categories import MaskClasses
 
 FORMAT = 1
@@ -137,7 +138,11 @@ class EpisodePlayer:
         first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
         start_qpos, told = np.asarray(state.pipeline_state.qpos), []
         while not told or not told[-1]["done"]:
-            state, out = self._step(state, self._policy(state.obs, policy_key, len(told)))
+            action = self._policy(state.obs, policy_key, len(told))
+            with (
+                signals_wait()
+            ):  # raised within the physics' callbacks it is another error; physics left behind crashes
+                state, out = jax.block_until_ready(self._step(state, action))
             told.append(jax.tree.map(np.asarray, out))
             on_progress(len(told))
         joined = {name: np.stack([out[name] for out in told]) for name in told[0]}

@@ -1,11 +1,14 @@
 """Signals that come where Python loses what their handlers raise."""
 
 import gc
+import os
 import signal
 import sys
+import threading
 import time
 import weakref
 
+import jax
 import pytest
 
 from interactive_nav_common.signals import heard, interrupts_heard
@@ -59,6 +62,38 @@ def test_one_where_nothing_can_be_raised_comes_after_it(lose):
     with pytest.raises(KeyboardInterrupt), interrupts_heard():
         lose()
         reached.append(lose)
+        time.sleep(5)
+    assert reached
+
+
+def compiled() -> None:
+    """Takes half a second; 0.2 s into it the signal comes."""
+
+    def long(x):
+        for k in range(400):
+            x = jax.numpy.sin(x @ x) + k
+        return x
+
+    lowered = jax.jit(long).lower(jax.numpy.ones((8, 8)))
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    lowered.compile()
+
+
+def called_back() -> None:
+    def on_host(x):
+        interrupted()
+        return x
+
+    jax.block_until_ready(jax.jit(lambda x: jax.pure_callback(on_host, x, x))(jax.numpy.ones(2)))
+
+
+@pytest.mark.parametrize("run", [compiled, called_back])
+def test_one_within_jax_comes_after_it(run):
+    """A compilation left behind crashes the interpreter at its end; in a callback what is raised is JAX's error."""
+    reached = []
+    with pytest.raises(KeyboardInterrupt), interrupts_heard():
+        run()
+        reached.append(run)
         time.sleep(5)
     assert reached
 

@@ -150,6 +150,8 @@ def test_resolve_fills_what_was_left_open(backend):
 
 
 def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ConfigError, match=r"kint.yaml is a sweep, expected one run; python -m train.sweep .*kint.yaml"):
+        load("sweeps/kint")
     with pytest.raises(ConfigError, match="no preset 'demos', did you mean 'demo'"):
         load("demos")
     with pytest.raises(ConfigError, match="No such file"):
