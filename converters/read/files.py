@@ -1,6 +1,7 @@
 """Paths in; meshes, images, JSON and hashes out; a failure is one `SceneRejected` line."""
 
 import dataclasses
+import functools
 import hashlib
 import math
 import os
@@ -29,9 +30,8 @@ class SourceFolder:
             raise SceneRejected(f"{root}: no such folder; give the folder that holds the raw scene")
         if not root.is_dir():
             raise SceneRejected(f"{root}: is a file, expected the folder that holds the raw scene")
-        self.root = root
-        self.strict = strict
-        self.remedy = remedy
+        self.root, self.strict, self.remedy = root, strict, remedy
+        self.resolve = functools.cache(Path.resolve)
         self.sha256: dict[str, str] = {}
         self.warnings: list[str] = []
         self.surfaces: dict[str, Any] = {}
@@ -77,12 +77,12 @@ class SourceFolder:
             SceneRejected: it leads out of the folder, or it is no path at all (a NUL byte, a loop of links).
         """
         try:
-            end = path.resolve()
+            end, root = self.resolve(path), self.resolve(self.root)
         except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
             raise SceneRejected(f"{path}: leads nowhere ({error}); put the file itself there") from error
-        if not end.is_relative_to(self.root.resolve()):
+        if not end.is_relative_to(root):
             raise SceneRejected(f"{path}: leads out of the source folder, to {end}; {self.remedy}")
-        return end.relative_to(self.root.resolve()).as_posix()
+        return end.relative_to(root).as_posix()
 
     def note(self, message: str) -> None:
         """Records something the user should know; it goes into scene.json, so it names no absolute path."""
