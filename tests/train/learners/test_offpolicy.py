@@ -14,7 +14,7 @@ from brax.training import types
 from scipy.stats import kstest
 
 from interactive_nav_common.errors import ConfigError
-from tests.train.learners.test_ppo import Recorder
+from tests.train.learners.test_ppo import Recorder, copy_snapshot
 from tests.train.toy_env import ToyConfig, ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import DDPGConfig, EnvConfig, OffPolicyConfig, RunConfig, SACConfig, TrainConfig
@@ -99,10 +99,10 @@ def test_who_never_learned_acts_at_random(straight, algorithm):
 
 @both
 def test_resumed_run_equals_uninterrupted_one(straight, algorithm):
-    """Six updates, against four, a snapshot with its replay, and two more: the same numbers to the last bit."""
+    """Six updates, against two more from the snapshot after four, with its replay: the same to the last bit."""
     recorder, whole = straight[algorithm]
-    half, _ = run(algorithm, 4)
-    rest, resumed = run(algorithm, 6, resume=half.saved[-1])
+    half = next(s for s in recorder.saved if s.env_steps == 4 * STEPS)
+    rest, resumed = run(algorithm, 6, resume=copy_snapshot(half))
     assert whole.env_steps == resumed.env_steps == 6 * STEPS
     jax.tree.map(np.testing.assert_array_equal, whole.learner, resumed.learner)
     jax.tree.map(np.testing.assert_array_equal, whole.env_state, resumed.env_state)

@@ -159,26 +159,31 @@ def test_episode_sums_count_ended_episodes_only():
     assert float(sums["success"]) == 1.5 and float(sums["episodes"]) == 2.0
 
 
-def test_resumed_run_equals_uninterrupted_one():
-    """Four updates, against two, a snapshot, and two more from it: the same numbers to the last bit."""
-    straight, half = Recorder(), Recorder()
-    whole = ALGORITHMS["ppo"].train(batched(), make_config(4), straight).snapshot
-    ALGORITHMS["ppo"].train(batched(), make_config(2), half)
-    rest = Recorder(resume=half.saved[-1])
+@pytest.fixture(scope="module")
+def straight() -> tuple[Recorder, Snapshot]:
+    """Four updates at once, with a snapshot after two."""
+    seen = Recorder()
+    return seen, ALGORITHMS["ppo"].train(batched(), make_config(4), seen).snapshot
+
+
+def test_resumed_run_equals_uninterrupted_one(straight):
+    """Four updates, against two more from the snapshot after two: the same numbers to the last bit."""
+    recorder, whole = straight
+    half = recorder.saved[0]
+    assert half.env_steps == 2 * 256
+    rest = Recorder(resume=copy_snapshot(half))
     resumed = ALGORITHMS["ppo"].train(batched(), make_config(4), rest).snapshot
     assert whole.env_steps == resumed.env_steps == 4 * 256
     jax.tree.map(np.testing.assert_array_equal, whole.learner, resumed.learner)
     jax.tree.map(np.testing.assert_array_equal, whole.env_state, resumed.env_state)
     assert [steps for steps, _ in rest.logs] == [768, 1024]
-    before, after = straight.logs[-1][1], rest.logs[-1][1]
+    before, after = recorder.logs[-1][1], rest.logs[-1][1]
     same = [name for name in before if name not in ("env_steps_per_s", "compile_s")]
     assert {name: before[name] for name in same} == {name: after[name] for name in same}
 
 
-def test_resume_without_environments_begins_new_episodes():
-    half = Recorder()
-    ALGORITHMS["ppo"].train(batched(), make_config(2), half)
-    rest = Recorder(resume=dataclasses.replace(half.saved[-1], env_state=None))
+def test_resume_without_environments_begins_new_episodes(straight):
+    rest = Recorder(resume=dataclasses.replace(copy_snapshot(straight[0].saved[0]), env_state=None))
     result = ALGORITHMS["ppo"].train(batched(), make_config(3), rest)
     assert result.snapshot.env_steps == 3 * 256 and result.completed
     # The first update restarts 16 episodes at step 0: after 16 steps none has run longer than that.
