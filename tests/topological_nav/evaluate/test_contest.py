@@ -30,9 +30,9 @@ from topological_nav.navigate.state import DRIVE
 from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
-WORDS = ("episodes=2", "batch=2", "images=6", "limit_s=22", "backend=native", "max_turn_rad_s=2.0", "passable=0.05")
+WORDS = ("episodes=2", "batch=2", "images=6", "limit_s=12", "backend=native", "max_turn_rad_s=2.0", "passable=0.05")
 CONFIG = EvaluationConfig.of(
-    episodes=2, batch=2, images=6, limit_s=22.0, backend="native", max_turn_rad_s=2.0, passable=0.05
+    episodes=2, batch=2, images=6, limit_s=12.0, backend="native", max_turn_rad_s=2.0, passable=0.05
 )
 
 

@@ -193,7 +193,7 @@ def test_resume_without_environments_begins_new_episodes(straight):
 
 @pytest.mark.slow
 def test_learns_the_toy():
-    """From random (about 0.2 success) to at least 0.95 in 100,000 steps."""
+    """From random to at least 0.95 success: 0.992 to 1.0 of five seeds, 0 where nothing is paid."""
     config = TrainConfig(
         env=EnvConfig(scenes=("toy",)),
         ppo=PPOConfig(
@@ -201,12 +201,12 @@ def test_learns_the_toy():
             unroll_length=16,
             batch_size=64,
             num_minibatches=4,
-            learning_rate=1e-3,
+            learning_rate=2e-3,
             discounting=0.97,
             policy_hidden_layer_sizes=(64, 64),
             value_hidden_layer_sizes=(64, 64),
         ),
-        run=RunConfig(num_timesteps=120_000, log_every_steps=8_192, checkpoint_every_steps=120_000),
+        run=RunConfig(num_timesteps=65_536, log_every_steps=8_192, checkpoint_every_steps=65_536),
     )
     seen = Recorder()
     result = ALGORITHMS["ppo"].train(batched(), config, seen)
