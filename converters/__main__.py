@@ -170,7 +170,12 @@ def _propose(arguments: argparse.Namespace, console: Console) -> None:
     console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
 
 
-def _annotate(arguments: argparse.Namespace, console: Console) -> None:
+def _number(stop: KeyboardInterrupt) -> int:
+    """Of the signal that raised it."""
+    return getattr(stop, "lost_signal", signal.SIGINT)
+
+
+def _annotate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.annotate.browser import Page
     from converters.annotate.guard import guarded_server
     from converters.annotate.session import Store, start
@@ -187,12 +192,15 @@ def _annotate(arguments: argparse.Namespace, console: Console) -> None:
         server, address = guarded_server(arguments.host, arguments.port, raw.name)
         page = Page(server, store, session, raw, proposals)
         console.print(f"{address} (Ctrl-C ends it; every action is saved)", soft_wrap=True, highlight=False)
-        with contextlib.suppress(KeyboardInterrupt):
+        try:
             threading.Event().wait()
+        except KeyboardInterrupt as stop:
+            number = _number(stop)  # Ctrl-C is how it ends
         server.stop()
     states = [item.state for item in page.session.items]
     told = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
     console.print(f"{arguments.output}: {told}", soft_wrap=True)
+    return 0 if number == signal.SIGINT else 128 + number
 
 
 RUNS: dict[str, Any] = {
@@ -278,7 +286,7 @@ def main(argv: list[str] | None = None) -> int:
             refuse_unused(arguments, "--ray-address", "without --launcher ray")
         return arguments.run(arguments, console) or 0
     except KeyboardInterrupt as stop:
-        number = getattr(stop, "lost_signal", signal.SIGINT)
+        number = _number(stop)
         print(f"{'terminated' if number == signal.SIGTERM else 'interrupted'}; {written()}", file=sys.stderr)
         return 128 + number
     except OSError as error:
