@@ -169,7 +169,9 @@ def load_recipes(path: Path) -> Recipes:
         text = path.read_bytes()
     except OSError as error:
         why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
-        raise GenerationError(f"{path}: {why}; give the recipes with --recipes") from None
+        raise GenerationError(
+            f"{path}: {why}; name recipes by --recipes, or a set: python -m converters scenes make NAME"
+        ) from None
     return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 

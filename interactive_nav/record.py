@@ -298,7 +298,9 @@ def check_picture_words(arguments: argparse.Namespace) -> None:
     check_format(Path(arguments.out))
     check_height(arguments.height)
     if arguments.every < 1 or arguments.episode < 0:
-        raise ReplayError(f"--every {arguments.every} --episode {arguments.episode}: expected 1 and 0 or more")
+        raise ReplayError(
+            f"--every is {arguments.every}, expected 1 or more; --episode is {arguments.episode}, expected 0 or more"
+        )
 
 
 def record(source: Path, arguments: argparse.Namespace, console: Console) -> None:

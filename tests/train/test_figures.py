@@ -262,6 +262,13 @@ def test_unseen_scenes_are_shown_where_there_are_any():
     assert chosen_split(seen, "auto") == "train"
 
 
+def test_a_users_policies_are_drawn_in_colours_that_no_other_has():
+    names = ["follower", "mine", "avoider", "yours", "learned"]
+    colours = style.policy_colours(names)
+    assert set(colours) == set(names) and len(set(colours.values())) == 5
+    assert colours["follower"] == style.GREEN and colours["learned"] == style.BLUE
+
+
 def test_looks_keep_apart():
     names, k_ints = ("ppo", "td3", "a2c"), (0.0, 0.1, 1.0)
     looks = style.Looks({("fetch", name, k_int): [1] for name in names for k_int in k_ints})

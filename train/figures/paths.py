@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from train.figures import style
-from train.figures.style import policy_colour
+from train.figures.style import policy_colours
 
 FURNITURE_COLOUR = "#ecd9b8"
 MOVED_M = 0.02
@@ -43,7 +43,7 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
         _draw_episode(axis, paths, policies, i)
     grey: dict[str, Any] = {"color": "0.35", "linestyle": ""}
     handles = [
-        *(style.handle(policy, **_pen(policy, k)) for k, policy in enumerate(policies)),
+        *(style.handle(policy, **pen) for policy, pen in _pens(policies).items()),
         style.handle("start", marker="o", markerfacecolor="w", markersize=8, **grey),
         style.handle("goal", marker="*", markersize=11, **grey),
         style.handle("not reached", marker="x", **grey),
@@ -55,11 +55,14 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
     return figure
 
 
-def _pen(policy: str, k: int) -> dict[str, Any]:
-    """How the k-th policy is drawn: random walks, which go everywhere, thin and grey."""
-    if policy == "random":
-        return {"color": "0.6", "linestyle": "-", "linewidth": 0.7}
-    return {"color": policy_colour(policy, k), "linestyle": LINES[k % len(LINES)], "linewidth": 1.6}
+def _pens(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """How each policy is drawn: random walks, which go everywhere, thin and grey."""
+    pens: dict[str, dict[str, Any]] = {
+        policy: {"color": colour, "linestyle": LINES[policies.index(policy) % len(LINES)], "linewidth": 1.6}
+        for policy, colour in policy_colours(policies).items()
+    }
+    random = {"random": {"color": "0.6", "linestyle": "-", "linewidth": 0.7}} if "random" in policies else {}
+    return {policy: (pens | random)[policy] for policy in policies}
 
 
 def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[str], i: int) -> None:
@@ -75,8 +78,7 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
     # Empty slots and objects that found no place wait far outside the map.
     inside = ((begin > [extent[0], extent[2]]) & (begin < [extent[1], extent[3]])).all(-1)
     axis.scatter(*begin[inside].T, s=14, marker="s", facecolors="none", edgecolors="0.35", linewidths=0.9)
-    for k, policy in enumerate(policies):
-        pen = _pen(policy, k)
+    for policy, pen in _pens(policies).items():
         colour = pen["color"]
         end = paths[f"{policy}/object_end_w"][i, :, :2]
         moved = inside & (np.linalg.norm(end - begin, axis=-1) > MOVED_M)

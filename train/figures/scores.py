@@ -33,11 +33,13 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
     scores = {name: np.asarray(rows[name], float) for name in ("path_efficiency", "effort_efficiency")}
     figure, ((axis,),) = style.panels((6.4, 5.2))
     swept: list[tuple[float, float, float]] = []
-    for k, policy in enumerate(dict.fromkeys(names)):
+    policies = list(dict.fromkeys(map(str, names)))
+    colours = style.policy_colours([policy for policy in policies if not policy.startswith("namo")])
+    for policy in policies:
         x, y = (values[names == policy] for values in scores.values())
         bars = [np.abs(np.array(interval(n, v)) - v.mean())[:, None] for n, v in zip(scores, (x, y), strict=True)]
         kind, _, weight = policy.partition(":")
-        colour = "0.25" if kind == "namo" else style.policy_colour(policy, k)
+        colour = colours.get(policy, "0.25")
         axis.errorbar(x.mean(), y.mean(), bars[1], bars[0], fmt="o", color=colour, capsize=2, linewidth=0.9)
         right = kind == "namo" or x.mean() < 0.2  # the avoider's point lies close to that of w = 1
         axis.annotate(

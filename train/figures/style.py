@@ -123,9 +123,12 @@ def draw_means(axis: Axes, x: Any, points: Sequence[Estimate], bounds: tuple[flo
     axis.fill_between(x, low, high, color=look["color"], alpha=0.13, linewidth=0)
 
 
-def policy_colour(policy: str, index: int) -> str:
-    """Of a policy in trajectories and frontiers."""
-    return POLICIES.get(policy, (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY)[index % 6])
+def policy_colours(policies: Sequence[str]) -> dict[str, str]:
+    """In trajectories and frontiers: those that have none of their own get what is left, in turn."""
+    own = {policy: POLICIES[policy] for policy in policies if policy in POLICIES}
+    others = [policy for policy in policies if policy not in own]
+    left = [c for c in (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY) if c not in own.values()]
+    return own | {policy: left[k % len(left)] for k, policy in enumerate(others)}
 
 
 def name_of(algorithm: str) -> str:
