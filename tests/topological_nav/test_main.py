@@ -84,7 +84,7 @@ def test_a_map_that_was_stopped_goes_on(made, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["data", "nowhere"], "nowhere/scene.json: no such file"),
+        (["data", "nowhere"], "nowhere: no such file"),
         (["data", "nowhere", "heading=3"], "unknown key 'heading', did you mean 'headings'?"),
         (["evaluate", "S", "--contenders", "expert,expert"], "contenders are expert, expert, expected each once"),
         (["train", "rooms", "--data", "nowhere"], "nowhere: is no dataset"),

@@ -287,7 +287,7 @@ def test_the_commands_draw_and_tell(first, toy, capsys, tmp_path):
         (["evaluate", "nowhere", "--contenders", "dens"], "contender is 'dens', expected a choice from dense, sparse"),
         (["evaluate", "nowhere", "--contenders", "ppo"], "contender ppo needs the run folder of a trained policy"),
         (["evaluate", "nowhere", "a/nowhere"], "scenes are nowhere, nowhere, expected different names"),
-        (["evaluate", "nowhere", "--truth"], "nowhere/scene.json: no such file"),
+        (["evaluate", "nowhere", "--truth"], "nowhere: no such file"),
         (["evaluate", "nowhere", "--localiser", "gone"], "no trained networks of passages"),
         (["evaluate", APARTMENT, "--localiser", "gone", "--detector", "gone"], "gone: holds no trained network"),
         (["evaluate", "nowhere", "--domain", "fog"], "domain is 'fog', expected one of clean, lens"),
