@@ -26,7 +26,7 @@ from converters.tables import alignment_table, bounds, gate_table, proposal_tabl
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.progress import stage_progress, warn_once
-from interactive_nav_common.signals import interrupts_heard
+from interactive_nav_common.signals import interrupts_heard, number_of
 from interactive_nav_common.words import Command, Commands, Parser, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES
 from scenes_mjcf.sets import installed
@@ -170,11 +170,6 @@ def _propose(arguments: argparse.Namespace, console: Console) -> None:
     console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
 
 
-def _number(stop: KeyboardInterrupt) -> int:
-    """Of the signal that raised it."""
-    return getattr(stop, "lost_signal", signal.SIGINT)
-
-
 def _annotate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.annotate.browser import Page
     from converters.annotate.guard import guarded_server
@@ -195,7 +190,7 @@ def _annotate(arguments: argparse.Namespace, console: Console) -> int:
         try:
             threading.Event().wait()
         except KeyboardInterrupt as stop:
-            number = _number(stop)  # Ctrl-C is how it ends
+            number = number_of(stop)  # Ctrl-C is how it ends
         server.stop()
     states = [item.state for item in page.session.items]
     told = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
@@ -286,7 +281,7 @@ def main(argv: list[str] | None = None) -> int:
             refuse_unused(arguments, "--ray-address", "without --launcher ray")
         return arguments.run(arguments, console) or 0
     except KeyboardInterrupt as stop:
-        number = _number(stop)
+        number = number_of(stop)
         print(f"{'terminated' if number == signal.SIGTERM else 'interrupted'}; {written()}", file=sys.stderr)
         return 128 + number
     except OSError as error:

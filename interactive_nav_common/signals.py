@@ -32,7 +32,7 @@ def heard(handler: Handler) -> Handler:
         try:
             handler(number, frame)
         except BaseException as raised:
-            raised.lost_signal = number  # type: ignore[attr-defined]
+            raised.signal_number = number  # type: ignore[attr-defined]
             raise
 
     if not hasattr(sys.unraisablehook, "before"):
@@ -40,10 +40,15 @@ def heard(handler: Handler) -> Handler:
     return raising
 
 
+def number_of(stop: KeyboardInterrupt) -> int:
+    """The signal that raised it."""
+    return getattr(stop, "signal_number", signal.SIGINT)
+
+
 def _lost_again(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def hook(unraisable: Any) -> None:
         """What Python cannot raise: a signal comes again, all else is for the hook before."""
-        number = getattr(unraisable.exc_value, "lost_signal", None)
+        number = getattr(unraisable.exc_value, "signal_number", None)
         _come_again(number) if number else before(unraisable)
 
     hook.before = before  # type: ignore[attr-defined]
@@ -61,7 +66,7 @@ def interrupts_heard(*also: int) -> Iterator[None]:
     """SIGINT raises KeyboardInterrupt as always, but where it is not lost; without effect where others handle it.
 
     Args:
-        *also: signals that raise it, too, unless they are ignored. The exception's `lost_signal` is the number.
+        *also: signals that raise it, too, unless they are ignored. `number_of` tells which.
     """
     mine = threading.current_thread() is threading.main_thread()
     usual = {n: signal.getsignal(n) for n in (signal.SIGINT, *also) if mine}

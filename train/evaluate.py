@@ -17,7 +17,7 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.rows import write_parquet
-from interactive_nav_common.signals import interrupts_heard
+from interactive_nav_common.signals import interrupts_heard, number_of
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
@@ -128,7 +128,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             return _run(parser().parse_intermixed_args(argv), build_env, kept)
     except KeyboardInterrupt as stop:
         told = "; ".join(kept.values()) or "nothing, no policy had played all"
-        number = getattr(stop, "lost_signal", signal.SIGINT)
+        number = number_of(stop)
         print(f"train.evaluate: stopped by {signal.Signals(number).name}; kept: {told}", file=sys.stderr)
         return 128 + number
 

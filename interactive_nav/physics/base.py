@@ -92,7 +92,7 @@ class Physics(abc.ABC):
 def uncommitted(tree: Any) -> Any:
     """The tree with its arrays on no device in particular, as constants of a program on several must be.
 
-    `device_put` copies; `jnp.asarray` compiles a program for each shape first, which takes a GPU a while.
+    By `device_put`, which compiles nothing; `jnp.asarray` compiles a program for each shape.
     """
     return jax.tree.map(lambda x: jax.device_put(np.asarray(x)) if isinstance(x, jax.Array) else x, tree)
 

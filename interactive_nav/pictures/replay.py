@@ -139,9 +139,8 @@ class EpisodePlayer:
         start_qpos, told = np.asarray(state.pipeline_state.qpos), []
         while not told or not told[-1]["done"]:
             action = self._policy(state.obs, policy_key, len(told))
-            with (
-                signals_wait()
-            ):  # raised within the physics' callbacks it is another error; physics left behind crashes
+            # Raised within the physics' callbacks it is another error; physics left behind crashes.
+            with signals_wait():
                 state, out = jax.block_until_ready(self._step(state, action))
             told.append(jax.tree.map(np.asarray, out))
             on_progress(len(told))

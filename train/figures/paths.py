@@ -57,12 +57,14 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
 
 def _pens(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
     """How each policy is drawn: random walks, which go everywhere, thin and grey."""
+    colours = policy_colours(policies)
     pens: dict[str, dict[str, Any]] = {
-        policy: {"color": colour, "linestyle": LINES[policies.index(policy) % len(LINES)], "linewidth": 1.6}
-        for policy, colour in policy_colours(policies).items()
+        policy: {"color": colours[policy], "linestyle": LINES[k % len(LINES)], "linewidth": 1.6}
+        for k, policy in enumerate(policies)
     }
-    random = {"random": {"color": "0.6", "linestyle": "-", "linewidth": 0.7}} if "random" in policies else {}
-    return {policy: (pens | random)[policy] for policy in policies}
+    if "random" in pens:
+        pens["random"] = {"color": "0.6", "linestyle": "-", "linewidth": 0.7}
+    return pens
 
 
 def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[str], i: int) -> None:

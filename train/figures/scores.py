@@ -34,7 +34,7 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
     figure, ((axis,),) = style.panels((6.4, 5.2))
     swept: list[tuple[float, float, float]] = []
     policies = list(dict.fromkeys(map(str, names)))
-    colours = style.policy_colours([policy for policy in policies if not policy.startswith("namo")])
+    colours = style.policy_colours([policy for policy in policies if policy.partition(":")[0] != "namo"])
     for policy in policies:
         x, y = (values[names == policy] for values in scores.values())
         bars = [np.abs(np.array(interval(n, v)) - v.mean())[:, None] for n, v in zip(scores, (x, y), strict=True)]
