@@ -93,6 +93,15 @@ def test_fixed_episodes_are_in_the_scenes_of_their_split(tier: str, robot: str) 
             assert low <= sum(free) / len(free) <= high
 
 
+@pytest.mark.parametrize(("robot", "pushes"), [("turtlebot", 3), ("fetch", 0)])
+def test_fixed_episodes_of_the_aws_house_are_in_the_scene_that_is_there(robot: str, pushes: int) -> None:
+    file = load(ROOT / "scenes_mjcf" / "episodes" / f"aws_house-{robot}.json.gz")
+    assert file.scenes == (("aws_house", load_scene(ROOT / "scenes_mjcf" / "aws_house").task_digest),)
+    assert len(file.episodes) == 200 and (file.robot, file.seed, len(file.objects)) == (robot, 7, 4)
+    assert sum(row["push_needed"] for row in file.episodes) == pushes
+    assert len({tuple(row["start_xy_w"]) for row in file.episodes}) == 200
+
+
 @pytest.mark.heavy
 @pytest.mark.parametrize("name", ["furnished/furnished_008", "cluttered/cluttered_009"])
 def test_a_scene_of_a_tier_is_made_as_it_is_listed(tmp_path: Path, name: str) -> None:
