@@ -249,10 +249,17 @@ def test_tables_say_what_the_rows_say(results, capsys):
     assert "SAC is best overall" in printed and "Welch" in printed
 
 
-def test_tables_need_learned_rows(tmp_path, capsys):
-    write_parquet(baseline_rows(), tmp_path / "y.parquet")
+def test_tables_of_policies_that_never_learned_alone(tmp_path, capsys):
+    rows = baseline_rows()
+    at_walls = pa.array([1, 0] * (len(rows) // 2))
+    write_parquet(rows.append_column("structure_steps", at_walls), tmp_path / "y.parquet")
+    assert figures.main([str(tmp_path), "--tables"]) == 0
+    printed = capsys.readouterr().out
+    assert [line for line in printed.splitlines() if line[:2] == "##"] == ["## Policies that never learned"]
+    assert "| TurtleBot | namo:0.5 | unseen | 20 | 0.950 [" in printed
+    write_parquet(rows.drop_columns("policy"), tmp_path / "y.parquet")
     assert figures.main([str(tmp_path), "--tables"]) == 2
-    assert "no rows of learned runs; evaluate them first" in capsys.readouterr().err
+    assert "no rows of policies; evaluate some first" in capsys.readouterr().err
 
 
 def test_unseen_scenes_are_shown_where_there_are_any():

@@ -166,10 +166,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     split = None if arguments.split == "all" else arguments.split
     if arguments.tables:
         found = Results(Path(arguments.results))
-        if not set(found.rows.column_names) >= SWEPT or not run_means(found.rows):
+        if not set(found.rows.column_names) >= SWEPT:
             raise FileError(
-                f"{arguments.results}: no rows of learned runs; evaluate them first (python -m train.sweep FILE "
-                "--only evaluate, or python -m train.evaluate RUN_DIR)"
+                f"{arguments.results}: no rows of policies; evaluate some first (python -m train.sweep FILE "
+                "--only evaluate, or python -m train.evaluate)"
             )
         print(document(found.rows, chosen_split(found.rows, split)), end="")
         return 0

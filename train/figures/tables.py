@@ -135,7 +135,7 @@ def provenance(rows: pa.Table) -> str:
         for row in sorted(found, key=lambda row: row["run"])
     ]
     header = ("run", "env steps", "evaluated at", "wall-clock [min]", "trained on", "commit", "evaluated on")
-    return markdown(header, lines)
+    return markdown(header, lines) if lines else ""
 
 
 def _number(value: int | None) -> str:
@@ -143,8 +143,9 @@ def _number(value: int | None) -> str:
 
 
 def document(rows: pa.Table, split: str | None) -> str:
-    """All tables, with what the numbers mean."""
+    """All tables, with what the numbers mean; without learned runs, those of the others."""
     shown = {"train": "training", "test": "unseen", None: "all"}[split]
+    learned = bool(len(learned_rows(rows)))
     parts = [
         "## Scores",
         "Mean over runs ± half of the 95 % t interval over seeds; a run's score is the mean over its fixed episodes.",
@@ -154,8 +155,8 @@ def document(rows: pa.Table, split: str | None) -> str:
         "mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
         "`undecided` says that these runs cannot tell, not that there is no difference.",
         claim_lines(claims(rows, split)),
-    ]
-    if effort := effort_lines(rows, split):
+    ] if learned else []  # fmt: skip
+    if learned and (effort := effort_lines(rows, split)):
         parts += [
             "## Effort without walls",
             "The same comparisons over the episodes that touched no wall. The dynamic term of E_eff counts forces on "
