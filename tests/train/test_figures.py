@@ -209,6 +209,23 @@ def test_random_walks_are_thin_and_grey():
     assert figure.axes[0].get_title() == "den, episode 0\nall reach it" and figure.get_figwidth() <= 7.2
 
 
+def test_titles_of_many_policies_name_the_fewer_and_fit_above_their_panel():
+    won = record(0.0, episodes=1)
+    lost = won | {"learned/success": np.zeros(1)}
+    planners = [f"namo:{w}" for w in ("0", "0.25", "0.5", "0.75", "1")]
+
+    def title(losers: list[str]) -> str:
+        merged = paths.side_by_side({name: lost if name in losers else won for name in ["avoider", *planners]})
+        return figures.trajectories(merged).axes[0].get_title().partition("\n")[2]
+
+    assert title(["avoider"]) == "missed by avoider"
+    assert title(planners) == "reached by avoider"
+    assert title(["avoider", *planners]) == "reached by none"
+    assert title(planners[2:]) == "reached by avoider, namo:0, namo:0.25"
+    assert title(["namo:0.25", "namo:0.75"]) == "missed by namo:0.25, namo:0.75"
+    assert title(["avoider", "namo:0", "namo:1"]) == "reached by namo:0.25, namo:0.5,\nnamo:0.75"
+
+
 def test_effort_terms_leave_a_few_episodes_outside_and_say_how_many():
     """98 of 100 episodes lie at 0.99, where the runs are: two at 0.5 and 0.6 would put all in one corner."""
     rows = pa.concat_tables([run_rows("turtlebot", "ppo", 0.1, seed, 0.9, (0.99, 0.99)) for seed in (0, 1)])

@@ -1,5 +1,6 @@
 """Recorded paths in; top views of where robots went and what they moved out (paper, figures 7 and 8)."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,8 @@ from train.figures.style import policy_colours
 FURNITURE_COLOUR = "#ecd9b8"
 MOVED_M = 0.02
 """Objects moved less than this are drawn once."""
+TITLE_WIDTH = 40
+"""Characters of a line above a panel."""
 LINES = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
 """Of the first, second, ... policy: without colour, too, they can be told apart."""
 
@@ -95,8 +98,11 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
     start, goal = paths[f"{policies[0]}/start_xy_w"][i], paths[f"{policies[0]}/goal_xy_w"][i]
     axis.plot(*start, marker="o", markerfacecolor="w", markeredgecolor="k", markersize=6, zorder=5)
     axis.plot(*goal, marker="*", color="#e69f00", markeredgecolor="k", markersize=11, zorder=5)
-    reached = [policy for policy in policies if paths[f"{policy}/success"][i]]
-    told = "all reach it" if len(reached) == len(policies) else f"reached by {', '.join(reached) or 'none'}"
+    reached, missed = ([p for p in policies if bool(paths[f"{p}/success"][i]) is well] for well in (True, False))
+    told = (
+        f"missed by {', '.join(missed)}" if len(missed) < len(reached) else f"reached by {', '.join(reached) or 'none'}"
+    )
+    told = textwrap.fill(told, TITLE_WIDTH) if missed else "all reach it"
     axis.set_title(f"{paths[f'scene/{scene}/name']}, episode {i}\n{told}", fontsize=8)
     axis.set_aspect("equal")
     axis.grid(visible=False)
