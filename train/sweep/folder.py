@@ -217,12 +217,13 @@ def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str
         wanted = folder.sweep.config.evaluate
         yield from (str(folder.runs / run) for run in runs)
         yield from ("--dataset", str(folder.rows), "--policies", "learned", "--checkpoint", wanted.checkpoint)
-        yield from ("--episodes", str(wanted.episodes), "--record", str(wanted.record))
+        yield from ("--record", str(wanted.record))
         yield "--stochastic" if wanted.stochastic else "--no-stochastic"
         yield from ("--batch", str(wanted.batch)) if wanted.batch else ()
         files = folder.episode_files(next(run for run in folder.sweep.runs if run.name == runs[0]))
         yield from (word for file in files for word in ("--episode-file", file))
-        yield from () if files else ("--seed", str(wanted.seed), *(("--balanced",) if wanted.balanced else ()))
+        drawn = ("--episodes", str(wanted.episodes), "--seed", str(wanted.seed))
+        yield from () if files else (*drawn, *(("--balanced",) if wanted.balanced else ()))  # of files all
         yield from ("--scenes", *wanted.scenes) if wanted.scenes else ()
 
     return [sys.executable, *program, *words()]

@@ -281,6 +281,8 @@ def _threads(run: RunSpec) -> int:
 def _how(code: int) -> str:
     if code == LOST:
         return "the node or its worker was lost"
+    if not code:
+        return "ended, but what it was asked for is not there"
     if code < 0:
         with contextlib.suppress(ValueError):
             return f"ended by {signal.Signals(-code).name}"

@@ -11,6 +11,7 @@ import yaml
 
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf import sets
+from train import evaluate
 from train.config_io import known_in
 from train.sweep import spec
 from train.sweep.__main__ import main
@@ -160,6 +161,9 @@ def test_fixed_episodes_of_each_run_s_robot_are_played(monkeypatch):
     words = words_of_evaluation(folder, [fetch.name], ("-m", "train.evaluate"))
     given = [word for flag, word in itertools.pairwise(words) if flag == "--episode-file"]
     assert given == [name.replace("{robot}", "fetch") for name in files]
+    understood = evaluate.parser().parse_intermixed_args(words[3:])
+    played, digest = evaluate._read_episodes(understood.episode_file, understood.episodes)
+    assert (len(played.episodes), digest) == (asked["fetch"].episodes, asked["fetch"].episode_file)
 
 
 def test_a_wrong_file_is_one_line_and_exit_2(tmp_path, capsys):
