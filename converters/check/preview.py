@@ -266,8 +266,6 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         FileError: the picture cannot be written.
         SceneRejected: the source is unusable.
     """
-    if not target.parent.is_dir():
-        raise SceneError(f"{target.parent}: no such folder; give another -o")
     if (folder / "object.json").is_file():
         if source is not None:
             raise SceneError(f"{folder}: is a single object, which has no scan to draw; leave --source out")

@@ -12,7 +12,6 @@ import flax.serialization
 import jax
 import numpy as np
 from rich.console import Console
-from tensorboardX import SummaryWriter
 
 import interactive_nav
 from interactive_nav.config import WINDOW
@@ -21,7 +20,7 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import write_text, writing
 from interactive_nav_common.locks import locked
 from interactive_nav_common.records import mean_over_episodes
 from interactive_nav_common.signals import stop_signals
@@ -35,7 +34,7 @@ from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs import checkpoint, tracking
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.progress import TrainingDisplay, describe
-from train.runs.run_folder import RunFolder, claim
+from train.runs.run_folder import GOES_ON, RunFolder, claim
 
 
 def make_env(config: EnvConfig) -> Any:
@@ -92,7 +91,7 @@ class FolderCallbacks:
         self._wall_before_s = 0.0
         self._began_together = 0
         self._began = time.perf_counter()
-        self._events: SummaryWriter | None = None
+        self._events: tracking.Events | None = None
         self._tracker: tracking.Tracker | None = None
 
     def _wall_s(self) -> float:
@@ -135,7 +134,8 @@ class FolderCallbacks:
         if snapshot.env_steps < total_steps:
             self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
         if self._config.run.tensorboard:
-            self._events = SummaryWriter(str(self._folder.tensorboard), purge_step=snapshot.env_steps + 1)
+            with writing(self._folder.tensorboard, GOES_ON):
+                self._events = tracking.Events(self._folder.tensorboard, snapshot.env_steps)
         note = getattr(snapshot.env_state, "note", "")
         if note:
             self._display.console.print(note, highlight=False, soft_wrap=True)
@@ -151,9 +151,8 @@ class FolderCallbacks:
         """One line of metrics.jsonl, one TensorBoard point a value, one status on the console."""
         self._folder.append_metrics({"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
         if self._events:
-            for name, value in metrics.items():
-                self._events.add_scalar(name if "/" in name else f"run/{name}", value, env_steps)
-            self._events.flush()
+            with writing(self._folder.tensorboard, GOES_ON):
+                self._events.log(env_steps, metrics)
         if self._tracker:
             self._tracker.log(env_steps, metrics)
         self._display.log(env_steps, metrics)

@@ -1,12 +1,18 @@
-"""Metrics of a run to Weights & Biases, for those who want it there too (`run.wandb=true`).
+"""Metrics of a run to TensorBoard, and to Weights & Biases for those who want it there too (`run.wandb=true`).
 
-The package is an optional extra. Where it writes is its own to say: WANDB_MODE=offline keeps everything in the run
-folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
+The latter's package is an optional extra. Where it writes is its own to say: WANDB_MODE=offline keeps everything in the
+run folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
 """
 
+import contextlib
+import time
 import uuid
 from pathlib import Path
 from typing import Any
+
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+from tensorboardX.record_writer import RecordWriter
+from tensorboardX.summary import scalar
 
 from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError, missing, optional
@@ -23,6 +29,33 @@ def import_wandb() -> Any:
         ConfigError: it is not installed.
     """
     return optional("wandb", missing("run.wandb=true", "wandb", "wandb", ", or set run.wandb=false"))
+
+
+class Events:
+    """A run's values for TensorBoard: a file for each sitting, which hides what older ones hold after its `env_steps`.
+
+    Not tensorboardX's SummaryWriter: its thread dies of a full disk, and who logs on then waits for ever.
+    """
+
+    def __init__(self, folder: Path, env_steps: int):
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = RecordWriter(str(folder / f"events.out.tfevents.{time.time():.3f}"))
+        self._add(file_version="brain.Event:2")
+        self._add(step=env_steps + 1, session_log=SessionLog(status=SessionLog.START))
+
+    def _add(self, **content: Any) -> None:
+        self._file.write(Event(wall_time=time.time(), **content).SerializeToString())
+
+    def log(self, env_steps: int, metrics: dict[str, float]) -> None:
+        """The means of a log interval, on disk afterwards."""
+        for name, value in metrics.items():
+            self._add(step=env_steps, summary=scalar(name if "/" in name else f"run/{name}", value))
+        self._file.flush()
+
+    def close(self) -> None:
+        """Closes the file, full disk or not."""
+        with contextlib.suppress(OSError):
+            self._file.close()
 
 
 class Tracker:

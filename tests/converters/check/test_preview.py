@@ -25,16 +25,16 @@ def colours(path) -> np.ndarray:
 
 @pytest.mark.heavy
 def test_a_source_adds_scan_and_cut(tiny_scene, pristine, tmp_path):
-    folder = tiny_scene[0]
-    preview(folder, tmp_path / "four.png")
-    assert main(["preview", str(folder), "-o", str(tmp_path / "six.png"), "--source", str(pristine / "gibson")]) == 0
-    four, six = colours(tmp_path / "four.png"), colours(tmp_path / "six.png")
+    folder, made = tiny_scene[0], tmp_path / "made" / "on the way"
+    preview(folder, made / "four.png")
+    assert main(["preview", str(folder), "-o", str(made / "six.png"), "--source", str(pristine / "gibson")]) == 0
+    four, six = colours(made / "four.png"), colours(made / "six.png")
     assert six.shape[0] > 1.2 * four.shape[0] and six.shape[1] == four.shape[1]  # three panels more, in a row
     for picture in (four, six):
         # The traversable area is drawn in its own colour, 0.85 0.94 0.85.
         near = np.abs(picture.astype(int) - [217, 240, 217]).max(axis=2) <= 6
         assert 0.03 < near.mean() < 0.8
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["four.png", "six.png"]
+    assert sorted(p.name for p in made.iterdir()) == ["four.png", "six.png"]
 
 
 def test_the_source_of_another_scene_is_refused(tiny_scene, gibson_raw, tmp_path):

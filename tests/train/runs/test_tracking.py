@@ -1,4 +1,4 @@
-"""Weights & Biases: offline the numbers of metrics.jsonl arrive, a continued run stays one, without it a clear line."""
+"""TensorBoard: values at their steps, a full disk. Weights & Biases: metrics.jsonl offline, one continued run."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ import flax.struct
 import numpy as np
 import pytest
 from rich.console import Console
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.record_writer import RecordWriter
 
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
 from tests.train.toy_run import build_toy, toy_config
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult
@@ -25,6 +27,38 @@ from train.runs.run import train_run
 
 def quiet() -> Console:
     return Console(file=io.StringIO())
+
+
+def scalars(path: Path) -> dict[tuple[int, str], float]:
+    """(step, name) -> value of an event file: records of a length (u64), its check sum, content, its check sum."""
+    data, at, found = path.read_bytes(), 0, {}
+    while at < len(data):
+        (length,) = struct.unpack_from("<Q", data, at)
+        event = Event.FromString(data[at + 12 : at + 12 + length])
+        found |= {(event.step, value.tag): value.simple_value for value in event.summary.value}
+        at += 16 + length
+    return found
+
+
+def test_events_hold_each_value_at_its_step(tmp_path):
+    for steps in (0, 256):
+        events = tracking.Events(tmp_path, steps)
+        events.log(steps + 128, {"episodes": 3.0, "loss/policy": 0.25 + steps})
+        events.close()
+    first, second = map(scalars, sorted(tmp_path.iterdir()))
+    assert first == {(128, "run/episodes"): 3.0, (128, "loss/policy"): 0.25}
+    assert second == {(384, "run/episodes"): 3.0, (384, "loss/policy"): 256.25}
+
+
+def test_events_that_meet_a_full_disk_are_one_error_and_the_run_can_be_begun_again(tmp_path, monkeypatch):
+    config = toy_config(tmp_path, updates=1)
+    with monkeypatch.context() as full:
+        full.setattr(tracking, "RecordWriter", lambda _: RecordWriter("/dev/full"))
+        with pytest.raises(FileError, match=r"tensorboard: cannot be written \(No space left on device\); make room"):
+            train_run(config, quiet(), build_env=build_toy)
+    result, folder, _ = train_run(config, quiet(), build_env=build_toy)
+    (events,) = folder.tensorboard.iterdir()
+    assert result.completed and {step for step, name in scalars(events) if "/" in name} == {256}
 
 
 def records(data: bytes) -> Iterator[bytes]:
