@@ -26,7 +26,8 @@ sync: .venv/.complete
 	@$(PYTHON3) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "make: $$($(PYTHON3) --version) is too old, expected Python 3.11 or newer; set PYTHON3=python3.12, say" >&2; exit 2; }
 	@$(PYTHON3) -m venv .venv || { echo "make: cannot make .venv; on Debian: apt install python3-venv" >&2; exit 2; }
-	@$(PY) -m pip install --disable-pip-version-check --quiet --require-hashes -r requirements.lock
+	@$(PY) -m pip install --disable-pip-version-check --quiet --no-compile --require-hashes -r requirements.lock
+	@$(PY) -m compileall -qq -j 0 .venv/lib || true  # on all cores, where pip takes one; some files are no Python 3
 	@$(PY) -m pip install --disable-pip-version-check --quiet --no-deps -e .
 	@touch $@
 	@$(PY) --version

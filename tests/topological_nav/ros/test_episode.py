@@ -1,5 +1,6 @@
 """A whole episode over topics of a real master on loopback, recorded and read back with `rosbags`."""
 
+import functools
 import json
 import math
 import os
@@ -25,11 +26,16 @@ PROGRAM = [sys.executable, "-m", "topological_nav.ros"]
 START = (-2.0, 0.5, 0.8)
 
 
-def ros_or_skip():
-    """Asked of a process of its own: Debian's packages are not to come into this one."""
+@functools.cache
+def what_is_missing():
+    """Asked once, and of a process of its own: Debian's packages are not to come into this one."""
     asked = subprocess.run([*PROGRAM, "check"], capture_output=True, text=True)
-    if asked.returncode:
-        pytest.skip(asked.stderr.strip())
+    return asked.stderr.strip() if asked.returncode else ""
+
+
+def ros_or_skip():
+    if what_is_missing():
+        pytest.skip(what_is_missing())
     return pytest.importorskip("rosbags.rosbag1", reason="rosbags is not installed (pip install rosbags)")
 
 
