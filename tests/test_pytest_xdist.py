@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-BUSY = "import time, pytest\n@pytest.mark.parametrize('i', range(6))\ndef test(i): time.sleep(0.3)\n"
+BUSY = "import time, pytest\n@pytest.mark.parametrize('i', range(6))\ndef test(i): time.sleep(0.1)\n"
 DIES = "import os, time\ndef test_a(): os.abort()\ndef test_b(): time.sleep(0.2)\ndef test_c(): time.sleep(0.2)\n"
 
 

@@ -33,9 +33,9 @@ def gibson_raw(tmp_path, pristine) -> Path:
 
 
 @pytest.fixture(scope="session")
-def hull_cache(tmp_path_factory) -> Path:
-    """A hull cache shared by the tests: each tiny model is decomposed once."""
-    return tmp_path_factory.mktemp("hulls")
+def hull_cache(shared) -> Path:
+    """A cache that all tests share, in every test process: each tiny model is decomposed once."""
+    return shared("hulls", lambda folder: None)
 
 
 @pytest.fixture(scope="session")
