@@ -141,13 +141,16 @@ def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> N
     """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`.
 
     Args:
-        folder: of the checkpoint.
+        folder: of the checkpoint; one that holds `policy.npz` alone is copied as it is.
         target: made.
         step: see `policy_file.packed`.
     """
     meta = read_meta(folder)
     target.mkdir(parents=True)
-    policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY, step)
+    if is_whole(folder):
+        policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY, step)
+    else:
+        shutil.copy2(folder / policy_file.POLICY, target)
     shutil.copy2(folder / META, target / META)
 
 

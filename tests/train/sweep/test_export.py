@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pyarrow.compute as pc
@@ -88,6 +89,13 @@ def test_what_is_kept(swept, tmp_path, capsys):
         path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
         learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}})
         np.testing.assert_array_equal(learner["params"]["w"], [1.0] * 3)
+    # A policy that was kept alone, brought back into a sweep's folder, is kept as it is.
+    brought = swept.runs / "k_int0-seed1" / "checkpoints"
+    shutil.rmtree(brought)
+    shutil.copytree(path.parent, brought)
+    assert main([str(tmp_path / "small.yaml"), "--export", str(tmp_path / "again")]) == 0
+    (again,) = (tmp_path / "again").rglob("policy.npz")
+    assert again.read_bytes() == (path / "policy.npz").read_bytes()
 
 
 def test_rows_that_are_kept_are_never_without_their_paths(swept, tmp_path, monkeypatch):
