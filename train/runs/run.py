@@ -184,11 +184,12 @@ class FolderCallbacks:
     def on_diverged(self, before: Snapshot, update: Update) -> str:
         """Saves the batch and the learner that met it."""
         path = self._folder.path / f"diverged-{before.env_steps:012d}"
-        path.mkdir(exist_ok=True)
-        (path / checkpoint.LEARNER).write_bytes(flax.serialization.to_bytes(jax.device_get(before.learner)))
-        named = jax.tree_util.tree_leaves_with_path(update.batch)
-        arrays = {jax.tree_util.keystr(name): np.asarray(leaf) for name, leaf in named}
-        np.savez_compressed(path / "batch.npz", **arrays)  # type: ignore[arg-type]
+        with writing(path, "make room"):
+            path.mkdir(exist_ok=True)
+            (path / checkpoint.LEARNER).write_bytes(flax.serialization.to_bytes(jax.device_get(before.learner)))
+            named = jax.tree_util.tree_leaves_with_path(update.batch)
+            arrays = {jax.tree_util.keystr(name): np.asarray(leaf) for name, leaf in named}
+            np.savez_compressed(path / "batch.npz", **arrays)  # type: ignore[arg-type]
         return str(path)
 
     def close(self) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file, writing
 from interactive_nav_common.records import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
@@ -42,9 +43,13 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
         over its rows, on test scenes where there are any.
 
     Raises:
-        FileError: it cannot be written.
+        FileError: it cannot be written, or no run has begun.
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
+    if not runs:
+        raise FileError(
+            f"{folder.root}: no run of the sweep has begun there; begin with the same command without --export"
+        )
     with writing(out, "make room"):
         _merge_rows(folder, out / "rows")
         for run in runs:
