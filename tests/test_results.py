@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import re
 from pathlib import Path
@@ -59,8 +60,30 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
     assert all((path / "config.yaml").is_file() for path in best)
 
 
+def test_runs_in_cluttered_homes_played_the_same_episodes_and_say_where_they_come_from():
+    """A thousand in the training homes, the first three hundred of those in the test homes."""
+    kept = ROOT / "results" / "cluttered"
+    rows = read_rows([kept / "rows" / "episodes.parquet"])
+    parts = rows.group_by(["run", "split"]).aggregate([("episode", "count"), ("shortest_path_m", "sum")]).to_pylist()
+    assert {(part["split"], part["episode_count"]) for part in parts} == {("train", 1000), ("test", 300)}
+    for robot, split in itertools.product(("turtlebot", "fetch"), ("train", "test")):
+        paths_m = [x["shortest_path_m_sum"] for x in parts if robot in x["run"] and x["split"] == split]
+        assert len(paths_m) == {"turtlebot": 9, "fetch": 3}[robot]
+        assert paths_m == pytest.approx([paths_m[0]] * len(paths_m), rel=1e-6)
+    facts = rows.group_by("run").aggregate(
+        [("train_device", "max"), ("train_commit", "max"), ("train_env_steps", "min")]
+    )
+    for name, device, commit, steps in (tuple(row.values()) for row in facts.to_pylist()):
+        summary, versions = (
+            json.loads((kept / "runs" / name / f"{x}.json").read_text()) for x in ("summary", "versions")
+        )
+        assert summary["completed"] and summary["env_steps"] == steps >= 6_500_000
+        assert "H200" in device and versions["commit"] == commit
+        assert len(read_metrics(kept / "runs" / name / PACKED_METRICS)) >= 10
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("sweep", ["kint"])
+@pytest.mark.parametrize("sweep", ["cluttered", "kint"])
 def test_the_tables_are_those_of_the_rows(sweep):
     """To the byte what `python -m train.figures results/SWEEP --tables` prints."""
     kept = ROOT / "results" / sweep
