@@ -29,7 +29,7 @@ def test_what_is_new_changed_or_committed_of_late_counts(tmp_path):
 
 def test_tests_of_changed_files_and_of_the_modules_that_they_mirror_are_chosen():
     tests = ["tests/a/b/test_c.py::one", "tests/a/b/test_c.py::two[x]", "tests/a/test_c.py::three"]
-    assert chosen(tests, {"a/b/c.py"}) == tests[:2]
+    assert chosen(tests, {"a/b/c.py"}, 9) == tests[:2]
     assert chosen(tests, {"tests/a/test_c.py"}) == tests[2:]
     assert chosen(tests, {"c.py", "a/b/d.py"}) == []
     pages = ["tests/test_docs.py::test_it[a-b.md]", "tests/test_docs.py::test_it[c.md]"]

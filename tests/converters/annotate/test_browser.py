@@ -138,7 +138,7 @@ def off(page: Page, k: int, at: int) -> tuple[float, float]:
     return float(np.linalg.norm(moved)), abs(wrap_angle(fit.yaw - known.yaw))
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_six_pairs_on_a_generated_scan_give_its_alignment(tmp_path):
     with contextlib.redirect_stdout(io.StringIO()):
         assert main(["generate", str(tmp_path / "raw"), "--seed", "1", "floor_area_m2=30", "n_rooms=2"]) == 0

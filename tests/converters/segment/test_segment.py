@@ -239,6 +239,7 @@ def test_models_that_one_command_fitted_are_kept_and_edited(room, tmp_path, caps
         assert main(words) == 2 and "aligned_models[0]" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_models_fitted_in_a_building_stand_beside_its_mesh_floor_by_floor(tmp_path, hull_cache, monkeypatch, capsys):
     monkeypatch.setattr("converters.pipeline.cache_folder", lambda: hull_cache)
     house = tiny_raw.write_two_floors(tmp_path / "house")

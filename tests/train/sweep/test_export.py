@@ -90,6 +90,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
         learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}})
         np.testing.assert_array_equal(learner["params"]["w"], [1.0] * 3)
     # A policy that was kept alone, brought back into a sweep's folder, is kept as it is.
+    path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
     brought = swept.runs / "k_int0-seed1" / "checkpoints"
     shutil.rmtree(brought)
     shutil.copytree(path.parent, brought)
