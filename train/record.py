@@ -27,6 +27,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     add_picture_words(made)
     arguments = made.parse_intermixed_args(argv)
     played = ["--episodes", str(arguments.episode), "--policies", arguments.policy]
+    played += ["--episode-file", arguments.episode_file] if arguments.episode_file else []
     try:
         check_picture_words(arguments)
         words = [arguments.run, *played, "--checkpoint", arguments.checkpoint, *arguments.overrides]

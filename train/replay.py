@@ -1,6 +1,6 @@
 """`python -m train.replay RUN_DIR --episodes 0,1 --policies learned,follower`: episodes played once more, step by step.
 
-Episode K starts as row K of `python -m train.evaluate` with the same seed: same place, goal and objects. The
+Episode K starts as row K of `python -m train.evaluate` with the same seed or file: same place, goal and objects. The
 numbers that a network computes may differ in their last bits with the size of the batch, so a close call may
 end otherwise; a replay carries its own scores. Videos and maps are drawn from its files:
 `python -m train.record`, `python -m interactive_nav.topdown`.
@@ -12,11 +12,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 from rich.console import Console
 
+from interactive_nav.episodes import load, starts_of
 from interactive_nav.pictures import replay
+from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.words import program
+from scenes_mjcf.sets import installed
 from train.config import EnvConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
@@ -41,7 +45,14 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     config = config_to_play(folder, arguments.overrides, arguments.scenes, console)
     claim(folder.path / "replays")
     env = build_env(config.env)
-    keys = episode_keys(arguments.seed, max(episodes) + 1)
+    seed, starts = SEED if arguments.seed is None else arguments.seed, None
+    if arguments.episode_file:
+        refuse_unused(arguments, "--seed", "with --episode-file, whose episodes are fixed")
+        file = load(installed(arguments.episode_file))
+        if max(episodes) >= len(file.episodes):
+            raise ConfigError(f"--episodes has {max(episodes)}, expected less than the file's {len(file.episodes)}")
+        seed, starts = file.seed, starts_of(file, env, "--episode-file")
+    keys = episode_keys(seed, max(episodes) + 1)
     names = list(dict.fromkeys(arguments.policies.split(",")))
     for name in names:
         if name not in POLICIES:
@@ -57,6 +68,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                     keys[episode],
                     episode,
                     lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
+                    None if starts is None else jax.tree.map(lambda x, k=episode: x[k : k + 1], starts),
                 )
             path = replay.replay_path(folder.path, name, episode)
             replay.save(played, path)

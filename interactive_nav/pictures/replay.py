@@ -20,6 +20,7 @@ from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError, readable
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.signals import signals_wait
@@ -127,13 +128,22 @@ class EpisodePlayer:
             label: where the policy comes from, for captions.
         """
         self.env, self.name, self.label = env, name, label
-        self._reset = jax.jit(jax.vmap(env.reset))
+        self._reset, self._reset_to = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.reset_to))
         self._policy = jax.jit(functools.partial(_action, policy))
         self._step = jax.jit(functools.partial(_play_step, env))
 
-    def play(self, key: jax.Array, episode: int = 0, on_progress: Callable[[int], None] = lambda step: None) -> Replay:
-        """Plays one episode, drawn from the key, to its end; `on_progress` is told the number of steps after each."""
-        state = self._reset(key[None])
+    def play(
+        self,
+        key: jax.Array,
+        episode: int = 0,
+        on_progress: Callable[[int], None] = lambda step: None,
+        start: EpisodeStart | None = None,
+    ) -> Replay:
+        """Plays one episode, drawn from the key or from `start` (leaves [1, ...]), to its end.
+
+        `on_progress` is told the number of steps after each.
+        """
+        state = self._reset(key[None]) if start is None else self._reset_to(start, key[None])
         policy_key = policy_key_of(key)
         first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
         start_qpos, told = np.asarray(state.pipeline_state.qpos), []

@@ -8,9 +8,11 @@ import importlib.util
 import numpy as np
 import pytest
 
+import interactive_nav
 import interactive_nav.record
-from interactive_nav import topdown
+from interactive_nav import episodes, topdown
 from interactive_nav.pictures import replay
+from interactive_nav.scenes.objects import body_names
 from tests.train.toy_run import toy_config
 from train import record
 from train import replay as program
@@ -101,6 +103,27 @@ def test_an_episode_starts_as_its_number_says_whoever_plays_it(run):
     np.testing.assert_array_equal(first.goal_xy_w, other.goal_xy_w)
     assert not np.allclose(first.action[0], other.action[0])
     assert not np.allclose(first.goal_xy_w, third.goal_xy_w)
+
+
+def test_an_episode_of_a_file_starts_as_the_file_says(run, room, tmp_path, capsys):
+    path = tmp_path / "two.json"
+    env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=1)
+    made = dataclasses.replace(episodes.draw(env, 2, seed=4), seed=5)  # keys alone would draw others
+    episodes.save(made, path)
+    asked = [str(run), "--policies", "random", "--episode-file", str(path)]
+    assert program.main([*asked, "--episodes", "1"]) == 0
+    played, told = replay.load(replay.replay_path(run, "random", 1)), made.episodes[1]
+    np.testing.assert_allclose(played.start_xy_w, told["start_xy_w"], atol=1e-6)
+    np.testing.assert_allclose(played.goal_xy_w, told["goal_xy_w"], atol=1e-6)
+    small = played.body_pos_w[0, played.bodies.index(body_names(played.small)[0]), :2]
+    np.testing.assert_allclose(small, told["objects"][0][:2], atol=1e-5)
+    capsys.readouterr()
+    for words, message in (
+        (["--episodes", "2"], "--episodes has 2, expected less than the file's 2"),
+        (["--seed", "4"], "--seed has no effect with --episode-file"),
+    ):
+        assert program.main([*asked, *words]) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_wrong_use_is_one_line(run, tmp_path, capsys):
