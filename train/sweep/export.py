@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file, writing
@@ -28,6 +29,14 @@ CURVE_LINES = 30
 KEPT = ("env_steps", "wall_s", "env_steps_per_s", "episodes")
 FILES = ("config.yaml", "versions.json", "summary.json")
 ROWS = "episodes.parquet"
+STEPS = {
+    **dict.fromkeys(("path_efficiency", "effort_efficiency", "ins_0.5", "kinematic_effort", "dynamic_effort"), 2**-14),
+    **dict.fromkeys(("robot_path_m", "shortest_path_m", "displacement_m", "object_displacement_kg_m"), 2**-9),
+    **dict.fromkeys(("reward/potential", "reward/interaction"), 2**-9),
+    **dict.fromkeys(("evaluation_wall_s", "train_wall_s"), 2**-6),
+    "force_sum_n": 1,
+}
+"""Column, or field of a nested one -> what exported rows are rounded to multiples of."""
 
 
 def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dict[tuple[Any, ...], str]]:
@@ -74,7 +83,7 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
     if not new:
         return
     out.mkdir(parents=True, exist_ok=True)
-    rows = read_rows(new)
+    rows = rounded(read_rows(new))
     replaced = {name for name in rows["run"].unique().to_pylist() if name}
     old = sorted(out.glob("*.parquet"))
     superseded = {path for name in replaced for path in files_of_run(out, name)}  # of an export that did not merge
@@ -88,13 +97,28 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
     for path in paths:
         with whole_file(out / PATHS / path.name) as partial:
             shutil.copy2(path, partial)
-    write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None)
+    write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None, small=True)
     for path in old:
         if path.name != ROWS:
             path.unlink()
     for path in out.glob("_paths/*.npz"):
         if path.stem.rpartition("-")[0] in replaced and path.name not in {wanted.name for wanted in paths}:
             path.unlink()
+
+
+def rounded(rows: pa.Table) -> pa.Table:
+    """Rows with numbers as multiples of `STEPS`; what is rounded already stays as it is."""
+    return pa.table({name: _rounded(name, rows[name].combine_chunks()) for name in rows.column_names})
+
+
+def _rounded(name: str, values: Any) -> pa.Array:
+    kind = values.type
+    if pa.types.is_list(kind):
+        return pa.ListArray.from_arrays(values.offsets, _rounded(name, values.values), kind, mask=values.is_null())
+    if pa.types.is_struct(kind):
+        fields = [_rounded(field.name, values.field(field.name)) for field in kind]
+        return pa.StructArray.from_arrays(fields, fields=list(kind), mask=values.is_null())
+    return pc.round_to_multiple(values, STEPS[name]) if name in STEPS and pa.types.is_floating(kind) else values
 
 
 def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, ...], str]:
