@@ -15,10 +15,10 @@ from interactive_nav_common.files import whole_file
 
 IDENTITY = ("run", "robot", "policy", "evaluation_seed", "scene", "episode")
 """Columns that name an episode that was played."""
-PAGES: dict[str, Any] = {"data_page_size": 2**26}
-"""One page a column, up to a twentieth smaller; from PyArrow 23 pages end at 20,000 rows unless told otherwise."""
+LAYOUT: dict[str, Any] = {"write_statistics": False, "store_schema": False, "data_page_size": 2**26}
+"""Nothing twice (types are the same without a schema), and one page a column; PyArrow 23 ends them at 20,000 rows."""
 if "max_rows_per_page" in inspect.signature(pq.ParquetWriter).parameters:
-    PAGES["max_rows_per_page"] = 2**30
+    LAYOUT["max_rows_per_page"] = 2**30
 
 
 def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
@@ -38,9 +38,7 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     others = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
     lists = [f for f in table.schema if pa.types.is_list(f.type) and pa.types.is_struct(f.type.value_type)]
-    others += [
-        f"{f.name}.list.element.{x.name}" for f in lists for x in f.type.value_type if pa.types.is_string(x.type)
-    ]
+    others += [f"{f.name}.list.element.{x.name}" for f in lists for x in f.type.value_type if x.type == pa.string()]
     with (
         whole_file(path) as partial,
         pq.ParquetWriter(
@@ -50,9 +48,7 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
             compression_level=11 if small else 15,
             use_dictionary=others,  # type: ignore[arg-type]
             use_byte_stream_split=floats,  # type: ignore[arg-type]
-            write_statistics=False,
-            store_schema=False,  # types are the same without it, and files 3 KiB smaller
-            **PAGES,
+            **LAYOUT,
         ) as writer,
     ):
         writer.write_table(table.replace_schema_metadata(None))
