@@ -1,6 +1,7 @@
 """Physics backends behind one interface: `warp`, `jax` and `native`; `make_physics` picks one."""
 
 import importlib.util
+import os
 
 import jax
 
@@ -8,6 +9,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals
 from interactive_nav.scenes.world import World
 from interactive_nav_common.errors import ConfigError, MissingPackage, missing
+from interactive_nav_common.files import cache_folder
 
 
 def resolve_backend(name: str) -> str:
@@ -25,6 +27,17 @@ def resolve_backend(name: str) -> str:
     if name == "warp" and not has_warp:
         raise MissingPackage(missing("backend=warp", "warp-lang", "warp", ", or choose backend=native"))
     return name
+
+
+def keep_programs() -> None:
+    """Programs that JAX compiles for an accelerator are kept in the cache folder, and found there by later processes.
+
+    JAX names them by what they were made of, the device and the versions. Those that call Warp name the call alone:
+    what is called each process has from its own tracing. Whoever set JAX_COMPILATION_CACHE_DIR has chosen.
+    """
+    chosen = "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir
+    if not chosen and jax.default_backend() != "cpu":
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "programs"))
 
 
 def make_physics(world: World, config: NavConfig) -> Physics:

@@ -15,7 +15,7 @@ from rich.console import Console
 
 import interactive_nav
 from interactive_nav.config import WINDOW
-from interactive_nav.physics import resolve_backend
+from interactive_nav.physics import keep_programs, resolve_backend
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
@@ -43,6 +43,7 @@ def make_env(config: EnvConfig) -> Any:
     Raises:
         ConfigError: an unknown robot, an unusable scene, or settings that do not fit each other.
     """
+    keep_programs()
     try:
         return interactive_nav.make(**flatten(config))
     except UserError as error:  # an unknown robot, an unusable scene, settings that exclude each other

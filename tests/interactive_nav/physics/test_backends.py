@@ -14,7 +14,15 @@ from mujoco import mjx
 
 import interactive_nav
 from interactive_nav.config import NavConfig
-from interactive_nav.physics import PhysicsState, StepSignals, base, make_physics, mjx_batch, resolve_backend
+from interactive_nav.physics import (
+    PhysicsState,
+    StepSignals,
+    base,
+    keep_programs,
+    make_physics,
+    mjx_batch,
+    resolve_backend,
+)
 from interactive_nav.physics import native as native_backend
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.contacts import combine
@@ -365,3 +373,23 @@ def test_the_loop_is_traced_once_and_never_leaves_the_device(tmp_path):
             ended.append(done)
     assert len(traced) == 1
     np.testing.assert_array_equal(np.concatenate(ended)[:, 0], [0, 1, 0, 1, 0, 1, 0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("platform", "chosen", "kept"),
+    [("gpu", None, "cache/programs"), ("gpu", "", None), ("cpu", None, None), ("gpu", "mine", "mine")],
+)
+def test_programs_of_an_accelerator_are_kept_unless_somebody_chose(platform, chosen, kept, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("INTERACTIVE_NAV_CACHE", "cache")
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        jax.config.update("jax_compilation_cache_dir", chosen or None)
+        if chosen is not None:
+            monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", chosen)
+        keep_programs()
+        assert jax.config.jax_compilation_cache_dir == kept
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

@@ -185,3 +185,39 @@ print(float(jax.jit(lambda x: captured(x)[0])(x).sum()))
 def test_what_dies_within_a_capture_ends_it(dies, collector, survives):
     done = say(DEATHS, dies, collector)
     assert (done.returncode == 0 and done.stdout.splitlines()[-1:] == ["8.0"]) == survives, done.stdout + done.stderr
+
+
+def test_a_program_that_calls_warp_is_found_again_and_calls_what_its_own_process_traced(tmp_path):
+    """Programs name a call by its number in the process, so the order of tracing must not matter."""
+    program = """
+import sys
+import jax, warp as wp
+from jax._src import monitoring
+from warp._src.jax.ffi import jax_callable
+
+events = []
+monitoring.register_event_listener(lambda name, **_: events.append(name.rpartition("/")[2]))
+
+@wp.kernel
+def times(x: wp.array(dtype=float), by: float, y: wp.array(dtype=float)):
+    y[wp.tid()] = x[wp.tid()] * by
+
+def scaled(x: wp.array(dtype=float), by: float, y: wp.array(dtype=float)):
+    wp.launch(times, x.shape[0], [x, by], [y])
+
+call = jax_callable(scaled, num_outputs=1)
+for by in map(float, sys.argv[1:]):
+    print(*jax.jit(lambda x: call(x, by)[0] + 1.0)(jax.numpy.array([1.0, 10.0])))
+print(events.count("cache_hits") == events.count("compile_requests_use_cache") > 0)
+"""
+    (tmp_path / "program.py").write_text(program)
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "kept"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+
+    def said(*factors):
+        words = [sys.executable, str(tmp_path / "program.py"), *factors]
+        done = subprocess.run(words, env={**os.environ, **kept}, capture_output=True, text=True, check=True)
+        return done.stdout.split("\n")[-len(factors) - 2 : -1]
+
+    assert said("2", "3") == ["3.0 21.0", "4.0 31.0", "False"]
+    assert said("3", "2")[:2] == ["4.0 31.0", "3.0 21.0"]
+    assert said("2", "3") == ["3.0 21.0", "4.0 31.0", "True"]
