@@ -118,6 +118,13 @@ def test_every_claim_holds_where_it_was_put_in():
     assert sac.result.startswith("+0.052 [")
 
 
+def test_a_cell_that_is_not_finished_changes_no_claim():
+    """Two seeds of DDPG at one k_int, and one at another: PPO and SAC are compared over their three as before."""
+    done = paper_like().filter(pa.compute.field("algorithm") != "ddpg")
+    begun = [run_rows("turtlebot", "ddpg", k_int, s, 0.3, (0.5, 0.5)) for k_int, s in ((0.0, 0), (0.0, 1), (1.0, 0))]
+    assert claims(pa.concat_tables([done, *begun]), "test")[:-1] == claims(done, "test")[:-1]
+
+
 def test_claims_that_fail_say_so_and_missing_runs_too():
     """SAC is worse here, k_int changes nothing, and unseen scenes are harder in every run."""
     tables = []
