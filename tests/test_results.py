@@ -62,7 +62,7 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
 
 
 def test_runs_in_cluttered_homes_played_the_same_episodes_and_say_where_they_come_from():
-    """The first three hundred of those in the test homes; twelve runs of PPO the thousand in the training homes as well."""
+    """The first three hundred in the test homes; twelve runs of PPO the thousand in the training homes as well."""
     kept = ROOT / "results" / "cluttered"
     rows = read_rows([kept / "rows" / "episodes.parquet"])
     parts = rows.group_by(["run", "split"]).aggregate([("episode", "count"), ("shortest_path_m", "sum")]).to_pylist()
