@@ -26,6 +26,9 @@ class OnHost:
         none = jnp.zeros(())
         return State(Pose(jnp.zeros(3)), jnp.zeros(2), none, none, {}, {"nav": none})  # pyright: ignore[reportArgumentType]
 
+    def reset_to(self, start, key):
+        return self.reset(key)
+
     def move(self, action):
         self.steps += 1
         if self.steps == 3:
