@@ -39,7 +39,7 @@ class Events:
 
     def __init__(self, folder: Path, env_steps: int):
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = RecordWriter(str(folder / f"events.out.tfevents.{time.time():.3f}"))
+        self._file = RecordWriter(str(folder / f"events.out.tfevents.{time.time():.6f}"))
         self._add(file_version="brain.Event:2")
         self._add(step=env_steps + 1, session_log=SessionLog(status=SessionLog.START))
 
