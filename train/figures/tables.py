@@ -153,7 +153,7 @@ def document(rows: pa.Table, split: str | None) -> str:
         "## The paper's claims",
         f"On {shown} scenes unless the line says otherwise. Two-sided Welch t tests over seeds, each seed's score the "
         "mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
-        "Cells with fewer runs than others are left out. "
+        "Cells with fewer runs than others are not compared. "
         "`undecided` says that these runs cannot tell, not that there is no difference.",
         claim_lines(claims(rows, split)),
     ] if learned else []  # fmt: skip

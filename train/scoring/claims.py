@@ -152,13 +152,14 @@ def _of_whole_cells(means: Sequence[RunMean]) -> list[RunMean]:
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     """The paper's claims, one comparison a line; those whose runs are missing say so.
 
-    Cells with fewer runs than others are left out: of a sweep that goes on they are not finished.
+    Cells with fewer runs than others are not compared: of a sweep that goes on they are not finished.
 
     Args:
         rows: of `train.evaluate`.
         split: of the scenes for all but the train and test claim; None: all.
     """
-    means = _of_whole_cells(run_means(rows, split))
+    runs = run_means(rows, split)
+    means = _of_whole_cells(runs)
     robots = sorted({run.robot for run in means})
     found: list[Finding] = []
     for robot in robots:
@@ -171,7 +172,7 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
         what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
         found.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
     for robot in robots:
-        chosen = [run.scores for run in means if run.robot == robot]
+        chosen = [run.scores for run in runs if run.robot == robot]
         r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
         what = f"{robot}: Pearson's r over runs"
         found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
