@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
@@ -94,6 +96,17 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **about: Any) -> None:
         super().__init__(*arguments, **about)
         self.prog = TYPED.get(self.prog, self.prog)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does; a setting behind `--scenes A` (env.x=1) is a setting, not one more scene."""
+        words = list(sys.argv[1:] if args is None else args)
+        if "--scenes" in words and any(a.dest in ("words", "overrides") for a in self._actions):
+            at = words.index("--scenes")
+            scenes = list(itertools.takewhile(lambda word: not word.startswith("-"), words[at + 1 :]))
+            settings = [word for word in scenes if "=" in word]
+            rest = [word for word in scenes if word not in settings]
+            words = [*words[:at], *settings, "--scenes", *rest, *words[at + 1 + len(scenes) :]]
+        return super().parse_known_args(words, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Usage, the message, exit code 2."""

@@ -59,3 +59,16 @@ def test_a_wrong_option_of_a_command_says_which_it_looks_like(capsys):
     with pytest.raises(SystemExit, match="2"):
         parser.parse_args(["convert", "--unlike"])
     assert "did you mean" not in capsys.readouterr().err
+
+
+def test_a_setting_behind_scenes_is_no_scene():
+    parser = Parser()
+    parser.add_argument("run")
+    parser.add_argument("--scenes", nargs="+")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument("overrides", nargs="*")
+    read = parser.parse_intermixed_args(["r", "env.b=1", "--scenes", "A", "env.x=[1,2]", "B", "--seed", "3", "env.c=2"])
+    assert (read.run, read.scenes, read.seed) == ("r", ["A", "B"], 3)
+    assert read.overrides == ["env.b=1", "env.x=[1,2]", "env.c=2"]
+    with pytest.raises(SystemExit, match="2"):  # a scene is still needed
+        parser.parse_intermixed_args(["r", "--scenes", "env.x=1"])
