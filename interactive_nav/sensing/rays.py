@@ -152,6 +152,21 @@ def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Arr
     return (centre + reach > -slack)[..., :-1] & (centre - reach < slack)[..., 1:]
 
 
+def in_view(boxes: dict[str, jax.Array], lens: Lens) -> jax.Array:
+    """Which boxes of `boxes_seen` may show in the image: [N, B]; false for padding."""
+    wide, high = lens.half_height * lens.width / lens.height, lens.half_height
+    across = _shows(boxes, np.array([-wide, wide], np.float32), 1)
+    along = _shows(boxes, np.array([-high, high], np.float32), 2)
+    return _in_front(boxes) & across[..., 0] & along[..., 0]
+
+
+def _in_front(boxes: dict[str, jax.Array]) -> jax.Array:
+    """Which boxes are not padding and reach before the near plane: [N, B]."""
+    ahead = -(boxes["eye"] * boxes["axes"][..., 0]).sum(-1)
+    ahead += (boxes["half"] * jnp.abs(boxes["axes"][..., 0])).sum(-1)
+    return (boxes["half"][..., 0] >= 0) & (ahead > NEAR_M)
+
+
 def _lists(shows: jax.Array, env: np.ndarray, n: int) -> tuple[jax.Array, jax.Array]:
     """Each tile's list of the boxes that it shows, and how many: of `shows` [T, B] and the tiles' environments [T].
 
@@ -176,10 +191,7 @@ def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: in
     y_edges = np.append(bottom, bottom[-1] + th * lens.pixel)
     # Rows of tiles run from the top, edges rise: reversed.
     across, along = _shows(boxes, x_edges, 1), _shows(boxes, y_edges, 2)[..., ::-1]
-    ahead = -(boxes["eye"] * boxes["axes"][..., 0]).sum(-1)
-    ahead += (boxes["half"] * jnp.abs(boxes["axes"][..., 0])).sum(-1)
-    exists = (boxes["half"][..., 0] >= 0) & (ahead > NEAR_M)
-    shows = exists[:, :, None, None] & along[..., :, None] & across[..., None, :]
+    shows = _in_front(boxes)[:, :, None, None] & along[..., :, None] & across[..., None, :]
     shows = jnp.moveaxis(shows.reshape(n, num_boxes, ny * nx), 1, 2).reshape(n * ny * nx, num_boxes)
     count = n * ny * nx
     env = np.repeat(np.arange(n, dtype=np.int32), ny * nx)

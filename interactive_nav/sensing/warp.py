@@ -17,11 +17,12 @@ from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses
+from interactive_nav.sensing.rays import boxes_seen, in_view
 from interactive_nav.sensing.shading import SKY_COLOUR
 from interactive_nav.sensing.surfaces import BoxRenderer
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
-"""Padding boxes lie here, below the floor, which hides them."""
+"""Padding, and boxes that the camera does not see, lie here, below the floor, which hides them."""
 _HIDDEN_HALF_M = 1e-4
 
 
@@ -66,9 +67,11 @@ class WarpRenderer(BoxRenderer):
     def trace_batch(self, scene, qpos, camera):
         n = scene.shape[0]
         context = self._context(n)
-        centre, axes = box_poses(self.tables, scene, held(qpos, self._contexts[n]))
+        qpos = held(qpos, self._contexts[n])
+        centre, axes = box_poses(self.tables, scene, qpos)
         half = self.tables.half_m[scene]
-        hidden = half[..., :1] < 0
+        # What the camera does not see lies aside with the padding: the tree of the rest is smaller.
+        hidden = ~in_view(boxes_seen(self.tables, scene, qpos, camera), self.lens)[..., None]
         centre = jnp.where(hidden, jnp.asarray(_HIDDEN_W), centre)
         half = jnp.where(hidden, _HIDDEN_HALF_M, half)
         order = jnp.argsort(morton_codes(centre[..., :2], hidden[..., 0]), axis=1)

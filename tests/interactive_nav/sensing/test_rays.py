@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import itertools
 import math
 
 import jax
@@ -15,8 +16,8 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
-from interactive_nav.sensing.boxes import build_boxes
-from interactive_nav.sensing.rays import RayRenderer, cast_fan
+from interactive_nav.sensing.boxes import box_poses, build_boxes
+from interactive_nav.sensing.rays import RayRenderer, boxes_seen, cast_fan, in_view
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses, class_id
 from tests.toys import write_room
 
@@ -97,6 +98,25 @@ def test_sizes_that_tiles_do_not_divide(boxes, jumble, size):
     assert tiled[0].shape == (2, size[1], size[0])
     assert np.mean(np.abs(tiled[0] - scanned[0]) < 1e-4) > 0.999
     assert np.mean(tiled[1] == scanned[1]) > 0.999
+
+
+@pytest.mark.parametrize("size", [(68, 68), (40, 20)])
+def test_in_view_is_what_no_side_of_the_picture_cuts_off(boxes, jumble, size):
+    scene, qpos, eye, forward = jumble
+    lens, pose = Lens(size[0], size[1], 80.0), look_along(eye, forward)
+    seen = np.asarray(in_view(boxes_seen(boxes, scene, qpos, pose), lens))
+    # By corners: [N, B, 8, 3] ahead, to the right and up.
+    centre, axes = box_poses(boxes, scene, qpos)
+    half, signs = np.asarray(boxes.half_m)[scene], np.array(list(itertools.product((-1, 1), repeat=3)))
+    corners = centre[:, :, None] + np.einsum("nbij,kj,nbj->nbki", axes, signs, half) - pose.pos_w[:, None, None]
+    ahead, right, up = np.moveaxis(np.einsum("nji,nbkj->nbki", pose.axes_w, corners), -1, 0)
+    high, wide = math.tan(math.radians(40)), math.tan(math.radians(40)) * size[0] / size[1]
+    cut = [ahead < 0.01, right > wide * ahead, right < -wide * ahead, up > high * ahead, up < -high * ahead]
+    want = (half[..., 0] >= 0) & ~np.any([side.all(-1) for side in cut], 0)
+    assert np.mean(seen == want) > 0.99 and (seen | ~want).all() and not seen.all() and seen.any()
+    _, index = jax.jit(RayRenderer(boxes, lens, tiled=False).trace_batch)(scene, qpos, pose)
+    drawn = [np.unique(image[(image >= 0) & (image < boxes.num_boxes)]) for image in np.asarray(index)]
+    assert all(seen[i][own].all() for i, own in enumerate(drawn))
 
 
 def test_depth_is_measured_along_the_optical_axis(world, boxes):
