@@ -43,7 +43,9 @@ def fingerprint(packages: tuple[Path, ...] = PACKAGES) -> bytes:
     """Digest of the converter's modules, of the tables that have their names, and of the libraries' versions."""
     digest = hashlib.sha256(repr([(name, version(name)) for name in COMPUTING]).encode())
     for package in packages:
-        modules = sorted(package.rglob("*.py"))
+        # Unlike rglob, walk passes over folders that vanish: scenes may be in the making inside of a package.
+        files = (Path(folder, name) for folder, _, names in os.walk(package) for name in names)
+        modules = sorted(path for path in files if path.suffix == ".py")
         for path in (*modules, *(table for p in modules if (table := p.with_suffix(".yaml")).is_file())):
             content = path.read_bytes()
             digest.update(f"{path.relative_to(package.parent).as_posix()}\0{len(content)}\0".encode() + content)

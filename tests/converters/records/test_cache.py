@@ -157,6 +157,23 @@ def test_the_fingerprint_follows_every_source_file_by_its_place(tmp_path):
     assert len(set(digests)) == 4
 
 
+def test_a_folder_that_vanishes_from_a_package_meanwhile_does_no_harm(tmp_path, monkeypatch):
+    """Scenes made side by side inside of the package come and go as unfinished folders."""
+    (tmp_path / "cut.py").write_text("a = 1")
+    whole = fingerprint((tmp_path,))
+    (tmp_path / ".home.part-1").mkdir()
+    scan = os.scandir
+
+    def gone(path="."):
+        if ".part-" in str(path):
+            raise FileNotFoundError(2, "No such file or directory", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", gone)
+    fingerprint.cache_clear()
+    assert fingerprint((tmp_path,)) == whole
+
+
 def test_the_fingerprint_follows_what_the_converter_is_built_on():
     """A category's labels decide what is cut: an edited table must not be served old cuts."""
     assert {p.name for p in PACKAGES} == {"converters", "scenes_mjcf", "interactive_nav_common"}
