@@ -9,6 +9,7 @@ import json
 import re
 from pathlib import Path
 
+import pyarrow.parquet
 import pytest
 from rich.console import Console
 
@@ -56,9 +57,33 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
         assert versions["packages"]["mujoco-mjx"] and versions["commit"] == commit
         assert len(read_metrics(kept / PACKED_METRICS)) >= 10
     best = [path.parents[1] for path in SWEPT.glob("runs/*/checkpoints/*")]
-    cells = {known[path.name].cell for path in best}  # PPO's policy of each
-    assert len(cells) == len(best) == 6 and all("-ppo-" in path.name for path in best)
+    cells = {known[path.name].cell for path in best}  # PPO's policy of each with k_int 0 and 0.1
+    assert len(cells) == len(best) == 4 and all("-ppo-" in path.name for path in best)
     assert all((path / "config.yaml").is_file() for path in best)
+
+
+def test_longer_runs_in_cluttered_homes_played_the_same_episodes_and_score_as_the_page_says():
+    kept = ROOT / "results" / "cluttered-long"
+    rows = pyarrow.parquet.read_table(kept / "rows" / "episodes.parquet")  # two checkpoints of a run
+    keys = ["run", "robot", "checkpoint_steps", "train_commit"]
+    wanted = [("episode", "count_distinct"), ("shortest_path_m", "sum"), ("ins_0.5", "mean")]
+    parts = rows.group_by(keys).aggregate([("episode", "count"), *wanted]).to_pylist()
+    assert len(parts) == 14 and {x["run"] for x in parts} == {path.name for path in (kept / "runs").iterdir()}
+    scores = collections.defaultdict(list)
+    for part in parts:
+        same = next(x for x in parts if x["robot"] == part["robot"])
+        assert part["episode_count"] == part["episode_count_distinct"] == 300 and part["train_commit"] == "34831c0d"
+        assert part["shortest_path_m_sum"] == pytest.approx(same["shortest_path_m_sum"], rel=1e-6)
+        scores[part["run"][:-6], part["checkpoint_steps"]].append(part["ins_0.5_mean"])
+        summary = json.loads((kept / "runs" / part["run"] / "summary.json").read_text())
+        assert summary["completed"] and summary["env_steps"] >= part["checkpoint_steps"]
+    page = (ROOT / "docs" / "results.md").read_text()
+    table = page[page.index("### Above every planner?") : page.index("### The paper's claims, cluttered homes")]
+    for group in (values for values in scores.values() if len(values) == 3):
+        assert re.search(rf"\| (\*\*)?{sum(group) / 3:.3f} ±", table)
+    assert len(scores) == 5 and len(scores["longer-k_int1-fetch", 13107200]) == 2
+    (policy,) = kept.rglob("policy.npz")
+    assert (policy.parents[2] / "config.yaml").is_file()
 
 
 def test_runs_in_cluttered_homes_played_the_same_episodes_and_say_where_they_come_from():
