@@ -175,7 +175,7 @@ def test_links_lead_to_files(page):
 
 ROOMS = (*HOUSE, "interactive_nav_common", "results", "scenes_mjcf", "tests")
 A_PATH = re.compile(rf"(?<![\w./$-])(?:{'|'.join(ROOMS)})/[\w./-]*\w(?![\w$<{{*-])")
-MADE = re.compile(r"scenes_mjcf/(?:furnished|cluttered)/\w+_\d|scenes_mjcf/my_|docs/_build|/[A-Z]+(?:/|$)")
+MADE = re.compile(r"scenes_mjcf/(?:furnished|cluttered)/\w+_\d|scenes_mjcf/(?:my_|homes\d)|docs/_build|/[A-Z]+(?:/|$)")
 """Made by a command, or a place that the reader fills: `scenes_mjcf/NAME`."""
 FOREIGN = {"benchmarks/kitchen"}
 """In the repository of `mujoco_warp`."""
