@@ -103,7 +103,7 @@ class Parser(argparse.ArgumentParser):
         if "--scenes" in words and any(a.dest in ("words", "overrides") for a in self._actions):
             at = words.index("--scenes")
             scenes = list(itertools.takewhile(lambda word: not word.startswith("-"), words[at + 1 :]))
-            settings = [word for word in scenes if "=" in word]
+            settings = [word for word in scenes if "=" in word and not Path(word).exists()]
             rest = [word for word in scenes if word not in settings]
             words = [*words[:at], *settings, "--scenes", *rest, *words[at + 1 + len(scenes) :]]
         return super().parse_known_args(words, namespace)

@@ -61,7 +61,7 @@ def test_a_wrong_option_of_a_command_says_which_it_looks_like(capsys):
     assert "did you mean" not in capsys.readouterr().err
 
 
-def test_a_setting_behind_scenes_is_no_scene():
+def test_a_setting_behind_scenes_is_no_scene(tmp_path):
     parser = Parser()
     parser.add_argument("run")
     parser.add_argument("--scenes", nargs="+")
@@ -70,5 +70,7 @@ def test_a_setting_behind_scenes_is_no_scene():
     read = parser.parse_intermixed_args(["r", "env.b=1", "--scenes", "A", "env.x=[1,2]", "B", "--seed", "3", "env.c=2"])
     assert (read.run, read.scenes, read.seed) == ("r", ["A", "B"], 3)
     assert read.overrides == ["env.b=1", "env.x=[1,2]", "env.c=2"]
+    (tmp_path / "a=b").mkdir()
+    assert parser.parse_intermixed_args(["r", "--scenes", str(tmp_path / "a=b")]).scenes == [str(tmp_path / "a=b")]
     with pytest.raises(SystemExit, match="2"):  # a scene is still needed
         parser.parse_intermixed_args(["r", "--scenes", "env.x=1"])
