@@ -24,7 +24,7 @@ from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
-SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar")
+SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar", "trail")
 """Parts of the state vector."""
 IMAGES = ("depth", "segmentation", "rgb", "normals")
 """Parts that are images."""
@@ -91,6 +91,10 @@ class TaskRules(Settings):
     """ahead: at equal arc length ahead; grid: from the robot's own cell, as the original's code."""
     potential: Literal["continuous", "quantised"] = "continuous"
     """Geodesic distance from the robot's position, or quantised: from the centre of its cell."""
+    potential_round: Positive | None = None
+    """A help in training: the potential's way also goes round furniture, where it stood at the start, whose friction
+    exceeds this share of the robot's weight (1: what planners hold for stuck), if there is such a way. Waypoints and
+    scores know nothing of it."""
     scene_choice: Literal["episode", "slot"] = "episode"
     """Each episode draws a scene, or each environment of a batch keeps one (slot; `AutoResetEnv`)."""
     goal_clear: bool = True
@@ -235,7 +239,7 @@ class SensorConfig(Settings):
 
     observations: tuple[str, ...] = OBSERVATIONS
     """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
-    odometry, collision, joints, lidar. With images (depth, segmentation, rgb, normals) the observation is a dict."""
+    odometry, collision, joints, lidar, trail. With images (depth, segmentation, rgb, normals) it is a dict."""
     renderer: Literal["auto", "warp", "rays"] = "auto"
     """Who draws: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
     image_geometry: Literal["boxes", "meshes"] = "boxes"

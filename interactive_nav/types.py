@@ -100,9 +100,10 @@ class NavInfo:
     object_pos_w: jax.Array
     """(M, 3) f32, m: centres of mass."""
     geodesic_m: jax.Array
-    """[] f32 distance to the goal for the body among static structure."""
+    """[] f32 distance to the goal for the body, which the potential is made of: among static structure, and round heavy
+    furniture with `potential_round`."""
     shortest_path_m: jax.Array
-    """[] f32 L*: `geodesic_m` at the start."""
+    """[] f32 L*: the distance among static structure at the start."""
     robot_path_m: jax.Array
     """[] f32 l_0."""
     object_path_m: jax.Array
@@ -133,6 +134,10 @@ class NavInfo:
     """(3,) f32 x, y (m) and yaw (rad) reckoned from the start's frame."""
     touching: jax.Array
     """(2,) bool: a movable object, a wall was touched in the last control step."""
+    trail_w: jax.Array
+    """(T, 2) f32, m: where the base was, latest first, every `TRAIL_STEPS` control steps; T is 0 if not observed."""
+    round_field: tuple[GoalField, jax.Array] | None = None
+    """With `potential_round`: what the geodesic round heavy furniture needs to know, and [] bool whether it counts."""
 
 
 @flax.struct.dataclass

@@ -38,14 +38,18 @@ def cell_centre(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Arr
     return jnp.broadcast_to(tables.grid_origin_w[scene], offset.shape) + offset
 
 
-def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
-    """[] bool: whether the line between two world points (2,) crosses free cells only."""
+def all_free(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Array:
+    """[] bool: whether world points [p, 2] all lie in free cells."""
     rows, columns = tables.free.shape[1:]
-    share = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples
-    points = a[None] + share[:, None] * (b - a)[None]
     at = jnp.floor((points - tables.grid_origin_w[scene][None]) / tables.fine_m).astype(jnp.int32)
     r, c = jnp.clip(at[:, 1], 0, rows - 1), jnp.clip(at[:, 0], 0, columns - 1)
     return tables.free[scene, r, c].all()
+
+
+def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
+    """[] bool: whether the line between two world points (2,) crosses free cells only."""
+    share = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples
+    return all_free(tables, scene, a[None] + share[:, None] * (b - a)[None])
 
 
 def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> GoalField:

@@ -33,7 +33,7 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
 
     Args:
         scene: with its map.
-        poses: body name -> (position, quaternion w x y z), world.
+        poses: body name -> (position, quaternion w x y z), world; what has none does not count.
         height_m: of the robot; what hangs higher does not count.
 
     Returns:
@@ -46,6 +46,8 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
     z = np.arange(0.02, height_m, 0.03)
     covered = np.zeros((rows, columns), bool)
     for movable in scene.movables:
+        if movable.name not in poses:
+            continue
         pos, quat = poses[movable.name]
         body = matrix_from_quat(quat)
         for row in movable.boxes:
@@ -69,6 +71,33 @@ def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarr
         if kind == "free" and name:
             rest[name] = (qpos[at : at + 3], qpos[at + 3 : at + 7])
     return rest
+
+
+def friction_share(world: World, index: int) -> np.ndarray:
+    """[M] friction with the floor of a scene's movables over the robot's weight; 0 for what turns on hinges."""
+    model, layout = world.models[index], world.layout
+    friction = model.geom_friction[np.maximum(model.body_geomadr[layout.slot_body], 0), 0]
+    slides = np.array([kind != "hinge" for kind in layout.slot_kind], bool)
+    return world.mass_kg[index] * friction * slides / world.robot_mass_kg
+
+
+def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
+    """The tables with shortest paths that also go round furniture at rest of more than this `friction_share`."""
+    fine = rules.nav_cell_m / FINE_CELLS
+
+    def graph(index: int) -> CornerGraph:
+        heavy = {n for n, f in zip(world.names[index], friction_share(world, index), strict=True) if f > limit}
+        poses = {name: pose for name, pose in rest_poses(world, index).items() if name in heavy}
+        maps = world.scenes[index].maps
+        for open_ in (~furniture_map(world.scenes[index], poses, world.robot.height_m), True):
+            body = maps.resolution_m, world.robot.footprint_radius_m
+            free = navigation_grid(maps.traversable & open_, *body, fine)
+            if free.any():
+                break
+        return corner_graph(free, fine, rules.nav_cell_m, maps.origin_w)
+
+    with ThreadPoolExecutor() as pool:
+        return tables.replace(**navigation_tables(list(pool.map(graph, range(len(world.scenes))))))
 
 
 def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ import scipy.sparse.csgraph
 import scipy.spatial
 
 from interactive_nav.geodesic import crossed_cells, largest_component, sampled_clearance
+from interactive_nav.navigation.tables import friction_share
 
 CELL_M = 0.05
 MARGIN_M = 0.02
@@ -104,10 +105,9 @@ class _SceneGrid:
         bodies = world.layout.slot_body[self.occupied]
         model = world.models[index]
         self.footprints = Footprints(model, bodies, env.robot.height_m, self.origin_w, self.shape)
-        self.mass_kg = world.mass_kg[index][self.occupied]
-        self.slides = np.array([world.layout.slot_kind[k] != "hinge" for k in self.occupied])
         first = [model.body_geomadr[b] for b in bodies]
-        self.friction = model.geom_friction[first, 0]
+        self.price = world.mass_kg[index][self.occupied] * model.geom_friction[first, 0] / world.robot_mass_kg
+        self.stuck = friction_share(world, index)[self.occupied] > 1.0  # its friction exceeds the robot's weight
 
     def middles_w(self, cells: np.ndarray) -> np.ndarray:
         """[p, 2] m of cells [p, 2] (row, column)."""
@@ -253,9 +253,8 @@ class Ways:
         share = 1.0 if self._weight is None else self._weight
         for k, cells in enumerate(grid.footprints.cells(qpos)):
             if len(cells):
-                price = grid.mass_kg[k] * grid.friction[k] / self._env.world.robot_mass_kg
-                stuck = grid.slides[k] and price > 1.0  # its friction exceeds the robot's weight
-                price = FORCED_COST if stuck or share == 1.0 else min(share / (1.0 - share) * price, FORCED_COST)
+                forced = grid.stuck[k] or share == 1.0
+                price = FORCED_COST if forced else min(share / (1.0 - share) * grid.price[k], FORCED_COST)
                 blocked.flat[cells] = True
                 covered.flat[cells] = np.maximum(covered.flat[cells], price)
         away, index = scipy.ndimage.distance_transform_edt(~blocked, return_indices=True)  # type: ignore[misc]

@@ -9,7 +9,7 @@ Layout by default (reference benchmark, section 1.1), robot frame, full roll-pit
 | 23-25 | base linear velocity | m/s |
 | 26-28 | base angular velocity | rad/s |
 
-Then, where asked for: localisation, odometry, collision, joints, lidar. Images stand beside the
+Then, where asked for: localisation, odometry, collision, joints, lidar, trail. Images stand beside the
 vector, not in it: `interactive_nav.sensing.sensors`.
 """
 

@@ -35,13 +35,17 @@ from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.boxes import rotate
 from interactive_nav.sensing.mount import Mount, make_mount
 from interactive_nav.sensing.noise import disturbed
-from interactive_nav.sensing.observation import task_parts
+from interactive_nav.sensing.observation import task_parts, waypoints_in_body
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.sensing.shading import draw_look
 from interactive_nav.types import NavInfo
 from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 from scenes_mjcf.categories import SEGMENTATIONS
 
+TRAIL_STEPS = 10
+"""Control steps between two points of the trail."""
+TRAIL = (1, 2, 4, 8, 16, 32, 64)
+"""Points of it that are observed: 1 to 64 s ago with a control period of 0.1 s, and up to 0.9 s more."""
 LIDAR_NEAR_M = 0.05
 """Beams begin this far from the scanner (iGibson)."""
 
@@ -100,6 +104,7 @@ class Sensors:
             "collision": 2,
             "joints": 2 * len(self._joints[0]),
             "lidar": config.lidar_rays,
+            "trail": 2 * len(TRAIL),
         }
         self.sizes = {name: size for name, size in sizes.items() if name in config.observations}
         """Parts of the vector in order -> their lengths."""
@@ -191,6 +196,8 @@ class Sensors:
             values["joints"] = jnp.concatenate([angle, physics.qvel[velocity]])
         if "lidar" in self.sizes:
             values["lidar"] = self._scan(physics, nav, rotation, rng)
+        if "trail" in self.sizes:
+            values["trail"] = waypoints_in_body(nav.trail_w[jnp.array(TRAIL)], nav.robot_pos_w, rotation).reshape(-1)
         return jnp.concatenate([values[name] for name in self.sizes] or [jnp.zeros(0)])
 
     def _scan(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array, rng: jax.Array) -> jax.Array:

@@ -11,9 +11,16 @@ import numpy as np
 from brax.envs.base import Env, State
 
 from interactive_nav.config import NavConfig
-from interactive_nav.navigation.lookup import cell_centre, geodesic_at, goal_field, grid_waypoints_at, waypoints_at
+from interactive_nav.navigation.lookup import (
+    all_free,
+    cell_centre,
+    geodesic_at,
+    goal_field,
+    grid_waypoints_at,
+    waypoints_at,
+)
 from interactive_nav.navigation.placement import draw_episode, place_small
-from interactive_nav.navigation.tables import build_tables, furniture_map, rest_poses
+from interactive_nav.navigation.tables import build_tables, furniture_map, rest_poses, round_tables
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
 from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.reward import interactive_navigation_reward
@@ -23,7 +30,7 @@ from interactive_nav.scenes.spec import parking_spot
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.boxes import body_poses, rotate
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
-from interactive_nav.sensing.sensors import Sensors
+from interactive_nav.sensing.sensors import TRAIL, TRAIL_STEPS, Sensors
 from interactive_nav.task.episode_scores import episode_scores, score_mass_kg
 from interactive_nav.types import EPISODE_METRICS, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
@@ -62,6 +69,8 @@ class InteractiveNav(Env):
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
         self.tables = build_tables(self.world, config.rules)
+        limit = config.rules.potential_round
+        self._round = round_tables(self.world, self.tables, config.rules, limit) if limit else None
         self.physics = make_physics(self.world, config)
         self.sensors = Sensors(self.world, config, self.physics.name)
         self.success_distance_m = config.rules.success_distance_m or robot.body_width_m
@@ -135,7 +144,12 @@ class InteractiveNav(Env):
         scene = start.scene_index
         goal = goal_field(self.tables, scene, start.goal_xy_w)
         waypoints_b = self._waypoints(scene, goal, pos_w, rotation)
-        geodesic_m = self._geodesic(scene, goal, pos_w)
+        if self._round:
+            ends = jnp.stack([start.start_xy_w, start.goal_xy_w])
+            detour = goal_field(self._round, scene, start.goal_xy_w), all_free(self._round, scene, ends)
+        else:
+            detour = None
+        geodesic_m = self._geodesic(scene, goal, detour, pos_w)
         nav = NavInfo(
             scene_index=scene,
             goal_xy_w=start.goal_xy_w,
@@ -144,6 +158,7 @@ class InteractiveNav(Env):
             waypoints_b=waypoints_b,
             shortest_path_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
+            round_field=detour,
             **self._at_start(scene, physics, geodesic_m),
         )
         zero = jnp.zeros(())
@@ -169,14 +184,15 @@ class InteractiveNav(Env):
             **dict.fromkeys((*counts, "lifted_steps", "step_count"), count),
             "odometry": jnp.zeros(3),
             "touching": jnp.zeros(2, bool),
+            "trail_w": jnp.tile(pos_w[:2], (max(TRAIL) + 1 if "trail" in self.sensors.sizes else 0, 1)),
         }
 
     def _of_physics(self, nav: NavInfo, physics: PhysicsState, again: jax.Array) -> NavInfo:
         """The task's memory that belongs to this physics: none yet where a wrapper (Brax's auto-reset) has put the
         episode's first state back, which the clock in it tells (`again`)."""
         scene, geodesic_m = nav.scene_index, nav.shortest_path_m
-        if self.config.rules.potential == "quantised":
-            geodesic_m = self._geodesic(scene, nav.goal_field, self._robot_pose(physics)[0])
+        if self.config.rules.potential == "quantised" or self._round:
+            geodesic_m = self._geodesic(scene, nav.goal_field, nav.round_field, self._robot_pose(physics)[0])
         first = self._at_start(scene, physics, geodesic_m)
         return nav.replace(**{name: jnp.where(again, value, getattr(nav, name)) for name, value in first.items()})
 
@@ -280,12 +296,17 @@ class InteractiveNav(Env):
         occupied = self.tables.mass_kg[scene, 1:] > 0
         return jnp.any(occupied & (signals.slot_force_n > TOUCH_FORCE_N))
 
-    def _geodesic(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array) -> jax.Array:
+    def _geodesic(
+        self, scene: jax.Array, goal: GoalField, detour: tuple[GoalField, jax.Array] | None, pos_w: jax.Array
+    ) -> jax.Array:
         """[] m: the distance that the potential is made of."""
         xy = pos_w[:2]
         if self.config.rules.potential == "quantised":
             xy = cell_centre(self.tables, scene, xy)
-        return geodesic_at(self.tables, scene, goal, xy)
+        plain_m = geodesic_at(self.tables, scene, goal, xy)
+        if not (self._round and detour):
+            return plain_m
+        return jnp.where(detour[1], geodesic_at(self._round, scene, detour[0], xy), plain_m)
 
     def _waypoints(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
         rules = self.config.rules
@@ -319,7 +340,7 @@ class InteractiveNav(Env):
             yaw_rad=yaw,
             waypoints_b=self._waypoints(scene, goal, pos_w, rotation),
             object_pos_w=objects,
-            geodesic_m=self._geodesic(scene, goal, pos_w),
+            geodesic_m=self._geodesic(scene, goal, nav.round_field, pos_w),
             robot_path_m=nav.robot_path_m + travelled,
             object_path_m=nav.object_path_m + pushed,
             object_contact_steps=contact_steps,
@@ -336,6 +357,11 @@ class InteractiveNav(Env):
                 nav.odometry, (pos_w - nav.robot_pos_w)[:2], nav.yaw_rad, wrap_angle(yaw - nav.yaw_rad), slip
             ),
             touching=~broken & jnp.stack([touches, hits_wall]),
+            trail_w=jnp.where(
+                (nav.step_count + 1) % TRAIL_STEPS == 0,
+                jnp.concatenate([pos_w[None, :2], nav.trail_w])[: len(nav.trail_w)],
+                nav.trail_w,
+            ),
         )
 
 

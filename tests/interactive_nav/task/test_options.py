@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
@@ -60,8 +61,9 @@ _RESETS: dict[bool, Any] = {}
 
 
 def begin(env, goal=(1.6, 0.0), x=-0.7):
-    """First state, which only options of waypoints and potential change: the others share a compiled reset."""
-    special = env.config.rules.waypoint_style != "ahead" or env.config.rules.potential != "continuous"
+    """First state, which only options of waypoints, potential and trail change: the others share a compiled reset."""
+    rules, trail = env.config.rules, "trail" in env.config.sensors.observations
+    special = (rules.waypoint_style, rules.potential, rules.potential_round) != ("ahead", "continuous", None) or trail
     if special or False not in _RESETS:
         reset = jax.jit(jax.vmap(env.reset_to))
         _RESETS[special] = reset
@@ -295,6 +297,37 @@ def test_a_quantised_potential_moves_in_steps_of_a_cell(pushed, paper):
     assert ((np.abs(steps) < 1e-3) | (np.abs(steps + 0.1) < 0.01)).all() and (steps < -0.05).sum() in (3, 4)
 
 
+def round_a_square_m(half_m, radius_m, start_x, goal_x):
+    """Length of a disc's shortest way past a square on the origin, from one place on the x axis to another: tangents to
+    the circles about two of its corners, arcs, and the straight piece between them."""
+    total = 2 * half_m
+    for away in (abs(start_x) - half_m, goal_x - half_m):
+        gap = math.hypot(away, half_m)
+        heading = math.atan2(half_m, away) + math.asin(radius_m / gap)
+        total += math.sqrt(gap**2 - radius_m**2) + radius_m * heading
+    return total
+
+
+def test_the_potential_goes_round_what_is_heavy_where_there_is_a_way(pushed, paper, tmp_path):
+    env = make(pushed, potential_round=0.05)  # the block's friction is 0.5 kg, the robot weighs 2.7 kg
+    states = play(env, [AHEAD] * 30)
+    way_m = round_a_square_m(0.2, env.robot.footprint_radius_m, -0.7, 1.6)
+    assert value(states, "geodesic_m")[0] == pytest.approx(way_m, abs=0.03)
+    # The robot presses on: the plain potential pays for that, this one hardly does. Nothing else knows of it.
+    assert value(paper, "geodesic_m")[[0, -1]] == pytest.approx([2.3, 2.3 - 0.95], abs=0.12)
+    for name in ("shortest_path_m", "waypoints_b", "robot_pos_w", "object_path_m"):
+        np.testing.assert_allclose(value(states, name), value(paper, name), atol=1e-5)
+    rewards = np.array([np.asarray(s.metrics["reward/potential"])[0] for s in states[1:]])
+    np.testing.assert_allclose(rewards, -np.diff(value(states, "geodesic_m")), atol=1e-5)
+
+    light = play(make(pushed, potential_round=0.2), [])
+    np.testing.assert_allclose(value(light, "geodesic_m"), 2.3, atol=1e-3)
+    row = tuple(("basket", 0.0, y, MASS_KG, FRICTION) for y in (-1.2, -0.8, -0.4, 0.0, 0.4, 0.8, 1.2))
+    closed = play(make(write_room(tmp_path / "closed", (4.0, 3.0), row), potential_round=0.05), [])
+    assert not closed[0].info["nav"].round_field[1].any()
+    np.testing.assert_allclose(value(closed, "geodesic_m"), 2.3, atol=1e-3)
+
+
 def test_each_slot_keeps_its_scene(pushed, room):
     env = interactive_nav.make(
         "turtlebot", [pushed, room], backend="native", num_objects=0, episode_steps=3, scene_choice="slot"
@@ -366,3 +399,17 @@ def test_settings_that_say_what_holds_anyway_are_taken():
     assert (either.active_furniture, either.contacts_per_env, either.threads) == (3, 50, 2)
     seen = make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=32)
     assert (seen.lidar_rays, seen.depth_noise, seen.image_size) == (3, 0.1, 32)
+
+
+def test_the_trail_is_where_the_base_was_a_second_ago_and_longer(pushed):
+    env = make(pushed, observations=("goal", "trail"))
+    states = play(env, [(0.2, -0.1)] * 25)
+    places = value(states, "robot_pos_w")[:, :2]
+    nav = states[25].info["nav"]
+    # Every ten control steps: after 10 and 20; before that the start, which stands for all that is longer ago.
+    np.testing.assert_allclose(nav.trail_w[0], [places[20], places[10], *[places[0]] * 63], atol=1e-6)
+    seen = np.asarray(jax.vmap(env.observe)(states[25]).obs)[0, 3:].reshape(7, 2)
+    ago = np.array([places[10], *[places[0]] * 6]) - places[25]
+    cos, sin = math.cos(float(nav.yaw_rad[0])), math.sin(float(nav.yaw_rad[0]))
+    np.testing.assert_allclose(seen, ago @ np.array([[cos, -sin], [sin, cos]]), atol=0.01)  # it pitches a little
+    assert np.linalg.norm(ago[0]) > 0.1
