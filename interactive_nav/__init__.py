@@ -22,6 +22,10 @@ from interactive_nav_common.errors import ConfigError
 # writes them as text into every program that it compiles (measured: 23 s instead of 8 s for a small room).
 # JAX reads it once, at its own import: import interactive_nav first, or set the variable yourself.
 os.environ.setdefault("JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS", "1")
+# With one thread (one core) JAX's CPU client never ends a callback whose large argument it has yet to copy (a thousand
+# environments of cluttered homes on native); XLA takes the number of its threads from here.
+if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+    os.environ.setdefault("NPROC", "2")
 mjx_without_warp.hush()
 
 if TYPE_CHECKING:
