@@ -202,7 +202,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
         goal_xy_w=f32("goal_xy_w"),
         small_xy_w=jnp.asarray(poses[..., :2]),
         small_yaw_rad=jnp.asarray(poses[..., 2]),
-        small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows]).reshape(-1, count),
+        small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows], bool),
     )
     _, lengths = jax.jit(jax.vmap(lambda start: _with_length(env, start)))(starts)
     wrong = np.abs(np.asarray(lengths) - np.asarray(f32("shortest_path_m"))) > LENGTH_TOLERANCE_M

@@ -48,6 +48,14 @@ def test_round_trip_and_the_same_episodes_as_reset(env, made, tmp_path):
     assert episodes.draw(env, 2, seed=4).episodes == made.episodes[:2]
 
 
+def test_episodes_without_small_objects(room):
+    bare = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0)
+    made = episodes.draw(bare, 2, seed=1)
+    starts = episodes.starts_of(made, bare)
+    assert starts.small_placed.shape == (2, 0) and starts.small_placed.dtype == bool
+    np.testing.assert_allclose(starts.goal_xy_w, [row["goal_xy_w"] for row in made.episodes], atol=1e-6)
+
+
 @pytest.mark.parametrize("backend", ["jax", "warp"])
 def test_the_same_file_gives_the_same_episodes_on_every_backend(env, made, room, two_rooms, backend):
     if backend == "warp":
