@@ -264,6 +264,10 @@ def _train_in(
         highlight=False,
         soft_wrap=True,
     )
+    each, limit = config.run.num_timesteps // num_envs(config), config.env.rules.episode_steps
+    if each < limit:
+        told = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
+        console.print(f"[yellow]{told} end and begins anew; lower env.episode_steps or train longer[/]", soft_wrap=True)
     with stop_signals() as stops, TrainingDisplay(console) as display:
         callbacks = FolderCallbacks(folder, config, env, display, stops)
         try:

@@ -71,6 +71,13 @@ def test_folder_of_a_finished_run(finished):
     assert not list(folder.path.rglob("*partial*"))
 
 
+def test_fewer_steps_for_an_environment_than_an_episode_may_have_are_told(finished, tmp_path):
+    console = quiet()
+    train_run(toy_config(tmp_path, updates=3), console, build_env=build_toy)  # 3 * 256 steps of 16 environments
+    told = "48 steps for each environment, and an episode has up to 60: none that fails comes to its end"
+    assert told in console.file.getvalue() and "none that fails" not in finished[3]  # type: ignore[attr-defined]
+
+
 def test_finished_run_is_not_trained_again(finished):
     result, folder, config, _ = finished
     before = folder.metrics.read_text()
