@@ -194,8 +194,10 @@ def last_line(path: Path) -> dict[str, Any]:
 
 
 def log_tail(path: Path, count: int = 6) -> list[str]:
-    """The last lines of a log that say something."""
-    return [line.rstrip() for line in _tail(path) if line.strip()][-count:]
+    """The last lines of a log that say something, of its last try: a line of `== time name` begins each."""
+    lines = [line.rstrip() for line in _tail(path) if line.strip()]
+    begun = max((i for i, line in enumerate(lines) if line.startswith("== ")), default=-1)
+    return lines[begun + 1 :][-count:]
 
 
 def programs_env() -> dict[str, str]:

@@ -204,6 +204,16 @@ def test_failures_stay_with_their_run_and_are_tried_again_so_many_times(tmp_path
     assert not list((folder.root / "failed").iterdir())
 
 
+def test_an_evaluation_that_ends_well_without_rows_has_failed(tmp_path, monkeypatch):
+    set_fates(tmp_path, {"k_int1-seed1": ["", "no-rows"]})
+    outcome, printed, _ = sweep(write_sweep(tmp_path))
+    states = {s.name: s for s in outcome.states}
+    assert outcome.exit_code("done") == 1 and states["k_int1-seed1"].state == "trained"
+    what = "evaluate: ended, but what it was asked for is not there: (nothing was printed)"
+    assert states["k_int1-seed1"].reason == what and "given up after 2 tries" in printed
+    assert [s.state for s in outcome.states].count("done") == 3
+
+
 def test_a_run_out_of_memory_gets_twice_the_share(tmp_path, monkeypatch):
     set_fates(tmp_path, {"k_int0-seed0": ["oom", "oom"]})
     launch = {"runs_per_gpu": 4, "retries": 2, "jax_memory_share": 0.5}
