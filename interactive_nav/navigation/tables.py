@@ -74,19 +74,20 @@ def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarr
 
 
 def friction_share(world: World, index: int) -> np.ndarray:
-    """[M] friction with the floor of a scene's movables over the robot's weight; 0 for what turns on hinges."""
-    model, layout = world.models[index], world.layout
-    friction = model.geom_friction[np.maximum(model.body_geomadr[layout.slot_body], 0), 0]
-    slides = np.array([kind != "hinge" for kind in layout.slot_kind], bool)
-    return world.mass_kg[index] * friction * slides / world.robot_mass_kg
+    """[M] mass times friction of what is in a scene's movable slots over the robot's mass; 0 where a slot is empty."""
+    model = world.models[index]
+    first = np.maximum(model.body_geomadr[world.layout.slot_body], 0)
+    return world.mass_kg[index] * model.geom_friction[first, 0] / world.robot_mass_kg
 
 
 def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
-    """The tables with shortest paths that also go round furniture at rest of more than this `friction_share`."""
-    fine = rules.nav_cell_m / FINE_CELLS
+    """The tables with shortest paths that also go round furniture at rest of more than this `friction_share`; doors,
+    which turn, are no obstacle."""
+    fine, kinds = rules.nav_cell_m / FINE_CELLS, world.layout.slot_kind
 
     def graph(index: int) -> CornerGraph:
-        heavy = {n for n, f in zip(world.names[index], friction_share(world, index), strict=True) if f > limit}
+        slots = zip(world.names[index], kinds, friction_share(world, index), strict=True)
+        heavy = {name for name, kind, share in slots if kind != "hinge" and share > limit}
         poses = {name: pose for name, pose in rest_poses(world, index).items() if name in heavy}
         maps = world.scenes[index].maps
         for open_ in (~furniture_map(world.scenes[index], poses, world.robot.height_m), True):

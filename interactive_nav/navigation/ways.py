@@ -105,9 +105,9 @@ class _SceneGrid:
         bodies = world.layout.slot_body[self.occupied]
         model = world.models[index]
         self.footprints = Footprints(model, bodies, env.robot.height_m, self.origin_w, self.shape)
-        first = [model.body_geomadr[b] for b in bodies]
-        self.price = world.mass_kg[index][self.occupied] * model.geom_friction[first, 0] / world.robot_mass_kg
-        self.stuck = friction_share(world, index)[self.occupied] > 1.0  # its friction exceeds the robot's weight
+        self.price = friction_share(world, index)[self.occupied]
+        slides = np.array([world.layout.slot_kind[k] != "hinge" for k in self.occupied], bool)
+        self.stuck = slides & (self.price > 1.0)  # its friction exceeds the robot's weight
 
     def middles_w(self, cells: np.ndarray) -> np.ndarray:
         """[p, 2] m of cells [p, 2] (row, column)."""

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -196,7 +197,7 @@ def last_line(path: Path) -> dict[str, Any]:
 def log_tail(path: Path, count: int = 6) -> list[str]:
     """The last lines of a log that say something, of its last try: a line of `== time name` begins each."""
     lines = [line.rstrip() for line in _tail(path) if line.strip()]
-    begun = max((i for i, line in enumerate(lines) if line.startswith("== ")), default=-1)
+    begun = max((i for i, line in enumerate(lines) if re.match(r"== \d{4}-\d\d-\d\d ", line)), default=-1)
     return lines[begun + 1 :][-count:]
 
 
