@@ -19,9 +19,9 @@ from train.scoring.policies import PolicyFn
 
 CHUNK_STEPS = 50
 """Steps between two looks at which episodes are over."""
-SHRINK = 4
-"""On the CPU, once only one episode in so many still runs, those go on in a batch of their own: it costs a
-compilation and saves stepping the rest. On an accelerator a step costs about the same for fewer."""
+FEWEST = 16
+"""On the CPU a batch is halved as often as its half holds all episodes that still run, down to about so many: each
+size costs a compilation, and saves stepping the rest. On an accelerator a step costs about the same for fewer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,13 +174,29 @@ class BatchPlayer:
             places[:, episode_of[seen]] = np.asarray(track)[:, seen]
             tracks.append(places)
             on_progress(done + int(finished[:count].sum()), step)
-            running = np.flatnonzero(~finished[episode_of])
-            if self.env.backend == "native" and 0 < len(running) <= len(episode_of) // SHRINK:
-                carry = jax.tree.map(operator.itemgetter(running), carry)
-                episode_of = episode_of[running]
+            if self.env.backend == "native":
+                kept = halved(finished[episode_of])
+                if len(kept) < len(episode_of):
+                    carry, episode_of = jax.tree.map(operator.itemgetter(kept), carry), episode_of[kept]
         paths = _paths(first, ends.pop("object_pos_w"), tracks, record)
         metrics, ends = ({name: x[:count] for name, x in values.items()} for values in (metrics, ends))
         return PlayedEpisodes(first.scene_index[:count], metrics, ends, paths)
+
+
+def halved(over: np.ndarray) -> np.ndarray:
+    """Places of a batch that go on once those of `over` have ended: all that run, then as many others as fill it.
+
+    Args:
+        over: [N] bool.
+
+    Returns:
+        [n] i64, N halved (and rounded up) as often as n holds all that run and N is above `FEWEST`. So the sizes of
+        all batches of N episodes are the same few, and what is compiled for one serves the next.
+    """
+    size, running = len(over), int((~over).sum())
+    while size > FEWEST and running <= -(-size // 2):
+        size = -(-size // 2)
+    return np.argsort(over, kind="stable")[:size]
 
 
 def _paths(first: Any, object_end: np.ndarray, tracks: list[np.ndarray], record: int) -> Paths:

@@ -25,15 +25,40 @@ from train.scoring.rows import episode_table
 
 
 def test_an_episode_is_the_same_whatever_runs_beside_it(monkeypatch):
-    """Twelve episodes, shrunk on the way, against the first five alone: equal number by number."""
+    """Twelve episodes, in ever smaller batches, against the first five alone: equal number by number."""
+    monkeypatch.setattr(rollout, "FEWEST", 2)
     env = ToyEnv(ToyConfig(episode_steps=120))
     many = BatchPlayer(env).play(make_random(env), episode_keys(seed=3, episodes=12), record=12)
-    monkeypatch.setattr(rollout, "SHRINK", 10**9)
+    monkeypatch.setattr(rollout, "FEWEST", 10**9)
     few = BatchPlayer(env).play(make_random(env), episode_keys(seed=3, episodes=5), record=5)
     for name, values in few.metrics.items():
         np.testing.assert_allclose(many.metrics[name][:5], values, rtol=1e-5)
     length = few.paths.robot_xy_w.shape[1]
     np.testing.assert_allclose(many.paths.robot_xy_w[:5, :length], few.paths.robot_xy_w, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("size", "running", "left"),
+    [
+        (100, 51, 100),
+        (100, 50, 50),
+        (100, 26, 50),
+        (100, 25, 25),
+        (100, 14, 25),
+        (100, 13, 13),
+        (100, 3, 13),
+        (16, 1, 16),
+        (31, 16, 16),
+    ],
+)
+def test_a_batch_is_halved_as_often_as_its_half_holds_what_runs(size, running, left):
+    """By hand: 100, 50, 25, 13 (which is no more than 16) are the only sizes of a batch of a hundred."""
+    over = np.ones(size, bool)
+    still = np.random.default_rng(size + running).choice(size, running, replace=False)
+    over[still] = False
+    kept = rollout.halved(over)
+    assert len(kept) == left == len(set(kept.tolist()))
+    assert kept[:running].tolist() == sorted(still.tolist()) and over[kept[running:]].all()
 
 
 def test_paths_end_where_the_episode_ends():
@@ -124,7 +149,7 @@ def test_batches_that_do_not_fit_are_halved(monkeypatch):
         return usual(policy, carry, keys, step)
 
     monkeypatch.setattr(player, "_chunk", small_memory)
-    monkeypatch.setattr(rollout, "SHRINK", 10**9)
+    monkeypatch.setattr(rollout, "FEWEST", 10**9)
     keys = episode_keys(seed=3, episodes=12)
     played = player.play(make_random(env), keys, on_note=notes.append)
     assert sizes[:3] == [12, 6, 3] and set(sizes[3:]) == {3} and len(notes) == 2
