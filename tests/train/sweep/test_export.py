@@ -19,7 +19,7 @@ from train.scoring.row_files import paths_beside
 from train.sweep import export as export_module
 from train.sweep import spec
 from train.sweep.__main__ import main
-from train.sweep.export import rounded, thinned
+from train.sweep.export import rounded, thinned, without_seen_things
 from train.sweep.folder import SweepFolder
 
 
@@ -40,8 +40,8 @@ def test_curves_are_means_over_episodes():
 
 def test_rows_are_rounded_by_column_also_in_lists():
     """By hand; a half goes to the even neighbour. What has no step, is no float or is missing stays as it is."""
-    entry = {"category": "toy", "touched": 3, "displacement_m": 1.5 / 512 + 1e-5, "force_sum_n": 2.5}
-    near = {**entry, "displacement_m": 2 / 512, "force_sum_n": 2.0}
+    entry = {"category": "toy", "touched": 3, "displacement_m": 1.5 / 128 + 1e-5, "force_sum_n": 20.0}
+    near = {**entry, "displacement_m": 2 / 128, "force_sum_n": 16.0}
     f32, f64 = pa.float32(), pa.float64()
     entries = pa.list_(
         pa.struct({"category": pa.string(), "touched": pa.int32(), "displacement_m": f32, "force_sum_n": f32})
@@ -51,8 +51,8 @@ def test_rows_are_rounded_by_column_also_in_lists():
             "run": ["a", "b", "c"],
             "k_int": pa.array([0.1, 0.1, 0.1], f64),
             "ins_0.5": pa.array([0.3, 1.0, None], f32),
-            "robot_path_m": pa.array([2.001, 0.25, 1 / 1024], f32),
-            "force_sum_n": pa.array([0.5, 1.5, 526777.0], f32),
+            "robot_path_m": pa.array([2.01, 0.25, 1 / 256], f32),
+            "force_sum_n": pa.array([4.0, 12.0, 526777.0], f32),
             "train_wall_s": pa.array([7.005, float("inf"), None], f64),
             "episode_steps": pa.array([3, 4, 5], pa.int32()),
             "by_category": pa.array([[entry, entry], None, []], entries),
@@ -61,9 +61,9 @@ def test_rows_are_rounded_by_column_also_in_lists():
     told = rounded(rows)
     assert told.schema.equals(rows.schema) and told.to_pydict() == {
         **rows.to_pydict(),
-        "ins_0.5": [4915 / 16384, 1.0, None],
-        "robot_path_m": [1025 / 512, 0.25, 0.0],
-        "force_sum_n": [0.0, 2.0, 526777.0],
+        "ins_0.5": [307 / 1024, 1.0, None],
+        "robot_path_m": [257 / 128, 0.25, 0.0],
+        "force_sum_n": [0.0, 16.0, 526776.0],
         "train_wall_s": [448 / 64, float("inf"), None],
         "by_category": [[near, near], None, []],
     }
@@ -71,6 +71,16 @@ def test_rows_are_rounded_by_column_also_in_lists():
         pa.concat_tables([told[2:], told[:2]])
     )
     assert rounded(rows[:0]).equals(rows[:0])
+
+
+def test_things_by_category_are_kept_of_unseen_homes_where_there_are_any():
+    told = pa.array([[{"objects": 2}], [{"objects": 3}], None])
+    rows = pa.table({"by_category": told, "split": ["train", "test", "test"], "episode": [0, 1, 2]})
+    kept = without_seen_things(rows)
+    assert kept.schema.equals(rows.schema) and kept["by_category"].to_pylist() == [None, [{"objects": 3}], None]
+    assert kept.drop(["by_category"]).equals(rows.drop(["by_category"]))
+    assert without_seen_things(rows[:1]).equals(rows[:1]) and without_seen_things(rows[:0]).equals(rows[:0])
+    assert without_seen_things(rows.drop(["by_category"])).column_names == ["split", "episode"]
 
 
 @pytest.fixture
