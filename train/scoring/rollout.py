@@ -19,9 +19,9 @@ from train.scoring.policies import PolicyFn
 
 CHUNK_STEPS = 50
 """Steps between two looks at which episodes are over."""
-FEWEST = 16
-"""On the CPU a batch is halved as often as its half holds all episodes that still run, down to about so many: each
-size costs a compilation, and saves stepping the rest. On an accelerator a step costs about the same for fewer."""
+FEWEST, MANY = 16, 256
+"""On the CPU a batch becomes smaller as episodes end: by a quarter above `MANY`, by half below, down to about `FEWEST`.
+Each size costs a compilation, and saves stepping the rest. On an accelerator a step costs about the same for fewer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,7 +175,7 @@ class BatchPlayer:
             tracks.append(places)
             on_progress(done + int(finished[:count].sum()), step)
             if self.env.backend == "native":
-                kept = halved(finished[episode_of])
+                kept = going_on(finished[episode_of])
                 if len(kept) < len(episode_of):
                     carry, episode_of = jax.tree.map(operator.itemgetter(kept), carry), episode_of[kept]
         paths = _paths(first, ends.pop("object_pos_w"), tracks, record)
@@ -183,19 +183,19 @@ class BatchPlayer:
         return PlayedEpisodes(first.scene_index[:count], metrics, ends, paths)
 
 
-def halved(over: np.ndarray) -> np.ndarray:
+def going_on(over: np.ndarray) -> np.ndarray:
     """Places of a batch that go on once those of `over` have ended: all that run, then as many others as fill it.
 
     Args:
         over: [N] bool.
 
     Returns:
-        [n] i64, N halved (and rounded up) as often as n holds all that run and N is above `FEWEST`. So the sizes of
-        all batches of N episodes are the same few, and what is compiled for one serves the next.
+        [n] i64, n the smallest of N's sizes (see `FEWEST`) that holds all that run. So all batches of N episodes have
+        the same few, and what is compiled for one serves the next.
     """
     size, running = len(over), int((~over).sum())
-    while size > FEWEST and running <= -(-size // 2):
-        size = -(-size // 2)
+    while size > FEWEST and running <= (smaller := -(-size * 3 // 4) if size > MANY else -(-size // 2)):
+        size = smaller
     return np.argsort(over, kind="stable")[:size]
 
 

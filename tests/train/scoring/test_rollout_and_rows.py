@@ -39,24 +39,15 @@ def test_an_episode_is_the_same_whatever_runs_beside_it(monkeypatch):
 
 @pytest.mark.parametrize(
     ("size", "running", "left"),
-    [
-        (100, 51, 100),
-        (100, 50, 50),
-        (100, 26, 50),
-        (100, 25, 25),
-        (100, 14, 25),
-        (100, 13, 13),
-        (100, 3, 13),
-        (16, 1, 16),
-        (31, 16, 16),
-    ],
+    [(100, 51, 100), (100, 50, 50), (100, 26, 50), (100, 14, 25), (100, 13, 13), (100, 3, 13), (16, 1, 16)]
+    + [(400, 301, 400), (400, 300, 300), (400, 226, 300), (400, 225, 225), (400, 114, 225), (400, 113, 113)],
 )
-def test_a_batch_is_halved_as_often_as_its_half_holds_what_runs(size, running, left):
-    """By hand: 100, 50, 25, 13 (which is no more than 16) are the only sizes of a batch of a hundred."""
+def test_a_batch_has_the_smallest_of_its_sizes_that_holds_what_runs(size, running, left):
+    """By hand: 100, 50, 25, 13, which is no more than 16; and 400, 300, 225, from where it is by half: 113, 57, 29, 15."""
     over = np.ones(size, bool)
     still = np.random.default_rng(size + running).choice(size, running, replace=False)
     over[still] = False
-    kept = rollout.halved(over)
+    kept = rollout.going_on(over)
     assert len(kept) == left == len(set(kept.tolist()))
     assert kept[:running].tolist() == sorted(still.tolist()) and over[kept[running:]].all()
 
