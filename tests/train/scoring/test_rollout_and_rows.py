@@ -43,7 +43,7 @@ def test_an_episode_is_the_same_whatever_runs_beside_it(monkeypatch):
     + [(400, 301, 400), (400, 300, 300), (400, 226, 300), (400, 225, 225), (400, 114, 225), (400, 113, 113)],
 )
 def test_a_batch_has_the_smallest_of_its_sizes_that_holds_what_runs(size, running, left):
-    """By hand: 100, 50, 25, 13, which is no more than 16; and 400, 300, 225, from where it is by half: 113, 57, 29, 15."""
+    """By hand: 100, 50, 25, 13, which is no more than 16; and 400, 300, 225, from where it is by half."""
     over = np.ones(size, bool)
     still = np.random.default_rng(size + running).choice(size, running, replace=False)
     over[still] = False
