@@ -35,6 +35,8 @@ from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manife
 
 LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19
 """Inches that an entry of the legend takes across and down."""
+LETTER_IN = 0.05
+"""Width of a letter of an object's label, 6 points high."""
 MARGIN_M = 0.3
 """Empty border around the map."""
 SURFACE_PIXELS = 480
@@ -124,6 +126,23 @@ def _draw_ground(axes: Axes, scene: _Scene) -> None:
             axes.fill(*outline.T, facecolor=WALL, edgecolor="0.45", linewidth=0.4)
 
 
+def apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Centres of labels, moved up or down as little as it takes for none to lie on an earlier one.
+
+    Args:
+        centres: [N, 2], in any unit.
+        sizes: [N, 2], width and height of each.
+    """
+    placed = centres.astype(float)
+    for i, (x, y) in enumerate(centres):
+        beside = np.abs(placed[:i, 0] - x) < (sizes[:i, 0] + sizes[i, 0]) / 2
+        ys, apart_by = placed[:i, 1][beside], (sizes[:i, 1][beside] + sizes[i, 1]) / 2
+        tried = np.array([y, *(ys + apart_by), *(ys - apart_by)])
+        free = (np.abs(tried[:, None] - ys) >= apart_by - 1e-9).all(axis=1)
+        placed[i, 1] = min(tried[free], key=lambda at: abs(at - y))
+    return placed
+
+
 def _draw_objects(axes: Axes, scene: _Scene) -> None:
     """Each movable object's CAD surface in its category's colour, lit from above, with its name."""
     _draw_ground(axes, scene)
@@ -137,10 +156,13 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
         axes.add_collection(
             PolyCollection(list(corners[order, :, :2]), facecolors=colours, edgecolors=colours, linewidth=0.2)
         )
-    for item in scene.manifest.objects:
-        x, y = scene.data.body(item.name).xipos[:2]
+    names = [item.name for item in scene.manifest.objects]
+    metre_in = PANEL_IN / (scene.maps.extent_w[3] - scene.maps.extent_w[2] + 0.5 + MARGIN_M)
+    sizes = np.array([(LETTER_IN * len(name) + 0.03, 2.2 * LETTER_IN) for name in names]).reshape(-1, 2) / metre_in
+    centres = np.array([scene.data.body(name).xipos[:2] for name in names]).reshape(-1, 2)
+    for name, (x, y) in zip(names, apart(centres, sizes), strict=True):
         box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.75, "linewidth": 0}
-        axes.text(x, y, item.name, ha="center", va="center", fontsize=6, bbox=box)
+        axes.text(x, y, name, ha="center", va="center", fontsize=6, bbox=box)
     area = f"{scene.manifest.floor_area_m2:.1f} m² traversable"
     _frame(axes, scene, f"{len(scene.manifest.objects)} objects, {area}")
 

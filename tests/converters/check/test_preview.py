@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from converters.__main__ import main
-from converters.check.preview import preview, read_source
+from converters.check.preview import apart, preview, read_source
 from converters.read.source import read_source as read_mesh_or_home
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 from scenes_mjcf.schema import SceneError, load_manifest
@@ -104,3 +104,11 @@ def test_a_damaged_scene_is_one_line_and_an_older_picture_stays(scene, capsys, d
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
     assert (scene / "p.png").read_text() == "older" and not list(scene.glob(".*"))
+
+
+def test_labels_move_apart_as_little_as_it_takes():
+    """By hand: 2 wide, 1 high. The second lies on the first, the third beside them, the fourth on the first two."""
+    centres = np.array([[0.0, 0.0], [1.0, 0.4], [5.0, 0.0], [0.5, 0.6], [0.0, 9.0]])
+    placed = apart(centres, np.tile([2.0, 1.0], (5, 1)))
+    np.testing.assert_allclose(placed, [[0.0, 0.0], [1.0, 1.0], [5.0, 0.0], [0.5, 2.0], [0.0, 9.0]])
+    assert apart(np.zeros((0, 2)), np.zeros((0, 2))).shape == (0, 2)
