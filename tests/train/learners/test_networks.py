@@ -208,26 +208,32 @@ def test_ppo_learns_from_a_picture():
 
 
 @pytest.mark.parametrize(("size", "k", "stride"), [(11, 8, 4), (12, 4, 2), (5, 3, 1), (7, 2, 3)])
-def test_convolution_as_a_product_is_xlas_in_value_and_gradients(size: int, k: int, stride: int):
+def test_convolutions_for_a_cpu_are_xlas_in_value_and_gradients(size: int, k: int, stride: int):
     images = jax.random.normal(jax.random.PRNGKey(0), (2, size, size + 1, 3))
     kernel = jax.random.normal(jax.random.PRNGKey(1), (k, k, 3, 5))
 
     def ours(images, kernel):
-        return networks.conv_as_product(images, kernel, (stride, stride))
+        return networks.conv_for_cpu(images, kernel, (stride, stride))
 
     def xlas(images, kernel):
         names = ("NHWC", "HWIO", "NHWC")
         return jax.lax.conv_general_dilated(images, kernel, (stride, stride), "VALID", dimension_numbers=names)
 
-    np.testing.assert_allclose(ours(images, kernel), xlas(images, kernel), rtol=1e-4, atol=1e-4)
+    for value in (ours(images, kernel), networks.conv_as_product(images, kernel, (stride, stride))):
+        np.testing.assert_allclose(value, xlas(images, kernel), rtol=1e-4, atol=1e-4)
     found, expected = (jax.grad(lambda x, w, f=f: (f(x, w) ** 2).sum(), (0, 1))(images, kernel) for f in (ours, xlas))
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
 
 
-def test_learners_on_a_cpu_have_no_convolution_of_xlas():
-    """Its gradients within a loop take a hundred times as long there."""
+def test_on_a_cpu_acting_has_xlas_convolutions_and_learning_none():
+    """Its gradients within a loop take 20 to 30 times as long there, see `docs/studies/convolutions.py`."""
     made = make()
     params = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
-    program = jax.make_jaxpr(made.networks.policy_network.apply)(networks.init_normalizer(TINY), params, observation())
-    assert ("conv_general_dilated" in str(program)) == (jax.default_backend() != "cpu")
+
+    def acted(params):
+        return made.networks.policy_network.apply(networks.init_normalizer(TINY), params, observation())
+
+    acting, learning = (jax.make_jaxpr(f)(params) for f in (acted, jax.grad(lambda params: acted(params).sum())))
+    assert "conv_general_dilated" in str(acting)
+    assert ("conv_general_dilated" in str(learning)) == (jax.default_backend() != "cpu")
