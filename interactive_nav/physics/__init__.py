@@ -1,5 +1,6 @@
 """Physics backends behind one interface: `warp`, `jax` and `native`; `make_physics` picks one."""
 
+import functools
 import importlib.util
 import os
 
@@ -38,6 +39,18 @@ def keep_programs() -> None:
     chosen = "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir
     if not chosen and jax.default_backend() != "cpu":
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "programs"))
+
+
+@functools.cache
+def compiler_options() -> dict[str, str] | None:
+    """For programs that step environments with images: on a CPU XLA's YNNPACK is left out, with which a step takes a
+    sixth to a third longer (jax issue 37465; `docs/studies/cpu_programs.py`). None elsewhere, or where XLA has none."""
+    options = {"xla_cpu_experimental_ynn_fusion_type": ""}
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=options)(0)
+    except jax.errors.JaxRuntimeError:
+        return None
+    return options if jax.default_backend() == "cpu" else None
 
 
 def make_physics(world: World, config: NavConfig) -> Physics:

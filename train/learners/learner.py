@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs import Env
 
+from interactive_nav.physics import compiler_options
 from train.config import RunConfig
 from train.errors import DivergedError
 
@@ -133,7 +134,8 @@ def run_loop(
         return TrainResult(start, metrics, completed=done >= total)
 
     clock = time.perf_counter()
-    compiled = jax.jit(_strongly_typed(update_fn), donate_argnums=1).lower(learner, env_state).compile()
+    lowered = jax.jit(_strongly_typed(update_fn), donate_argnums=1).lower(learner, env_state)
+    compiled = lowered.compile(compiler_options())
     compile_s = time.perf_counter() - clock
 
     interval: list[Update] = []

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav.physics import compiler_options
 from interactive_nav.pictures.replay import policy_key_of
 from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.rows import Rows
@@ -74,8 +75,9 @@ class BatchPlayer:
         self.env = env
         self._reset = jax.jit(jax.vmap(env.reset))
         self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
-        self._chunk = jax.jit(functools.partial(_play_chunk, env))
-        self._step = jax.jit(functools.partial(_play_step, env))
+        how = {"compiler_options": compiler_options()}
+        self._chunk = jax.jit(functools.partial(_play_chunk, env), **how)
+        self._step = jax.jit(functools.partial(_play_step, env), **how)
         self.known: dict[Any, Any] = {}
         """Functions of learned policies, by kind: see `train.scoring.evaluation.load_policy`."""
 

@@ -18,6 +18,7 @@ from interactive_nav.physics import (
     PhysicsState,
     StepSignals,
     base,
+    compiler_options,
     keep_programs,
     make_physics,
     mjx_batch,
@@ -393,3 +394,18 @@ def test_programs_of_an_accelerator_are_kept_unless_somebody_chose(platform, cho
         assert jax.config.jax_compilation_cache_dir == kept
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_programs_on_a_cpu_leave_out_what_is_slow_there_if_xla_knows_it(monkeypatch):
+    """The pinned XLA knows the option; one that does not, and an accelerator, get none."""
+    make = compiler_options.__wrapped__
+    assert make() == ({"xla_cpu_experimental_ynn_fusion_type": ""} if jax.default_backend() == "cpu" else None)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert make() is None
+
+    def unknown(*_, **__):
+        raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: No such compile option")
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setattr(jax, "jit", lambda *_, **__: unknown)
+    assert make() is None
