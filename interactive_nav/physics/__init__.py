@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import os
+from typing import Any
 
 import jax
 
@@ -42,10 +43,13 @@ def keep_programs() -> None:
 
 
 @functools.cache
-def compiler_options() -> dict[str, str] | None:
-    """For programs that step environments with images: on a CPU XLA's YNNPACK is left out, with which a step takes a
-    sixth to a third longer (jax issue 37465; `docs/studies/cpu_programs.py`). None elsewhere, or where XLA has none."""
-    options = {"xla_cpu_experimental_ynn_fusion_type": ""}
+def compiler_options() -> dict[str, Any] | None:
+    """For programs that step environments with images: on a CPU they leave out XLA's YNNPACK, with which a step takes
+    a sixth to a third longer (jax issue 37465; measured by `docs.studies.policies.cpu_programs`).
+
+    None elsewhere, or where XLA knows no such option.
+    """
+    options: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
     try:
         jax.jit(lambda x: x + 1, compiler_options=options)(0)
     except jax.errors.JaxRuntimeError:

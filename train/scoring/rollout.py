@@ -75,9 +75,8 @@ class BatchPlayer:
         self.env = env
         self._reset = jax.jit(jax.vmap(env.reset))
         self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
-        how = {"compiler_options": compiler_options()}
-        self._chunk = jax.jit(functools.partial(_play_chunk, env), **how)
-        self._step = jax.jit(functools.partial(_play_step, env), **how)
+        self._chunk = jax.jit(functools.partial(_play_chunk, env), compiler_options=compiler_options())
+        self._step = jax.jit(functools.partial(_play_step, env), compiler_options=compiler_options())
         self.known: dict[Any, Any] = {}
         """Functions of learned policies, by kind: see `train.scoring.evaluation.load_policy`."""
 

@@ -212,7 +212,7 @@ def test_convolutions_for_a_cpu_are_xlas_in_value_and_gradients(size: int, k: in
     images = jax.random.normal(jax.random.PRNGKey(0), (2, size, size + 1, 3))
     kernel = jax.random.normal(jax.random.PRNGKey(1), (k, k, 3, 5))
 
-    def ours(images, kernel):
+    def ours(images, kernel) -> Any:
         return networks.conv_for_cpu(images, kernel, (stride, stride))
 
     def xlas(images, kernel):
@@ -227,7 +227,7 @@ def test_convolutions_for_a_cpu_are_xlas_in_value_and_gradients(size: int, k: in
 
 
 def test_on_a_cpu_acting_has_xlas_convolutions_and_learning_none():
-    """Its gradients within a loop take 20 to 30 times as long there, see `docs/studies/cpu_programs.py`."""
+    """Its gradients within a loop take 20 to 30 times as long there, see `docs/studies/policies/cpu_programs.py`."""
     made = make()
     params = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
 

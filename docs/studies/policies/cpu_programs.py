@@ -1,4 +1,4 @@
-"""`python -m docs.studies.cpu_programs [SCENE]`: CPU time of XLA's programs on a CPU, by how they are made.
+"""`python -m docs.studies.policies.cpu_programs [SCENE]`: CPU time of XLA's programs on a CPU, by how they are made.
 
 The paper's three convolutions within a loop: XLA's own, as one product of matrices each, and what the learners take
 (`train.learners.networks.conv_for_cpu`): the product where gradients are wanted, and XLA's where not. Once XLA's own
@@ -27,14 +27,14 @@ def own(images: jax.Array, kernel: jax.Array, strides: tuple[int, ...]) -> jax.A
     return jax.lax.conv_general_dilated(images, kernel, strides, "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
-def cpu_ms(conv: Callable[..., jax.Array], gradient: bool) -> float:
+def cpu_ms(conv: Callable[..., Any], gradient: bool) -> float:
     """CPU time of a step of the loop, the least of several; ms."""
     draw = np.random.default_rng(0)
     shapes = ((8, 8, 2, 32), (4, 4, 32, 64), (3, 3, 64, 64))
     kernels = [draw.normal(size=shape).astype(np.float32) for shape in shapes]
     images = draw.random((IMAGES, 68, 68, 2), np.float32)
 
-    def features(kernels: Any, images: jax.Array) -> jax.Array:
+    def features(kernels: Any, images: Any) -> Any:
         for kernel, stride in zip(kernels, (4, 2, 1), strict=True):
             images = jax.nn.relu(conv(images, kernel, (stride, stride)))
         return (images**2).mean()
@@ -61,7 +61,7 @@ def least_s(program: Callable[[], Any]) -> float:
     return min(took)
 
 
-def step_us(scene: str, options: dict[str, str] | None) -> float:
+def step_us(scene: str, options: dict[str, Any] | None) -> float:
     """CPU time of an environment's step with depth and segmentation, `ENVS` at a time and driven at random; us."""
     seen = ("waypoints", "goal", "velocity", "depth", "segmentation")
     env = interactive_nav.make("turtlebot", [scene], backend="native", num_objects=4, observations=seen)
@@ -80,7 +80,8 @@ def step_us(scene: str, options: dict[str, str] | None) -> float:
 def main() -> None:
     """Prints a line for each way."""
     print(f"{IMAGES} images of 68 x 68 x 2, ms of CPU time a step of a loop: acting, gradient")
-    for name, conv in (("XLA's own", own), ("as products", conv_as_product), ("the learners'", conv_for_cpu)):
+    ways: dict[str, Any] = {"XLA's own": own, "as products": conv_as_product, "the learners'": conv_for_cpu}
+    for name, conv in ways.items():
         print(f"{name:14} {cpu_ms(conv, False):8.1f} {cpu_ms(conv, True):8.1f}")
     scene = sys.argv[1] if len(sys.argv) > 1 else "scenes_mjcf/alder"
     print("a step with depth and segmentation, us of CPU time: with YNNPACK, without")
