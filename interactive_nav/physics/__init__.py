@@ -49,12 +49,14 @@ def compiler_options() -> dict[str, Any] | None:
 
     None elsewhere, or where XLA knows no such option.
     """
+    if jax.default_backend() != "cpu":
+        return None
     options: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
     try:
         jax.jit(lambda x: x + 1, compiler_options=options)(0)
     except jax.errors.JaxRuntimeError:
         return None
-    return options if jax.default_backend() == "cpu" else None
+    return options
 
 
 def make_physics(world: World, config: NavConfig) -> Physics:

@@ -110,11 +110,12 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
 def without_seen_things(rows: pa.Table) -> pa.Table:
     """Rows that tell of things by category in test scenes only, where there are any: in no table are those of the
     others, and they are 44 % of a file."""
-    at = rows.column_names.index("by_category") if {"by_category", "split"} <= set(rows.column_names) else None
-    test = pc.equal(rows["split"], "test") if at is not None else pa.array([False])
-    if at is None or not pc.any(test).as_py():
+    if not {"by_category", "split"} <= set(rows.column_names):
         return rows
-    places = pc.if_else(test, pa.array(range(len(rows))), None)
+    test = pc.equal(rows["split"], "test")
+    if not pc.any(test).as_py():
+        return rows
+    at, places = rows.column_names.index("by_category"), pc.if_else(test, pa.array(range(len(rows))), None)
     return rows.set_column(at, "by_category", rows["by_category"].take(places))
 
 
