@@ -1,7 +1,7 @@
 """Scenes in; one picture of them out: what somebody sees from 1.5 m, two in a row, or each from the south.
 
-python docs/studies/eye_height.py scenes_mjcf/furnished/furnished_00{0,2,3,4,5,7} -o docs/home-rooms.jpg
-python docs/studies/eye_height.py scenes_mjcf/cluttered/cluttered_010 -o docs/home-cluttered.jpg --south
+python docs/studies/eye_height.py scenes_mjcf/furnished/furnished_00{0,2,3,4,5,7} -o docs/home-rooms.webp
+python docs/studies/eye_height.py scenes_mjcf/cluttered/cluttered_010 -o docs/home-cluttered.webp --south
 """
 
 from __future__ import annotations

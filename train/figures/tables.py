@@ -132,7 +132,7 @@ def provenance(rows: pa.Table) -> str:
             (row["train_commit"] or "-")[:10],
             row["device"],
         )
-        for row in sorted(found, key=lambda row: row["run"])
+        for row in sorted(found, key=lambda row: (row["run"], row["device"]))
     ]
     header = ("run", "env steps", "evaluated at", "wall-clock [min]", "trained on", "commit", "evaluated on")
     return markdown(header, lines) if lines else ""

@@ -3,7 +3,7 @@
     python -m topological_nav data scenes_mjcf/{alder,cedar,hazel} -o runs/look positions=12 max_per_room=1 \\
       headings=3 passage_sources=1 passage_targets=3
     python -m docs.studies.policies.transfer results/topological/full/features --data runs/look \\
-      -o docs/topological-transfer.png
+      -o docs/topological-transfer.webp
 
 Curves and scores are the run's own; the pairs of images show the domains, and need not be of its dataset.
 """
@@ -31,7 +31,11 @@ def main() -> None:
     images = load_rooms(given.data).images[:, PITCHES.index("level"), 0]
     seen = as_seen(images, preset(given.domain))
     results = json.loads((given.run / "results.json").read_text(encoding="utf-8"))
-    save(features_figure(images, seen, read_metrics(given.run / "metrics.jsonl"), results), given.output)
+    save(
+        features_figure(images, seen, read_metrics(given.run / "metrics.jsonl"), results),
+        given.output,
+        given.output.suffix[1:],
+    )
 
 
 if __name__ == "__main__":

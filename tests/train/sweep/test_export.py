@@ -19,7 +19,7 @@ from train.scoring.row_files import paths_beside
 from train.sweep import export as export_module
 from train.sweep import spec
 from train.sweep.__main__ import main
-from train.sweep.export import rounded, thinned, without_seen_things
+from train.sweep.export import ORDER, rounded, thinned, without_seen_things
 from train.sweep.folder import SweepFolder
 
 
@@ -73,14 +73,18 @@ def test_rows_are_rounded_by_column_also_in_lists():
     assert rounded(rows[:0]).equals(rows[:0])
 
 
-def test_things_by_category_are_kept_of_unseen_homes_where_there_are_any():
+def test_what_no_table_has_of_seen_homes_is_kept_of_unseen_ones_where_there_are_any():
     told = pa.array([[{"objects": 2}], [{"objects": 3}], None])
-    rows = pa.table({"by_category": told, "split": ["train", "test", "test"], "episode": [0, 1, 2]})
+    rows = pa.table(
+        {"by_category": told, "force_sum_n": [8.0, 16.0, 0.0], "split": ["train", "test", "test"], "n": [0, 1, 2]}
+    )
     kept = without_seen_things(rows)
     assert kept.schema.equals(rows.schema) and kept["by_category"].to_pylist() == [None, [{"objects": 3}], None]
-    assert kept.drop(["by_category"]).equals(rows.drop(["by_category"]))
+    assert kept["force_sum_n"].to_pylist() == [None, 16.0, 0.0]
+    left = ["by_category", "force_sum_n"]
+    assert kept.drop(left).equals(rows.drop(left))
     assert without_seen_things(rows[:1]).equals(rows[:1]) and without_seen_things(rows[:0]).equals(rows[:0])
-    assert without_seen_things(rows.drop(["by_category"])).column_names == ["split", "episode"]
+    assert without_seen_things(rows.drop(left)).equals(rows.drop(left))
 
 
 @pytest.fixture
@@ -125,7 +129,8 @@ def test_what_is_kept(swept, tmp_path, capsys):
         (merged,) = (out / "rows").glob("*.parquet")  # with what another machine had brought
         assert len(read_rows([merged])) == (4 + 2) * 40 and read_notes(merged) == {"asked": "here\nthere"}
         found, given = (read_rows([path]).filter(pc.field("run") == "k_int1-seed0") for path in (merged, rows))
-        assert found.select(given.column_names).equals(rounded(given))
+        order = [(name, "ascending") for name in ORDER]
+        assert found.select(given.column_names).equals(rounded(given).sort_by(order))
         (kept,) = (out / "rows" / "_paths").iterdir()
         assert kept.name == paths_beside(rows).name and kept.read_bytes() == b"where it went"
         assert sorted(path.name for path in (out / "runs").iterdir()) == [run.name for run in swept.sweep.runs]
