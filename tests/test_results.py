@@ -64,42 +64,45 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
 
 def test_longer_runs_in_cluttered_homes_played_the_same_episodes_and_score_as_the_page_says():
     kept = ROOT / "results" / "cluttered-long"
-    rows = pyarrow.parquet.read_table(kept / "rows" / "episodes.parquet")  # two checkpoints of a run
-    keys = ["run", "robot", "checkpoint_steps", "train_commit"]
+    rows = pyarrow.parquet.read_table(kept / "rows" / "episodes.parquet")
+    keys = ["run", "robot", "split", "checkpoint_steps", "train_commit"]
     wanted = [("episode", "count_distinct"), ("shortest_path_m", "sum"), ("ins_0.5", "mean")]
     parts = rows.group_by(keys).aggregate([("episode", "count"), *wanted]).to_pylist()
-    assert len(parts) == 20 and {x["run"] for x in parts} == {path.name for path in (kept / "runs").iterdir()}
+    halfway = {f"halfway-{path.name}" for path in (ROOT / "results" / "cluttered" / "runs").iterdir()}
+    assert len(parts) == 50 and {x["run"] for x in parts} - halfway == {path.name for path in (kept / "runs").iterdir()}
+    commits = {"round": "04733abd", "halfw": "04733abd", "sac10": "f1cb811b", "sacro": "f1cb811b"}
     scores = collections.defaultdict(list)
     for part in parts:
-        same = next(x for x in parts if x["robot"] == part["robot"])
-        assert part["episode_count"] == part["episode_count_distinct"] == 300
-        assert part["train_commit"] == ("04733abd" if part["run"].startswith("round") else "34831c0d")
+        same = next(x for x in parts if (x["robot"], x["split"]) == (part["robot"], part["split"]))
+        assert part["episode_count"] == part["episode_count_distinct"] == 1000
+        assert part["train_commit"] == commits.get(part["run"][:5], "34831c0d")
         assert part["shortest_path_m_sum"] == pytest.approx(same["shortest_path_m_sum"], rel=1e-6)
-        scores[part["run"][:-6], part["checkpoint_steps"]].append(part["ins_0.5_mean"])
-        summary = json.loads((kept / "runs" / part["run"] / "summary.json").read_text())
-        assert summary["completed"] and summary["env_steps"] >= part["checkpoint_steps"]
+        scores[part["run"][:-6], part["split"], part["checkpoint_steps"]].append(part["ins_0.5_mean"])
+        if part["run"] not in halfway:
+            summary = json.loads((kept / "runs" / part["run"] / "summary.json").read_text())
+            assert summary["completed"] and summary["env_steps"] >= part["checkpoint_steps"]
     page = (ROOT / "docs" / "results.md").read_text()
-    table = page[page.index("### Above every planner?") : page.index("### The paper's claims, cluttered homes")]
-    for group in (values for values in scores.values() if len(values) == 3):
-        assert re.search(rf"\| (\*\*)?{sum(group) / 3:.3f} ±", table)
-    assert len(scores) == 7 and len(scores["longer-k_int1-fetch", 13107200]) == 2
-    (policy,) = kept.rglob("policy.npz")
-    assert (policy.parents[2] / "config.yaml").is_file()
+    assert len(scores) == 17 and len(scores.pop(("longer-k_int1-fetch", "test", 13107200))) == 2
+    for group in scores.values():
+        assert len(group) == 3 and f"{sum(group) / 3:.3f}" in page
+    policies = sorted(path.parts[-4] for path in kept.rglob("policy.npz"))
+    assert policies == ["homes100-fetch-seed2", "sac100-turtlebot-seed0"]
+    assert all((kept / "runs" / name / "config.yaml").is_file() for name in policies)
 
 
 def test_runs_in_cluttered_homes_played_the_same_episodes_and_say_where_they_come_from():
-    """The first three hundred in the test homes; twelve of PPO and all of DDPG a thousand in the training homes too."""
+    """Every run of the sweep, and every planner, the thousand of each split."""
     kept = ROOT / "results" / "cluttered"
-    rows = read_rows([kept / "rows" / "episodes.parquet"])
-    parts = rows.group_by(["run", "split"]).aggregate([("episode", "count"), ("shortest_path_m", "sum")]).to_pylist()
-    assert {(part["split"], part["episode_count"]) for part in parts} == {("train", 1000), ("test", 300)}
-    played = collections.Counter(x["run"].split("-")[2] for x in parts if x["split"] == "test")
-    assert played == {"ppo": 18, "sac": 18, "ddpg": 18}
-    for robot, split in itertools.product(("turtlebot", "fetch"), ("train", "test")):
-        paths_m = [x["shortest_path_m_sum"] for x in parts if robot in x["run"] and x["split"] == split]
-        expected = {("turtlebot", "train"): 18, ("fetch", "train"): 12}.get((robot, split), sum(played.values()) // 2)
-        assert len(paths_m) == expected
-        assert paths_m == pytest.approx([paths_m[0]] * len(paths_m), rel=1e-6)
+    rows, planned = (read_rows([kept / x / "episodes.parquet"]) for x in ("rows", "baselines"))
+    keys, wanted = ["run", "robot", "split", "policy"], [("episode", "count_distinct"), ("shortest_path_m", "sum")]
+    parts, others = (x.group_by(keys).aggregate([("episode", "count"), *wanted]).to_pylist() for x in (rows, planned))
+    cells = itertools.product(("0", "0.1", "1"), ("turtlebot", "fetch"), ("ppo", "sac", "ddpg"), range(3))
+    assert collections.Counter(x["run"] for x in parts) == {f"k_int{k}-{r}-{a}-seed{s}": 2 for k, r, a, s in cells}
+    assert {"avoider", "namo:0.25", "namo:0.5", "namo:0.75", "namo:1"} <= {x["policy"] for x in others}
+    for part in parts + others:
+        assert part["episode_count"] == part["episode_count_distinct"] == 1000
+        same = next(x for x in parts if (x["robot"], x["split"]) == (part["robot"], part["split"]))
+        assert part["shortest_path_m_sum"] == pytest.approx(same["shortest_path_m_sum"], rel=1e-6)
     facts = rows.group_by("run").aggregate(
         [("train_device", "max"), ("train_commit", "max"), ("train_env_steps", "min")]
     )

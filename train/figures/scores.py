@@ -255,7 +255,7 @@ def _baselines(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> Non
         named.append((label, place))
     for label, place in _gathered(named, near.reach):
         long = "," in label  # to the left: on the right the axis ends
-        look = {"ha": "right" if long else "left", "fontsize": 7, "color": "0.35", "zorder": 5}
+        look = {"ha": "right" if long else "left", "fontsize": 7, "color": "0.35", "zorder": 3.5}
         look["bbox"] = {"facecolor": "w", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
         axis.annotate(label, place, xytext=(-4 if long else 4, -9), textcoords="offset points", **look)
     if line:
