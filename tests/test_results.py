@@ -66,6 +66,8 @@ def test_longer_runs_in_cluttered_homes_played_the_same_episodes_and_score_as_th
     kept = ROOT / "results" / "cluttered-long"
     rows = pyarrow.parquet.read_table(kept / "rows" / "episodes.parquet")
     keys = ["run", "robot", "split", "checkpoint_steps", "train_commit"]
+    efforts = ("effort_efficiency", "kinematic_effort", "dynamic_effort", "structure_steps")
+    assert not any(rows[name].null_count for name in efforts)  # figures are drawn of them
     wanted = [("episode", "count_distinct"), ("shortest_path_m", "sum"), ("ins_0.5", "mean")]
     parts = rows.group_by(keys).aggregate([("episode", "count"), *wanted]).to_pylist()
     halfway = {f"halfway-{path.name}" for path in (ROOT / "results" / "cluttered" / "runs").iterdir()}
