@@ -86,10 +86,6 @@ def convert_many(
 
     Returns:
         Names of the sources without a scene, or with a gate that fails, whether tried now or before.
-
-    Raises:
-        ConfigError: two sources of one name.
-        FileError: unreadable rows of before.
     """
     named = _named(sources)
     path = into / ROWS

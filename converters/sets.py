@@ -59,11 +59,7 @@ class Wanted:
 
 
 def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
-    """The YAML of a set's recipes: the last fifth of its scenes is to test in, with CAD models of its own.
-
-    Raises:
-        GenerationError: an unknown tier, or no scene.
-    """
+    """The YAML of a set's recipes: the last fifth of its scenes is to test in, with CAD models of its own."""
     if count < 1:
         raise GenerationError(f"count is {count}, expected at least 1")
     first_test = count - round(TEST_SHARE * count)
@@ -77,11 +73,7 @@ def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
 
 
 def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
-    """Writes a set's recipes, unless they are there.
-
-    Raises:
-        GenerationError: `out` holds other recipes.
-    """
+    """Writes a set's recipes, unless they are there."""
     text, path = tier_recipes(tier, count, seed), out / RECIPES
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise GenerationError(
@@ -117,11 +109,7 @@ def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda l
 
 
 def make_launcher(launcher: str, address: str | None, jobs: int, count: int) -> tuple[Launcher, int]:
-    """Where `count` commands run, and how many of them side by side.
-
-    Raises:
-        ConfigError: Ray is not installed, or there is no such cluster.
-    """
+    """Where `count` commands run, and how many of them side by side."""
     if launcher == "ray":
         from interactive_nav_common.jobs.on_ray import RayLauncher
 
@@ -183,9 +171,6 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
 
     Returns:
         Names of those that were not made, or do not pass every gate.
-
-    Raises:
-        GenerationError: unknown names, a folder of other recipes, or a single scene that cannot be made.
     """
     if wanted.tier and wanted.count is not None and wanted.seed is not None:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
@@ -218,9 +203,6 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
 
     Returns:
         Names of those that were not made, do not pass every gate, or are not what the set lists.
-
-    Raises:
-        GenerationError: an unknown name.
     """
     sets = {name: packaged_set(name).scenes for name in PACKAGED}
     known = [word for name, members in sets.items() for word in (name, f"{name}/train", f"{name}/test", *members)]

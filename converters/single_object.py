@@ -86,11 +86,7 @@ def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder
 
 
 def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFolder]:
-    """Reads a URDF or a mesh, in metres and z up.
-
-    Raises:
-        SceneRejected: missing, damaged or empty file, or no rigid object.
-    """
+    """Reads a URDF or a mesh, in metres and z up."""
     source = SourceFolder(config.source or path.parent, config.strict)
     relative = source.inside(path)
     if path.suffix.lower() == ".urdf":
@@ -150,10 +146,6 @@ def convert_object(
 
     Returns:
         The content of `object.json`.
-
-    Raises:
-        SceneRejected: bad input, or an object without a stable pose near the given one.
-        StageFailed: a stage broke.
     """
     if not path.is_file():
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")
@@ -202,11 +194,7 @@ def _origin(item: RigidObject, source: SourceFolder) -> dict[str, Any]:
 
 
 def _bounds(item: RigidObject, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner of the surface, m.
-
-    Raises:
-        SceneRejected: no plausible size.
-    """
+    """Lowest and highest corner of the surface, m."""
     low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
     if not 0.005 < (high - low).max() < 10.0:
         raise SceneRejected(

@@ -145,11 +145,7 @@ class Tier(NamedTuple):
 
 
 def parse_tiers(words: Sequence[str]) -> tuple[Tier, ...]:
-    """Tiers as the setting `windows` writes them.
-
-    Raises:
-        ConfigError: they are not five numbers each, fill the batch, or one is narrower than that before it.
-    """
+    """Tiers as the setting `windows` writes them."""
     try:
         tiers = tuple(Tier(float(s), *map(int, widths)) for s, *widths in map(str.split, words))
         good = all(t.share > 0 and min(t[1:]) >= 0 for t in tiers) and sum(t.share for t in tiers) < 1
@@ -341,9 +337,6 @@ def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
     Args:
         variant: `paper`, the defaults, or `code`: where the original's code differs from its paper, the code.
         **settings: of `NavConfig`'s parts; they go before the variant's.
-
-    Raises:
-        ConfigError: unknown variant or setting (the message names the nearest valid one) or impossible value.
     """
     if variant not in VARIANTS:
         raise ConfigError(f"variant is {variant!r}, expected one of {', '.join(VARIANTS)}")

@@ -84,9 +84,6 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     """Draws episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
 
     The environment is not batched.
-
-    Raises:
-        ConfigError: fewer than one episode.
     """
     if episodes < 1:
         raise ConfigError(f"episodes is {episodes}, expected at least 1")
@@ -181,10 +178,6 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
         file: of `load`.
         env: whose scenes must include the file's; their order may differ.
         where: named in errors.
-
-    Raises:
-        EpisodeFileError: the file was made for another robot, other scenes, other small objects or another map of
-            shortest paths than the environment's.
     """
     scene_of_digest = _check_fits(file, env, where)
     rows, count = file.episodes, len(file.objects)
@@ -216,11 +209,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
 
 
 def save(file: EpisodeFile, path: str | Path) -> None:
-    """Writes whole or not at all; packed where the name ends with `.gz`.
-
-    Raises:
-        FileError: it cannot be written.
-    """
+    """Writes whole or not at all; packed where the name ends with `.gz`."""
     data = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(file)}
     head = {k: v for k, v in data.items() if k != "episodes"}
     # One line an episode: readable, and small in a diff.
@@ -232,11 +221,7 @@ def save(file: EpisodeFile, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> EpisodeFile:
-    """Reads and checks a file.
-
-    Raises:
-        EpisodeFileError: no such file, not such a file, another version, a missing or impossible value.
-    """
+    """Reads and checks a file."""
     try:
         text = Path(path).read_bytes()
         text = gzip.decompress(text) if Path(path).suffix == PACKED else text
@@ -269,9 +254,6 @@ def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
 
     Args:
         paths: at least one.
-
-    Raises:
-        EpisodeFileError: as `load` does; or the files are of different robots or small objects.
     """
     files = [load(path) for path in paths]
     first = files[0]

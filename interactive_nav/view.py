@@ -62,9 +62,6 @@ def choose_viewer(
         wanted: auto, window or browser; auto takes a window where there is a screen.
         window: tells whether a window can open.
         browser: tells whether the browser's viewer is installed.
-
-    Raises:
-        ViewError: neither can open, or the one that was asked for cannot; says what to do.
     """
     if wanted in ("auto", "window") and window():
         return "window"
@@ -87,9 +84,6 @@ def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np
 
     Returns:
         (n, 2) world x, y, m.
-
-    Raises:
-        ViewError: a disc finds no place.
     """
     maps = scene.maps
     poses = {m.name: (m.pos_w, m.quat_w) for m in scene.movables}
@@ -115,10 +109,6 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
         robot: or None.
         small: small objects.
         seed: of the places.
-
-    Raises:
-        SceneError: an unusable scene folder.
-        ViewError: no room for a robot or object.
     """
     scene = load_scene(folder)
     rng = np.random.default_rng(seed)

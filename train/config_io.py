@@ -29,9 +29,6 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
         plain: nested mapping as read from YAML; names any part of the settings.
         base: what `plain` does not name; the defaults where None.
         where: file or word the values come from, for messages.
-
-    Raises:
-        ConfigError: an unknown key, a wrong type or a value out of range.
     """
     return overlay(base or TrainConfig(), plain, where, known=list(flatten(TrainConfig())))
 
@@ -51,11 +48,7 @@ def known_in(folder: Path = PRESET_DIR) -> list[str]:
 
 
 def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tuple[Path, Any]:
-    """The nested plain values of a YAML file: a path that ends in .yaml or .yml, or a name among a folder's.
-
-    Raises:
-        ConfigError: no such file, or it is not readable as YAML; the message begins with `told`, and calls it `what`.
-    """
+    """The nested plain values of a YAML file: a path that ends in .yaml or .yml, or a name among a folder's."""
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         path = folder / f"{name_or_path}.yaml"
@@ -73,11 +66,7 @@ def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tup
 
 
 def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
-    """Reads a preset (by name) or a YAML file (by path) and applies `key=value` words to it.
-
-    Raises:
-        ConfigError: no such config, or one of its values or an override is wrong.
-    """
+    """Reads a preset (by name) or a YAML file (by path) and applies `key=value` words to it."""
     path, plain = read_file(name_or_path, PRESET_DIR, "preset", "--config: ")
     if isinstance(plain, dict) and {"preset", "grid"} & plain.keys():
         raise ConfigError(
@@ -93,20 +82,12 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
 
 
 def with_scenes(config: TrainConfig) -> TrainConfig:
-    """The config with the scene folders of the sets that `env.scenes` names (`cluttered/train`).
-
-    Raises:
-        SceneError: a set whose scenes are not there.
-    """
+    """The config with the scene folders of the sets that `env.scenes` names (`cluttered/train`)."""
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(config.env.scenes)))
 
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
-    """The config with `dotted.name=value` words laid over it; values are read as YAML.
-
-    Raises:
-        ConfigError: a word without `=`, an unknown name, a wrong type or a value out of range.
-    """
+    """The config with `dotted.name=value` words laid over it; values are read as YAML."""
     return overlay(config, read_words(words), "override", known=list(flatten(TrainConfig())))
 
 

@@ -51,11 +51,7 @@ def refusal(path: str, headers: Any, token: str | None) -> str | None:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket.
-
-    Raises:
-        ConfigError: the port is taken or none, or the address is not this machine's.
-    """
+    """A listening socket."""
     try:
         if not 0 <= port < 65536:  # the system would take its last 16 bits
             raise OverflowError("no port has this number")
@@ -70,11 +66,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
-    """A running viser server, and the address to open; with a token where others can reach it.
-
-    Raises:
-        ConfigError: viser is not installed or works otherwise than 1.1 does, or the port cannot be had.
-    """
+    """A running viser server, and the address to open; with a token where others can reach it."""
     names = "viser", "websockets.asyncio.server"
     viser, serving = (optional(name, missing("annotate", "viser", "annotate")) for name in names)
     token, listening = None if is_local(host) else secrets.token_urlsafe(24), bind(host, port)

@@ -70,11 +70,7 @@ class Item:
         return np.array(self.model[: self.pairs]), np.array(self.scan[: self.pairs])
 
     def fit(self) -> Alignment:
-        """The model's placement by the whole pairs, as `convert` would solve it.
-
-        Raises:
-            AlignmentError: too few pairs, or pairs that do not determine it.
-        """
+        """The model's placement by the whole pairs, as `convert` would solve it."""
         return solve_alignment(*self.points(), self.symmetry)
 
 
@@ -95,11 +91,7 @@ class Session:
 
     @property
     def item(self) -> Item:
-        """The object that is worked on.
-
-        Raises:
-            AlignmentError: there is none at all.
-        """
+        """The object that is worked on."""
         if not self.items:
             raise AlignmentError("there is no object yet; add one first")
         return self.items[self.at]
@@ -122,11 +114,7 @@ class Session:
         return self.changed(**{side: (*kept, _point(point))}, state="open")
 
     def accepted(self) -> Session:
-        """Accepts the fit and goes on to the next open object.
-
-        Raises:
-            AlignmentError: no model is chosen, or there is no fit.
-        """
+        """Accepts the fit and goes on to the next open object."""
         if not self.item.cad_id:
             raise AlignmentError("no model is chosen; choose one, then click pairs")
         self.item.fit()
@@ -198,9 +186,6 @@ def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> Ra
         raw: as read.
         path: of the file.
         library_root: folder with `cad/`; None: the packaged furniture.
-
-    Raises:
-        SceneRejected: damaged, of another scan, or a model that the library lacks.
     """
     _, records = parse_annotations(read_json(path), path)
     library, annotations = read_library(library_root), tuple(a for _, a in records)
@@ -237,11 +222,7 @@ class Store:
             raise FileError(f"{self.folder / name}: cannot be read ({error.strerror}); mend it") from None
 
     def open(self, raw: RawScene, begin: Callable[[], Session]) -> Session:
-        """The session that the folder holds, or what `begin` makes.
-
-        Raises:
-            FileError: its file is damaged or of another scan, or an annotation file there is somebody else's.
-        """
+        """The session that the folder holds, or what `begin` makes."""
         path = self.folder / SESSION
         self._known = {name: self._digest(name) for name in (SESSION, ANNOTATION)}
         given = Reader(FileError, "remove it to begin anew").json(path, absent={})
@@ -268,11 +249,7 @@ class Store:
         return session
 
     def save(self, session: Session) -> Session:
-        """Writes the session, then its annotations, each whole or not at all; returns what stands there.
-
-        Raises:
-            FileError: one cannot be written, or another program has changed it since; nothing is overwritten then.
-        """
+        """Writes the session, then its annotations, each whole or not at all; returns what stands there."""
         for name, digest in self._known.items():
             if self._digest(name) != digest:
                 raise FileError(

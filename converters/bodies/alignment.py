@@ -59,9 +59,6 @@ def _check_spread(points: np.ndarray) -> None:
 
     Roll and pitch being fixed, height separates from the rest: the z scale needs extent along z, the two
     horizontal scales and the yaw need points that do not lie on one line seen from above.
-
-    Raises:
-        AlignmentError: with the direction that is missing.
     """
     centred = points - points.mean(axis=0)
     spread = np.sqrt((centred**2).mean(axis=0))
@@ -103,9 +100,6 @@ def least_squares(
         q: (k, 3) scan frame, m.
         round_model: one scale for both horizontal axes (what is round stays round).
         weights: (k,) of the squared distances, or None for equal ones.
-
-    Raises:
-        AlignmentError: degenerate or contradictory pairs.
     """
     _check_spread(p)
     share = np.full(len(p), 1.0 / len(p)) if weights is None else weights / weights.sum()
@@ -242,10 +236,6 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: s
         cad_points: (k, 3) in a z-up CAD frame, unscaled, k >= 6.
         scan_points: (k, 3) in the scan frame, m, row by row the same physical points.
         symmetry: Scan2CAD's word, a key of `SYMMETRY_PERIOD_RAD`.
-
-    Raises:
-        AlignmentError: fewer than six pairs, numbers that are not finite, keypoints that leave a parameter open
-            (collinear, coplanar), pairs that contradict each other, or an unknown symmetry.
     """
     p, q = np.asarray(cad_points, float), np.asarray(scan_points, float)
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:

@@ -119,10 +119,6 @@ def decompose_all(
         progress: called with the share that is done, 0 to 1.
         overrides: name -> parameters that differ from the config's.
         strict: a model that coacd cannot decompose is an error.
-
-    Raises:
-        StageFailed: coacd failed or ran past the time limit, with `strict`; the message names the model.
-        OSError: the folder for temporary files is full or cannot be written.
     """
     changes = overrides or {}
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore

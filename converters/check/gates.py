@@ -237,11 +237,7 @@ def drawn_shares(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
-    """Runs the gates on a written scene folder.
-
-    Raises:
-        SceneError: the folder's files are missing or break the schema.
-    """
+    """Runs the gates on a written scene folder."""
     manifest, maps = load_manifest(folder), load_maps(folder)
     path = folder / "scene.xml"
     if not path.is_file():

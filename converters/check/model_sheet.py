@@ -66,10 +66,6 @@ def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
 
     Returns:
         How many models there are on it.
-
-    Raises:
-        UserError: neither a model nor a category has such a name.
-        FileError: it cannot be written.
     """
     unknown = [n for n in names if n not in LIBRARY and n not in {d.category for d in LIBRARY.values()}]
     if unknown:

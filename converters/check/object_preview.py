@@ -35,11 +35,7 @@ class _About:
 
 
 def draw_object(folder: Path) -> Figure:
-    """Draws the textured surface, and the hulls and boxes that collide, as the object stands at rest.
-
-    Raises:
-        SceneError: the folder is no readable object.
-    """
+    """Draws the textured surface, and the hulls and boxes that collide, as the object stands at rest."""
     described = folder / "object.json"
     about = SCENES.record(SCENES.json(described), _About, str(described), others=True)
     name = check_name(about.name, f"{described}: name", SceneError)

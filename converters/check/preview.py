@@ -216,10 +216,6 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
         source: the raw folder, or the file of a mesh or a home.
         manifest: of the scene.
         floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
-
-    Raises:
-        SceneRejected: no known layout, or unusable files.
-        SceneError: another building than the scene's.
     """
     from converters.read import source as sources
     from converters.read.storeys import split_storeys
@@ -282,11 +278,6 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         folder: of the scene, or of an object made by `python -m converters object`.
         target: the PNG.
         source: the raw folder that a scene was made from: scan and cut are drawn too.
-
-    Raises:
-        SceneError: the folder is not a readable scene or object, or the source is another building's.
-        FileError: the picture cannot be written.
-        SceneRejected: the source is unusable.
     """
     if (folder / "object.json").is_file():
         if source is not None:

@@ -176,9 +176,6 @@ def settle(parts: SceneParts, drawn: bool = False, fitted: Collection[int] = ())
         drawn: they were drawn there: they slide by `DRAWN_PUSH_M` at most, and what does not part is `held`. If
             anything is, nothing else is done.
         fitted: numbers of those that no person put there: what of them does not part is `held`, too.
-
-    Raises:
-        StageFailed: the simulation diverged.
     """
     hold = range(len(parts.objects)) if drawn else fitted
     result, held = push_apart(_on_floor(parts), DRAWN_PUSH_M if drawn else MAX_PUSH_M, hold)

@@ -61,9 +61,6 @@ def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None
 
     Returns:
         The building.
-
-    Raises:
-        GenerationError: the configuration is wrong, or its rooms or furniture do not fit.
     """
     if seed < 0:
         raise GenerationError(f"seed is {seed}: expected a whole number of 0 or more")
@@ -122,10 +119,6 @@ def generate_building(
         seed: 0 or more; the same seed and configuration give the same bytes.
         progress: called with a stage's name and the share done, 0..1.
         config: what to build; default: a small apartment.
-
-    Raises:
-        GenerationError: `out_dir` is taken, or the building cannot be generated.
-        FileError: it cannot be written, or was filled meanwhile.
     """
     out_dir = Path(out_dir)
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):

@@ -63,9 +63,6 @@ def sample_faces(
 
     Returns:
         points (k, columns), face (k,) the face each lies on.
-
-    Raises:
-        SceneRejected: more than `SAMPLES`.
     """
     if len(faces) == 0:
         return np.zeros((0, vertices.shape[1])), np.zeros(0, np.int64)

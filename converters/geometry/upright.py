@@ -48,9 +48,6 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
         vertices: (n, 3) in any unit.
         faces: (m, 3), their front to the room.
         where: file named in errors.
-
-    Raises:
-        SceneRejected: the scan does not tell.
     """
     normal, area = _vectors(vertices, faces)
     if not area.sum() > 0:
@@ -147,9 +144,6 @@ def find_unit(vertices: np.ndarray, faces: np.ndarray, where: str) -> str:
         vertices: (n, 3), z up.
         faces: (m, 3).
         where: file named in errors.
-
-    Raises:
-        SceneRejected: in none, or a height of 6 to 20 units, which may be feet or storeys.
     """
     low, high = _extent(vertices[faces, 2].mean(axis=1), face_areas(vertices, faces))
     fits = [word for word in ("m", "cm", "mm") if HEIGHTS_M[0] <= (high - low) * UNITS_M[word] <= HEIGHTS_M[1]]

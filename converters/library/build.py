@@ -63,11 +63,7 @@ class Chosen:
 
 
 def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> tuple[Chosen, ...]:
-    """The pieces that a selection names, by category.
-
-    Raises:
-        ConfigError: a category or piece that is not known, or a creator in both splits.
-    """
+    """The pieces that a selection names, by category."""
     known = {piece.key: (catalogue, piece) for catalogue in catalogues for piece in catalogue.pieces}
     data = Reader(ConfigError, "converters/library/selection.yaml shows the form").decoded(
         path.read_bytes(), "YAML", str(path)
@@ -90,11 +86,7 @@ def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> t
 
 
 def as_catalogued(surface: TexturedMesh, piece: Piece, where: str) -> TexturedMesh:
-    """The surface turned and scaled as its catalogue says, the middle of its base at the origin.
-
-    Raises:
-        SceneRejected: no faces, or flat in a direction in which the catalogue gives it a size.
-    """
+    """The surface turned and scaled as its catalogue says, the middle of its base at the origin."""
     if not len(surface.faces):
         raise SceneRejected(f"{where}: has no face; choose another model")
     vertices, faces = compacted(surface.vertices, surface.faces)
@@ -129,12 +121,7 @@ def on_top(surface: TexturedMesh, rider: TexturedMesh) -> TexturedMesh:
 
 
 def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]:
-    """One model, ready to be packaged.
-
-    Raises:
-        SceneRejected: an unusable model.
-        StageFailed: coacd cannot decompose it.
-    """
+    """One model, ready to be packaged."""
     piece, where = chosen.piece, f"{chosen.catalogue.path}: {chosen.piece.model}"
     surface = _surface(chosen.catalogue, piece)
     for rider in chosen.riders:
@@ -192,9 +179,6 @@ def build(
 
     Returns:
         How many models.
-
-    Raises:
-        SceneRejected, StageFailed: a model that cannot be used.
     """
     chosen = read_selection([read_catalogue(path) for path in files], selection)
     done: list[tuple[Model, Shape]] = []

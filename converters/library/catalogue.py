@@ -109,11 +109,7 @@ def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Pie
 
 
 def read_catalogue(path: Path) -> Catalogue:
-    """Reads the pieces of a `.sh3f` file.
-
-    Raises:
-        SceneRejected: no such file, no whole archive, or a piece without model or size.
-    """
+    """Reads the pieces of a `.sh3f` file."""
     try:
         with zipfile.ZipFile(path) as archive:
             names, data = set(archive.namelist()), archive.read(PROPERTIES)
@@ -137,9 +133,6 @@ def unpack_model(catalogue: Catalogue, piece: Piece, folder: Path) -> Path:
 
     Returns:
         Path of the model.
-
-    Raises:
-        SceneRejected: a damaged archive, or one that unpacks to more than `MOST_BYTES`.
     """
     home = PurePosixPath(piece.model).parent
     try:

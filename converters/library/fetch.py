@@ -39,9 +39,6 @@ def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Pa
 
     Returns:
         Paths of the files.
-
-    Raises:
-        FileError: they cannot be had, or are not those of this version.
     """
     with whole_folder(target, overwrite) as folder, tempfile.TemporaryDirectory(prefix="library-") as scratch:
         place = given or _downloaded(Path(scratch))

@@ -167,11 +167,7 @@ def _member(path: Path, name: str) -> bytes:
 
 @functools.cache
 def read_index(path: Path = PACKED) -> dict[str, Model]:
-    """Name -> model, in the archive's order.
-
-    Raises:
-        FileError: a missing or damaged archive.
-    """
+    """Name -> model, in the archive's order."""
     found = {}
     for row in json.loads(_member(path, "index.json")):
         credits = tuple(Credit(**one) for one in row["credits"])
@@ -187,9 +183,6 @@ def read_shape(name: str, path: Path = PACKED) -> Shape:
     Args:
         name: key of `read_index`.
         path: of the archive.
-
-    Raises:
-        FileError: no such model, or a damaged archive.
     """
     buffer = io.BytesIO(_member(path, f"{name}.arrays"))
     try:

@@ -133,10 +133,6 @@ def propose(
         target: folder, made if absent; on failure older files in it stay as they were.
         library: models to choose from, by id; None: boxes only.
         report: progress, (stage, share).
-
-    Raises:
-        SceneRejected: no labelled furniture.
-        FileError: the folder cannot be written.
     """
     say = report or (lambda stage, share: None)
     say("propose", 0.0)

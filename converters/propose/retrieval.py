@@ -89,9 +89,6 @@ def read_library(root: Path | None) -> dict[str, CadModel]:
 
     Args:
         root: folder that holds `cad/`; None: the packaged furniture.
-
-    Raises:
-        SceneRejected: no model there, or a damaged one.
     """
     if root is None:
         return _packaged()

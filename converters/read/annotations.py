@@ -72,9 +72,6 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
 
     Returns:
         The scan id, and for each object its synset id and annotation.
-
-    Raises:
-        SceneRejected: not a list of one scan, a missing key, an unknown category, a singular pose.
     """
     if not isinstance(data, list) or len(data) != 1:
         got = f"a list of {len(data)}" if isinstance(data, list) else type(data).__name__
@@ -150,12 +147,7 @@ def inside_scan(
     vertices: np.ndarray,
     faces: np.ndarray,
 ) -> tuple[Annotation, ...]:
-    """The annotations whose objects stand in the scan; the others are left out with a warning each.
-
-    Raises:
-        SceneRejected: most objects stand outside (the annotation belongs to another scan), or the folder is read
-            strictly.
-    """
+    """The annotations whose objects stand in the scan; the others are left out with a warning each."""
     gaps = [gap_to_scan(a, cads[a.cad_id].vertices, vertices, faces) for a in annotations]
     outside = [i for i, gap in enumerate(gaps) if gap > OUTSIDE_M]
     if 2 * len(outside) > len(annotations):

@@ -23,9 +23,6 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     """Reads `cad/<synset>/<id>/models/model_normalized.obj` and turns it to z up.
 
     A `collision.obj` beside it, of convex pieces, saves the decomposition.
-
-    Raises:
-        SceneRejected: unknown synset, absent model, or unreadable file.
     """
     if synset not in SYNSETS:
         known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
@@ -81,9 +78,6 @@ def clean_surface(
         vertices: (n, 3), equal positions joined.
         faces: (m, 3).
         colours: (m, 3) of the faces.
-
-    Raises:
-        SceneRejected: nothing is left, or the model has no extent in two directions.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     extent = np.ptp(vertices, axis=0)

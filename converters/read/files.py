@@ -47,11 +47,7 @@ class SourceFolder:
         return (self.root / relative).is_file()
 
     def use(self, relative: str, remedy: str) -> Path:
-        """Path of a file that must exist; its hash goes into the record.
-
-        Raises:
-            SceneRejected: missing (`remedy` ends the message), unreadable, or a link out of the folder.
-        """
+        """Path of a file that must exist; its hash goes into the record."""
         path = self.root / relative
         if os.path.isfile(path) or path.is_symlink():
             self.inside(path)
@@ -71,11 +67,7 @@ class SourceFolder:
             return None
 
     def inside(self, path: Path) -> str:
-        """The path relative to the folder, links followed.
-
-        Raises:
-            SceneRejected: it leads out of the folder, or it is no path at all (a NUL byte, a loop of links).
-        """
+        """The path relative to the folder, links followed."""
         try:
             end, root = self.resolve(path), self.resolve(self.root)
         except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
@@ -90,41 +82,25 @@ class SourceFolder:
             self.warnings.append(message)
 
     def repaired(self, message: str) -> None:
-        """Records a defect that was mended.
-
-        Raises:
-            SceneRejected: the folder is read strictly.
-        """
+        """Records a defect that was mended."""
         if self.strict:
             raise SceneRejected(f"{self.root}: {message}; --strict refuses what would be repaired")
         self.note(message)
 
 
 def read_json(path: Path) -> Any:
-    """Decodes one JSON file.
-
-    Raises:
-        SceneRejected: not JSON, or with a number that is not finite or above 2**64.
-    """
+    """Decodes one JSON file."""
     return Reader(SceneRejected, "fetch the file again").json(path)
 
 
 def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
-    """One array of an NPZ file.
-
-    Raises:
-        SceneRejected: not an NPZ, damaged, or without the array.
-    """
+    """One array of an NPZ file."""
     with readable(path, SceneRejected, remedy), np.load(path, allow_pickle=False) as arrays:
         return np.asarray(arrays[name])
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """(n,) int64 NYU40 ids: the array `label` of an NPZ.
-
-    Raises:
-        SceneRejected: there is none, or it holds no whole numbers.
-    """
+    """(n,) int64 NYU40 ids: the array `label` of an NPZ."""
     labels = read_npz(path, "label", "expected an NPZ with the array 'label' of NYU40 ids")
     if labels.dtype.kind not in "iu":
         raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
@@ -132,21 +108,13 @@ def read_labels(path: Path) -> np.ndarray:
 
 
 def read_image(path: Path, mode: str) -> np.ndarray:
-    """Reads an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w).
-
-    Raises:
-        SceneRejected: not an image, or truncated.
-    """
+    """Reads an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w)."""
     with readable(path, SceneRejected, "fetch the file again", " as an image"), Image.open(path) as image:
         return np.asarray(image.convert(mode))
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
-    """Reads a single mesh in file order (no vertices merged or moved).
-
-    Raises:
-        SceneRejected: unreadable, truncated, empty, or with vertices that are not finite.
-    """
+    """Reads a single mesh in file order (no vertices merged or moved)."""
     with readable(path, SceneRejected, "fetch the file again", " as a mesh"):
         mesh = trimesh.load(path, process=False, force="mesh")
     assert isinstance(mesh, trimesh.Trimesh)
@@ -163,11 +131,7 @@ def vertex_colours(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Refuses what no stage can use.
-
-    Raises:
-        SceneRejected: no faces, indices out of range, or vertices that are not finite.
-    """
+    """Refuses what no stage can use."""
     if len(vertices) == 0 or len(faces) == 0:
         raise SceneRejected(
             f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; fetch the file again"
@@ -202,11 +166,7 @@ class ObjMesh:
 
 
 def read_obj(path: Path) -> ObjMesh:
-    """Reads a polygon OBJ in its own vertex order (labels refer to it; mesh libraries reorder at seams).
-
-    Raises:
-        SceneRejected: a malformed line, an index out of range, no faces, or vertices that are not finite.
-    """
+    """Reads a polygon OBJ in its own vertex order (labels refer to it; mesh libraries reorder at seams)."""
     positions: list[str] = []
     uvs: list[str] = []
     corners: list[str] = []

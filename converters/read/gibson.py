@@ -38,9 +38,6 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
     Args:
         root: the folder.
         strict: refuse what would be repaired with a warning.
-
-    Raises:
-        SceneRejected: a file is missing or damaged, counts differ, or mesh, floors and maps do not fit together.
     """
     source = SourceFolder(root, strict)
     mesh = read_scan_obj(source, MESH, "expected Gibson's textured z-up mesh")
@@ -69,11 +66,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
 
 
 def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heights, cads, annotations) -> RawScene:
-    """The record of a Gibson building: joins what was read with maps, licence and hashes.
-
-    Raises:
-        SceneRejected: a map does not fit the mesh.
-    """
+    """The record of a Gibson building: joins what was read with maps, licence and hashes."""
     floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
     maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
     raw = source.scene(
@@ -101,11 +94,7 @@ def _furnished(path: Path) -> bool:
 
 
 def read_floors(source: SourceFolder) -> tuple[float, ...]:
-    """Heights of the floors, m, lowest first.
-
-    Raises:
-        SceneRejected: no `floors.txt`, no finite number in it, or two floors less than a metre apart.
-    """
+    """Heights of the floors, m, lowest first."""
     path = source.use("floors.txt", "expected one floor height in metres a line")
     words = path.read_text(encoding="utf-8", errors="replace").split()
     try:
@@ -123,11 +112,7 @@ def read_floors(source: SourceFolder) -> tuple[float, ...]:
 
 
 def read_windows(source: SourceFolder) -> tuple[Window, ...]:
-    """Boxes along x and y that windows fill; none without the file.
-
-    Raises:
-        SceneRejected: a line is no box.
-    """
+    """Boxes along x and y that windows fill; none without the file."""
     if not source.has(WINDOWS):
         return ()
     path, remedy = source.use(WINDOWS, ""), "expected a lower and an upper corner a line, x y z x y z in metres"
@@ -149,9 +134,6 @@ def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, flo
         number: of the floor, from the lowest.
         mesh_xy: (n, 2) vertices of the mesh, m.
         floor_xy: (k, 2) those of this floor's floor.
-
-    Raises:
-        SceneRejected: not a square image, obstacles of another size, or an area other than the mesh's.
     """
     name, obstacle_name = f"floor_trav_{number}.png", f"floor_{number}.png"
     if not source.has(name):

@@ -58,9 +58,6 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     Args:
         root: the folder.
         strict: refuse what would be repaired with a warning.
-
-    Raises:
-        SceneRejected: a file is missing or damaged, or mesh, floors and maps do not fit together.
     """
     source = SourceFolder(root, strict)
     mesh = read_scan_obj(source, MESH, "expected the scan without its furniture")

@@ -56,11 +56,7 @@ class SourceResolver(Resolver):
         """What trimesh's loaders swallowed: they go on without a file, whatever the reason."""
 
     def get(self, key: str) -> bytes:
-        """Content of a named file.
-
-        Raises:
-            FileNotFoundError: there is none, or an image that is not readable; the source has a warning.
-        """
+        """Content of a named file."""
         try:
             if Path(key).suffix.lower() in Image.registered_extensions():
                 found = read_texture(self.source, self.model, key) is not None
@@ -88,11 +84,7 @@ class SourceResolver(Resolver):
 
 
 def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
-    """Reads a mesh file of any kind that trimesh knows, with its textures or colours, once for every source.
-
-    Raises:
-        SceneRejected: missing, damaged, empty or too large, or it names a file by a link that leads out of the source.
-    """
+    """Reads a mesh file of any kind that trimesh knows, with its textures or colours, once for every source."""
     if relative not in source.surfaces:
         source.surfaces[relative] = _read_surface(source, relative, remedy)
     return source.surfaces[relative]
@@ -145,9 +137,6 @@ def read_single_mesh(
         up: word of `AXES`, or `auto`: found.
         unit: word of `UNITS_M`, or `auto`: told by the height.
         mirror: take -x for x.
-
-    Raises:
-        SceneRejected: missing or damaged, mirrored, or neither its axes nor its unit can be told.
     """
     source = SourceFolder(path.parent, strict)
     mesh = read_surface(source, source.inside(path), "give a mesh file")
@@ -193,11 +182,7 @@ def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMes
 
 
 def _collada_turn(path: Path) -> np.ndarray:
-    """(3, 3) from a COLLADA file's frame to metres and z up; by its standard a silent file is in metres, y up.
-
-    Raises:
-        SceneRejected: a unit that is no positive number, or an unknown axis.
-    """
+    """(3, 3) from a COLLADA file's frame to metres and z up; by its standard a silent file is in metres, y up."""
     asset = ElementTree.parse(path).getroot().find("{*}asset")
     unit = None if asset is None else asset.find("{*}unit")
     axis = (None if asset is None else asset.findtext("{*}up_axis")) or "Y_UP"

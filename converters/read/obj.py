@@ -27,11 +27,7 @@ SMALL_IMAGE = 10_000
 
 
 def find_file(source: SourceFolder, folder: Path, name: str) -> Path | None:
-    """The file that a model names, sought also by its bare name (paths of another machine, letter case).
-
-    Raises:
-        SceneRejected: what stands under that name is a link that leads out of the source or nowhere.
-    """
+    """The file that a model names, sought also by its bare name (paths of another machine, letter case)."""
     words = name.strip().strip('"').removeprefix("file://")
     bare = words.replace("\\", "/")
     names = dict.fromkeys(n for n in (bare, bare.split()[-1] if bare.split() else bare, unquote(bare)) if n)
@@ -54,11 +50,7 @@ def _is_there(path: Path) -> bool:
 
 
 def use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | None:
-    """The named file with its hash recorded; a warning where it stands under another name than the given one.
-
-    Raises:
-        SceneRejected: a link that leads out of the source or nowhere.
-    """
+    """The named file with its hash recorded; a warning where it stands under another name than the given one."""
     found = find_file(source, folder, name)
     if found is None:
         return None
@@ -99,11 +91,7 @@ def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) 
 
 
 def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None:
-    """The image (h, w, 3) uint8 that a material file or model names; None and a warning where there is none.
-
-    Raises:
-        SceneRejected: a link that leads out of the source or nowhere; with a strict source, no readable image.
-    """
+    """The image (h, w, 3) uint8 that a material file or model names; None and a warning where there is none."""
     where = source.relative(by) or by.name
     path = use_found(source, by.parent, name, where)
     if path is None:
@@ -150,9 +138,6 @@ def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[
 
     Returns:
         The mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
-
-    Raises:
-        SceneRejected: missing or damaged OBJ, or a link that leads out of the source.
     """
     path = source.use(relative, remedy)
     mesh = read_obj(path)

@@ -23,9 +23,6 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
     Args:
         root: the folder.
         strict: refuse what would be repaired with a warning.
-
-    Raises:
-        SceneRejected: a file is missing or damaged, label and vertex counts differ, or the scan is not z up.
     """
     source = SourceFolder(root, strict)
     path = source.use(ANNOTATION, "expected Scan2CAD's annotation of one scan beside scan/ and cad/")

@@ -34,11 +34,7 @@ WITHIN = (sdf.read_sdf, mjcf.read_mjcf)
 
 
 def detect_format(source: Path) -> str:
-    """Name of the layout that the folder has.
-
-    Raises:
-        SceneRejected: no known layout.
-    """
+    """Name of the layout that the folder has."""
     for name, (shows, _) in READERS.items():
         if source.is_dir() and shows(source):
             return name
@@ -74,9 +70,6 @@ def read_source(
         unit: of a mesh file: its unit, or `auto`.
         within: of an MJCF or Gazebo home: the folder that may be read; default its own.
         mirror: of a mesh file: take -x for x.
-
-    Raises:
-        SceneRejected: no known layout, or bad input.
     """
     about_mesh = (up, unit, mirror) != ("auto", "auto", False)
     if source.is_file() and layout == "auto":

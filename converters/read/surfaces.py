@@ -46,11 +46,7 @@ def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
 
 
 def labelled(mesh: TexturedMesh, labels: np.ndarray, where: Path) -> tuple[TexturedMesh, np.ndarray]:
-    """A mesh and its labels: one a vertex, or as many as `with_own_corners` makes.
-
-    Raises:
-        SceneRejected: another number.
-    """
+    """A mesh and its labels: one a vertex, or as many as `with_own_corners` makes."""
     own = mesh if len(labels) == len(mesh.vertices) else with_own_corners(mesh)
     if len(labels) != len(own.vertices):
         raise SceneRejected(
@@ -61,11 +57,7 @@ def labelled(mesh: TexturedMesh, labels: np.ndarray, where: Path) -> tuple[Textu
 
 
 def check_extent(where: str, vertices: np.ndarray) -> None:
-    """Refuses scans of several buildings, in another unit, or with stray vertices.
-
-    Raises:
-        SceneRejected: longer than `EXTENT_M`.
-    """
+    """Refuses scans of several buildings, in another unit, or with stray vertices."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if not (high - low).max() <= EXTENT_M:
         raise SceneRejected(
@@ -75,11 +67,7 @@ def check_extent(where: str, vertices: np.ndarray) -> None:
 
 
 def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
-    """Height of the lowest level that has a fifth of the largest level's area, m; faces that look up count.
-
-    Raises:
-        SceneRejected: nothing is level, or it is too large.
-    """
+    """Height of the lowest level that has a fifth of the largest level's area, m; faces that look up count."""
     check_extent(where, vertices)
     area = face_vectors(vertices, faces) / 2
     level = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
@@ -162,9 +150,6 @@ def check_upright(
         faces: (m, 3).
         labels: (n,) NYU40, or None: then the level faces at `height_m` are taken for floor.
         height_m: of the floor; needed without labels.
-
-    Raises:
-        SceneRejected: no floor faces up, or it is too large.
     """
     check_extent(where, vertices)
     area = face_vectors(vertices, faces) / 2

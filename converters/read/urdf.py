@@ -41,9 +41,6 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
         relative: path of the URDF in it.
         remedy: ends the message where the file is missing.
         hold: take joints that move as fixed where they are at 0.
-
-    Raises:
-        SceneRejected: no XML, no link, a joint that moves, no mesh, or a number that is none.
     """
     path = source.use(relative, remedy)
     try:
@@ -79,11 +76,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
 
 
 def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
-    """As many numbers as the default has, from text.
-
-    Raises:
-        ValueError: another count, not finite, or beyond 1e6.
-    """
+    """As many numbers as the default has, from text."""
     values = np.array((text or "").split() or default, float)
     if values.shape != np.shape(default) or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e6:
         raise ValueError(f"'{text}' is not {len(default)} usable numbers")
@@ -172,10 +165,6 @@ def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> Textu
         path: named in errors.
         kind: of shape.
         text: a dimension's name -> its text, m.
-
-    Raises:
-        SceneRejected: another kind.
-        ValueError: a dimension that is no number.
     """
     if kind == "box":
         solid = trimesh.creation.box(numbers(text("size"), (0.0, 0.0, 0.0)))

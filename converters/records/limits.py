@@ -23,21 +23,13 @@ Image.MAX_IMAGE_PIXELS = PIXELS // 2  # Pillow warns from here on, and refuses t
 
 
 def check_count(where: object, count: float, most: float, what: str, remedy: str = "split the source") -> None:
-    """Refuses more of `what` than there may be, naming the file and the remedy.
-
-    Raises:
-        SceneRejected: too many, or their number is none.
-    """
+    """Refuses more of `what` than there may be, naming the file and the remedy."""
     if not count <= most:
         raise SceneRejected(f"{where}: has {count:,.0f} {what}, expected at most {most:,.0f}; {remedy}")
 
 
 def check_image(path: Path) -> None:
-    """Refuses a file whose header tells of too large an image; what is no image passes.
-
-    Raises:
-        SceneRejected: more than `PIXELS`.
-    """
+    """Refuses a file whose header tells of too large an image; what is no image passes."""
     try:
         with Image.open(path):
             pass

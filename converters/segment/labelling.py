@@ -32,11 +32,7 @@ Report = Callable[[str, float], None]
 
 
 def load_scores(weights: Path | None = None) -> Scores:
-    """The network with weights, for `label_scan`; None: the packaged ones.
-
-    Raises:
-        SceneRejected: there are none, or damaged ones.
-    """
+    """The network with weights, for `label_scan`; None: the packaged ones."""
     return make_scores(*read_weights(weights or WEIGHTS))
 
 

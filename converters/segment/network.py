@@ -145,11 +145,7 @@ def write_weights(path: Path, net: VoxelNet, variables: Any) -> None:
 
 
 def read_weights(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
-    """What `write_weights` wrote.
-
-    Raises:
-        SceneRejected: it is missing or damaged.
-    """
+    """What `write_weights` wrote."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files}

@@ -68,9 +68,6 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
         faces: (m, 3).
         labels: (n,) NYU40.
         near_m: the height as the source states it: only what lies within `GIVEN_NEAR_M` of it counts.
-
-    Raises:
-        SceneRejected: too few floor labels, or they lie in no level plane.
     """
     labelled = int((labels == FLOOR).sum())
     if labelled < MIN_LABELS:

@@ -242,9 +242,6 @@ def make_floor_plan(
         yaw: of the grid: the building's `main_direction`, rad.
         exact: leaves and walls lie where they are: what a leaf passes stays free of boxes, wall or unseen.
         resolution_m: cell side.
-
-    Raises:
-        SceneRejected: no traversable cell.
     """
     grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
     shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))

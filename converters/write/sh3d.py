@@ -68,11 +68,6 @@ def export_sh3d(folder: Path, target: Path) -> list[str]:
     Args:
         folder: of the scene.
         target: file to write, which must not be there.
-
-    Raises:
-        SceneError: no scene folder.
-        SceneRejected: its MJCF or a mesh is missing or damaged.
-        FileError: the target is there, has another ending or cannot be written.
     """
     manifest = load_manifest(folder)
     if target.suffix != ".sh3d" or target.exists():

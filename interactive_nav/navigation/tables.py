@@ -131,11 +131,7 @@ def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGra
 
 
 def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndarray:
-    """[S, PAIRS_KEPT, 2, 2] f32 starts and goals at middles of cells, as far apart as asked: some of each scene's.
-
-    Raises:
-        SceneError: a scene with no such pair.
-    """
+    """[S, PAIRS_KEPT, 2, 2] f32 starts and goals at middles of cells, as far apart as asked: some of each scene's."""
     least_m, largest_m = rules.min_goal_distance_m, rules.max_goal_distance_m
 
     @jax.jit
@@ -226,11 +222,7 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
 
 
 def build_tables(world: World, rules: TaskRules) -> SceneTables:
-    """Solves navigation for every scene and stacks all constants on the device.
-
-    Raises:
-        SceneError: a scene with no room for the robot, or for a start and a goal as far apart as asked.
-    """
+    """Solves navigation for every scene and stacks all constants on the device."""
     with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
         places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
     com = np.stack([m.body_ipos[world.layout.slot_body] for m in world.models])

@@ -15,11 +15,7 @@ from interactive_nav_common.files import cache_folder
 
 
 def resolve_backend(name: str) -> str:
-    """`auto` becomes `warp` on an NVIDIA GPU with Warp installed, `native` on a CPU, `jax` elsewhere.
-
-    Raises:
-        ConfigError: `warp` without the Warp package.
-    """
+    """`auto` becomes `warp` on an NVIDIA GPU with Warp installed, `native` on a CPU, `jax` elsewhere."""
     has_warp = importlib.util.find_spec("warp") is not None
     if name == "auto":
         platform = jax.default_backend()
@@ -60,11 +56,7 @@ def compiler_options() -> dict[str, Any] | None:
 
 
 def make_physics(world: World, config: NavConfig) -> Physics:
-    """Builds the backend that the configuration names.
-
-    Raises:
-        ConfigError: hull collision on an MJX backend, or a backend that is not installed.
-    """
+    """Builds the backend that the configuration names."""
     physics = config.physics
     backend = resolve_backend(physics.backend)
     if physics.collision == "hulls" and backend != "native":

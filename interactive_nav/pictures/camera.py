@@ -33,11 +33,7 @@ class Painter:
     """RGB with textures of scene models, by the first engine that works here."""
 
     def __init__(self, engine: str = "auto"):
-        """Prepares nothing that is not asked for; `engine` as `Camera` has it; auto until the first picture.
-
-        Raises:
-            ConfigError: unknown engine.
-        """
+        """Prepares nothing that is not asked for; `engine` as `Camera` has it; auto until the first picture."""
         if engine not in ENGINES:
             raise ConfigError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
         self.engine = engine
@@ -100,9 +96,6 @@ class Camera:
             env: an `InteractiveNav`.
             engine: of RGB: gl, warp, rays, or auto: gl where it works, else warp on an NVIDIA GPU, else rays.
             fov_deg: vertical field of view of the robot's camera; None: that of its observations.
-
-        Raises:
-            ConfigError: unknown engine.
         """
         self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
         world, classes = env.world, env.sensors.boxes.classes
@@ -136,9 +129,6 @@ class Camera:
             rgb [H, W, 3] u8; normals [H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the
             viewer), 0 where nothing is; depth [H, W] f32, m along the optical axis, 0 where nothing is;
             segmentation [H, W] u8 class ids.
-
-        Raises:
-            ConfigError: unknown stream or view, or a batch of states.
         """
         unknown = [s for s in streams if s not in STREAMS]
         if unknown or not streams:

@@ -37,9 +37,6 @@ class GlPainter:
             width: of the pictures, pixels.
             height: pixels.
             sky: colour where nothing is hit; None: the model's.
-
-        Raises:
-            UserError: no GL library starts here, or the buffer is smaller than the pictures.
         """
         buffer = model.vis.global_
         if width > buffer.offwidth or height > buffer.offheight:

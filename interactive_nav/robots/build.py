@@ -101,11 +101,7 @@ class _Limits:
 
 
 def read_file(path: Path) -> mujoco.MjSpec:
-    """Parses an MJCF or URDF file.
-
-    Raises:
-        ConfigError: no such file, or MuJoCo cannot read it.
-    """
+    """Parses an MJCF or URDF file."""
     if not path.is_file():
         raise ConfigError(f"robot file {path} does not exist, expected an MJCF or URDF file")
     try:
@@ -340,9 +336,6 @@ def wheeled_robot(
         camera: its body without the robot's name.
         rolling: bodies of wheels without the robot's name; by default those of the driven wheels.
         **figures: other fields of `RobotSpec`.
-
-    Raises:
-        ConfigError: unknown mode, or a file that does not fit.
     """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"

@@ -185,9 +185,6 @@ def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> 
         control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and
             angular velocity through the gait.
         **figures: of `RobotSpec`, in place of those set here.
-
-    Raises:
-        ConfigError: unknown mode.
     """
     check_mode(legs.name, control_mode, legs.modes)
     joint_mode = legs.native if control_mode == "native" else control_mode

@@ -242,9 +242,6 @@ def from_file(
 
     Returns:
         control mode -> `RobotSpec`.
-
-    Raises:
-        ConfigError: a file that cannot be used; the message says what to change.
     """
     speeds = {"max_linear_m_s": max_linear_m_s, "max_angular_rad_s": max_angular_rad_s}
     _check(name, max_wheel_speed_rad_s, {"body_width_m": body_width_m, "track_m": track_m} | speeds)

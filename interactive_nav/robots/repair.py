@@ -57,11 +57,7 @@ def _solid(geom) -> bool:
 
 
 def find(child: mujoco.MjSpec, path: Path, kind: str, name: str):
-    """The body or joint of a name.
-
-    Raises:
-        FileError: there is none; the message lists what there is.
-    """
+    """The body or joint of a name."""
     found = child.body(name) if kind == "body" else child.joint(name)
     if found is None:
         known = [x.name for x in (child.bodies if kind == "body" else child.joints) if x.name not in ("world", "")]

@@ -165,11 +165,7 @@ class RobotSpec:
         return command if self.control is None else self.control(command, state, xp)
 
     def drive(self, linear_m_s, angular_rad_s, xp=np):
-        """Actions [..., A] that ask the base for a velocity.
-
-        Raises:
-            ConfigError: this control mode has no twist map.
-        """
+        """Actions [..., A] that ask the base for a velocity."""
         if self.twist is None:
             raise ConfigError(
                 f"robot '{self.name}' in control mode '{self.control_mode}' takes no base velocity; "

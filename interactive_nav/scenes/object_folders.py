@@ -53,9 +53,6 @@ def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple
         num_objects: how many.
         split: whose built-in models, train or test.
         folders: of `NavConfig.objects`.
-
-    Raises:
-        SceneError: a folder that is no object.
     """
     if not folders:
         return pick(num_objects, split)
@@ -64,11 +61,7 @@ def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple
 
 
 def load_object(folder: str | Path) -> ConvertedObject:
-    """Reads and checks a folder with `object.xml`, `object.json` and `assets/`.
-
-    Raises:
-        SceneError: a file is missing, damaged or does not compile.
-    """
+    """Reads and checks a folder with `object.xml`, `object.json` and `assets/`."""
     from scenes_mjcf.categories import class_id  # which imports the world that small objects are part of
 
     folder = Path(folder)

@@ -231,9 +231,6 @@ def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[Smal
 
     Slot i holds the same kind, with the same number of boxes, whatever the split and the variant: which two models of
     each kind, 0 the default set; they come round again. Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
-
-    Raises:
-        ConfigError: a negative number, or an unknown split.
     """
     if num_objects < 0:
         raise ConfigError(f"num_objects is {num_objects}, expected 0 or more")

@@ -131,11 +131,7 @@ def _geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, friction: float) -> Movable:
-    """One movable body of a compiled scene or single object; `xml` is named in errors, `friction` is sliding.
-
-    Raises:
-        SceneError: no such body, not one joint that is free or a hinge, or no box to collide with.
-    """
+    """One movable body of a compiled scene or single object; `xml` is named in errors, `friction` is sliding."""
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
     if body < 0:
         raise SceneError(f"{xml}: no body named '{name}', which its JSON file lists; convert it again")
@@ -180,11 +176,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """Reads and checks a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too.
-
-    Raises:
-        SceneError: a file is missing or unreadable, or scene.xml and scene.json disagree.
-    """
+    """Reads and checks a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too."""
     folder, word = installed(folder), str(folder)
     if not folder.exists():
         raise SceneError(

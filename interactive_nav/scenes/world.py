@@ -95,13 +95,7 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
 
 
 def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) -> World:
-    """Compiles one padded model per scene and settles its furniture under the environment's own physics.
-
-    Raises:
-        ConfigError: no scene, or hulls with several scenes.
-        SceneError: a scene whose furniture does not come to rest at finite coordinates, or a folder in
-            `config.objects` that is no object.
-    """
+    """Compiles one padded model per scene and settles its furniture under the environment's own physics."""
     if not scenes:
         raise ConfigError("scenes is empty, expected at least one scene folder")
     if config.physics.collision == "hulls" and len(scenes) > 1:

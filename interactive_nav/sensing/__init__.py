@@ -14,9 +14,6 @@ def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes
         name: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
         backend: of the physics: warp, jax or native.
         meshes: whose visual meshes are drawn, by a Warp kernel whatever the name; None: boxes.
-
-    Raises:
-        ConfigError: warp where the package warp-lang is not installed.
     """
     from interactive_nav.physics import resolve_backend
 

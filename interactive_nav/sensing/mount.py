@@ -45,9 +45,6 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera, yaw_r
         base_body: the body with the free joint.
         camera: its body lies in the base's subtree.
         yaw_rad: how far it looks to the left of its body's x axis.
-
-    Raises:
-        ConfigError: no such body, or one that is not part of the robot.
     """
     base, body = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in (base_body, camera.body))
     own = [model.body(b).name for b in range(model.nbody) if model.body_rootid[b] == base]

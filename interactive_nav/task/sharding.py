@@ -47,11 +47,7 @@ class ShardedEnv(Wrapper):
         return self.mesh.size
 
     def reset(self, rng: jax.Array) -> State:
-        """[N, 2] keys to N states.
-
-        Raises:
-            ConfigError: N is no multiple of the number of devices.
-        """
+        """[N, 2] keys to N states."""
         if rng.shape[0] % self.num_devices:
             raise ConfigError(
                 f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
@@ -76,9 +72,6 @@ def start_distributed(coordinator: str, num_processes: int, process_id: int) -> 
         coordinator: host:port of process 0, reachable from all.
         num_processes: how many join.
         process_id: 0 to num_processes - 1.
-
-    Raises:
-        ConfigError: an impossible process id, or a coordinator without a port.
     """
     if not 0 <= process_id < num_processes:
         raise ConfigError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")

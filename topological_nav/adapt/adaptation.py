@@ -158,10 +158,6 @@ def adapt_features(
 
     Returns:
         The content of results.json: localisation before, with the target's statistics alone, and after.
-
-    Raises:
-        DatasetError, RunError: something cannot be used.
-        Stopped: it was asked for before the end.
     """
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)
@@ -216,11 +212,7 @@ def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
 def localisation_between(
     node_network: Trained, node_rooms: RoomImages, query_network: Trained, query_rooms: RoomImages
 ) -> dict[str, Any]:
-    """Scores of queries of one domain on nodes of another, as `training.localisation` has them; and their number.
-
-    Raises:
-        RunError: source and target have nothing in common to score.
-    """
+    """Scores of queries of one domain on nodes of another, as `training.localisation` has them; and their number."""
     rows = localisation(node_network, node_rooms, query_network, query_rooms)
     if not rows:
         raise RunError("source and target have no scene in common with positions for training and for testing")

@@ -66,10 +66,6 @@ def passage_configurations(
 
     Returns:
         The content of results.json.
-
-    Raises:
-        DatasetError, RunError: something cannot be used.
-        Stopped: it was asked for before the end.
     """
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
@@ -113,9 +109,6 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
 
     Returns:
         `build.Built`; its scores tell how held-out images of the target are localised on it.
-
-    Raises:
-        DatasetError, MapError, RunError: something cannot be used, or does not fit.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
     need_task(detector.about, "passages", "the detector")

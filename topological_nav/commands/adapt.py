@@ -23,12 +23,7 @@ from topological_nav.weights.packaged import choose
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Runs the command.
-
-    Raises:
-        Stopped: a signal asked for it.
-        UserError: something cannot be used.
-    """
+    """Runs the command."""
     config = overridden(AdaptConfig(), arguments.settings)
     if (arguments.what == "map") != bool(arguments.scene):
         raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")

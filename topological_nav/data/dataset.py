@@ -99,9 +99,6 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
     """Decides where a scene's images are taken.
 
     Positions are drawn uniformly; of a room that has more than its share, those farthest from each other stay.
-
-    Raises:
-        SpaceError: too little free space.
     """
     rng = np.random.default_rng([config.seed, 2, int(scene.digest[:8], 16)])
     rooms = scene_rooms(scene, space, config)
@@ -134,11 +131,6 @@ def make_dataset(
 
     Returns:
         The content of dataset.json.
-
-    Raises:
-        DatasetError: `out` holds a dataset of other scenes or settings.
-        SceneError, SpaceError: a scene cannot be used.
-        UserError: the engine is not installed.
     """
     scenes = load_scenes(scene_folders, config.engine)
     robot = get_robot(config.robot)
@@ -171,11 +163,7 @@ def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig)
 
 
 def load_rooms(folder: Path) -> RoomImages:
-    """The room images of a dataset.
-
-    Raises:
-        DatasetError: the dataset is missing, incomplete or damaged.
-    """
+    """The room images of a dataset."""
     header, config = read_header(folder)
     parts, first = [], 0
     for index, scene in enumerate(header["scenes"]):
@@ -190,11 +178,7 @@ def load_rooms(folder: Path) -> RoomImages:
 
 
 def load_passages(folder: Path) -> PassageImages:
-    """The passage images of a dataset.
-
-    Raises:
-        DatasetError: the dataset is missing, incomplete or damaged.
-    """
+    """The passage images of a dataset."""
     header, config = read_header(folder)
     parts = []
     for index, scene in enumerate(header["scenes"]):
@@ -206,11 +190,7 @@ def load_passages(folder: Path) -> PassageImages:
 
 
 def load_plan(folder: Path, scene: str) -> ScenePlan:
-    """Where a scene's images were taken.
-
-    Raises:
-        DatasetError: missing or damaged.
-    """
+    """Where a scene's images were taken."""
     path = Path(folder) / scene / "plan.npz"
     arrays = read_arrays(path)
     with readable(path, DatasetError, "run 'data' again"):

@@ -56,11 +56,7 @@ PRESETS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, DomainCon
 
 
 def preset(name: str) -> DomainConfig:
-    """A named camera.
-
-    Raises:
-        ConfigError: there is none of that name.
-    """
+    """A named camera."""
     if name not in PRESETS:
         raise ConfigError(f"domain is '{name}', expected one of {', '.join(PRESETS)}")
     return PRESETS[name]

@@ -41,11 +41,7 @@ class Folder(Generic[Config]):
     """What to do about one that cannot be used."""
 
     def read(self, folder: Path) -> tuple[dict[str, Any], Config]:
-        """The description of a folder, and the settings in it.
-
-        Raises:
-            DatasetError: there is none, it is not readable, or of another format.
-        """
+        """The description of a folder, and the settings in it."""
         path = Path(folder) / self.file
         if not path.is_file():
             raise DatasetError(f"{folder}: {self.none}")
@@ -92,13 +88,7 @@ class Folder(Generic[Config]):
 
 
 def load_scenes(folders: Sequence[Path], engine: str) -> list[Scene]:
-    """The scenes to draw.
-
-    Raises:
-        DatasetError: none, or several of one name.
-        SceneError: one cannot be used.
-        UserError: the engine that will draw them is not installed.
-    """
+    """The scenes to draw."""
     scenes = [load_scene(folder) for folder in folders]
     need_engine(engine)
     names = [scene.name for scene in scenes]

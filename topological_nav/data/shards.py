@@ -59,11 +59,7 @@ def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
 
 
 def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:
-    """The arrays of an npz file that a command wrote.
-
-    Raises:
-        DatasetError: it is missing or damaged.
-    """
+    """The arrays of an npz file that a command wrote."""
     need_files([path], command)
     remedy = f"delete it and run '{command}' again"
     with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
@@ -78,11 +74,7 @@ def need_files(paths: Iterable[Path], command: str = "data") -> None:
 
 
 def read_shard(path: Path) -> np.ndarray:
-    """All images [N, H, W, 3] u8 of a file, in the order they were written.
-
-    Raises:
-        DatasetError: it is missing or damaged.
-    """
+    """All images [N, H, W, 3] u8 of a file, in the order they were written."""
     stored = read_arrays(path)
     with readable(path, DatasetError, "delete it and run 'data' again"):
         height, width = (int(v) for v in stored["size"])
@@ -114,10 +106,6 @@ def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Res
 
 
 def read_shards(paths: Sequence[Path], command: str = "data") -> Iterator[np.ndarray]:
-    """`read_shard` of each file that a command wrote, in order, some files ahead in threads.
-
-    Raises:
-        DatasetError: one is missing, which is told before the first is read; or see `read_shard`.
-    """
+    """`read_shard` of each file that a command wrote, in order, some files ahead in threads."""
     need_files(paths, command)
     return in_order((functools.partial(read_shard, path) for path in paths), THREADS)

@@ -102,9 +102,6 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np
 
     Returns:
         The n drives, scene by scene, [n] bool which of them are for testing, and what the expert knows of the scenes.
-
-    Raises:
-        SpaceError: a scene in which no two nodes are joined.
     """
     robot = get_robot(config.robot)
     spaces, fields, parts, tests = [], [], [], []
@@ -154,11 +151,6 @@ def simulate_drives(
         out: the folder.
         config: of the drives.
         progress: told the number of drives that have ended, and of all.
-
-    Raises:
-        DatasetError: `out` holds drives of other scenes or settings.
-        SceneError, SpaceError: a scene cannot be used.
-        UserError: the engine that will draw them is not installed.
     """
     scenes = load_scenes(scene_folders, config.engine)
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
@@ -193,9 +185,6 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
         scene_folders: as they were driven in, in the same order.
         out: a folder whose drives have been simulated.
         progress: told what is drawn, images done and images in all.
-
-    Raises:
-        DatasetError: the folder cannot be used, or a scene has changed since.
     """
     with alone_in(out):
         header, config = read_drives_header(out)
@@ -232,11 +221,7 @@ def _image_files(out: Path, name: str, index: int, drives: Drives, config: Drive
 
 
 def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields the kept drives of a folder, some at a time: indices [k] among all, images [F, H, W, 3] u8 of their steps.
-
-    Raises:
-        DatasetError: images are missing or damaged.
-    """
+    """Yields the kept drives of a folder, some at a time: indices [k] among all, images [F, H, W, 3] u8 of their steps."""
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
     files = [
@@ -252,11 +237,7 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def load_drives(folder: Path) -> Drives:
-    """All drives of a folder, kept or not.
-
-    Raises:
-        DatasetError: missing, incomplete or damaged.
-    """
+    """All drives of a folder, kept or not."""
     folder = Path(folder)
     header, config = read_drives_header(folder)
     total = len(header["scenes"]) * config.drives

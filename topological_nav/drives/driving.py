@@ -51,11 +51,7 @@ class TrainedPolicy:
         return fresh, fresh.copy()
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-        """See `LocalPolicy`.
-
-        Raises:
-            RunError: images of another size than it learned from.
-        """
+        """See `LocalPolicy`."""
         if images.shape[1:] != self._shape:
             raise RunError(f"images are {images.shape[1:]}, expected {self._shape}, the size that it learned from")
         state, (linear, angular) = jax.device_get(self._step(self._weights, state, jnp.asarray(images)))
@@ -77,10 +73,6 @@ def load_policy(
         localiser: run folder of the room classifier that embeds its images; None: where it was when it learned, seen
             from the run folder.
         detector: the same, of the passage detector.
-
-    Raises:
-        RunError: the run is not finished or damaged, or the networks are neither those that it learned with nor
-            adapted from them.
     """
     run = Path(run_folder)
     about = read_description(run, "policy", "policy")
@@ -109,9 +101,6 @@ def local_policy(name: str, sight: Sight, config: NavigatorConfig, *seeing: tupl
         config: of the navigator.
         seeing: the navigator's localiser and detector with their run folders; a trained policy sees through those of
             them that are adapted.
-
-    Raises:
-        RunError: see `load_policy`.
     """
     if name == PASSAGE_POLICY:
         return PassagePolicy(sight, config.passable, config.clear_m)

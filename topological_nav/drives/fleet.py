@@ -43,11 +43,7 @@ class Tasks(Rows):
 
 
 def make_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
-    """The environment of the drives: furniture at rest, no small objects, the robot commanded by velocities.
-
-    Raises:
-        UserError: the robot takes no velocities, or the backend is not installed.
-    """
+    """The environment of the drives: furniture at rest, no small objects, the robot commanded by velocities."""
     need_engine(config.backend)
     if config.robot not in LIDAR_B:
         raise UserError(f"robot is '{config.robot}', expected one with a scanner: {', '.join(LIDAR_B)}")

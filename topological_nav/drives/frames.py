@@ -57,10 +57,6 @@ def embed_drives(
         mirror: embed mirrored images too.
         tell: told now and then how far it is.
         should_stop: asked after every file of images.
-
-    Raises:
-        DatasetError, RunError: drives or networks cannot be used, or do not fit each other.
-        Stopped: it was asked for.
     """
     header, config = read_drives_header(folder)
     drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)

@@ -65,10 +65,6 @@ def train_policy(
 
     Returns:
         The content of results.json.
-
-    Raises:
-        RunError: `out` holds another run, or there is no sequence to learn from.
-        Stopped: it was asked for before the end.
     """
     if config.mirror and not frames.mirrored:
         raise RunError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")

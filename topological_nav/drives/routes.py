@@ -60,9 +60,6 @@ def draw_routes(
         edges: [E, 2] of `drivable`.
         config: counts and spreads.
         rng: draws all of it.
-
-    Raises:
-        SpaceError: no edge to drive along.
     """
     if not len(edges):
         raise SpaceError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")

@@ -198,12 +198,7 @@ class ContestScene:
 
 
 def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> LocalPolicy:
-    """What drives along edges; a trained policy sees through adapted networks where the navigator does.
-
-    Raises:
-        RunError: no such run.
-        ConfigError: a trained policy cannot look at poses.
-    """
+    """What drives along edges; a trained policy sees through adapted networks where the navigator does."""
     if contest.truth and contest.policy != PASSAGE_POLICY:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
     seeing = [(contest.localiser, networks.localiser), (contest.detector, networks.detector)] if networks else []
@@ -236,11 +231,7 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulat
 
 
 def contest_scenes(contest: Contest) -> list[ContestScene]:
-    """The scenes, with the networks where somebody looks through them.
-
-    Raises:
-        TopologicalError, SceneError: something cannot be used.
-    """
+    """The scenes, with the networks where somebody looks through them."""
     navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
     networks = load_networks(contest.localiser, contest.detector) if navigates else None
     return [ContestScene(folder, contest, networks) for folder in contest.scenes]

@@ -47,9 +47,6 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
     """Draws episodes: number i depends on seed and scene alone, however many there are.
 
     Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
-
-    Raises:
-        SpaceError: the scene has no such pair.
     """
     parts, _ = components(space.clearance_m >= CONNECTED_M)  # type: ignore[misc]
     places = space.centres(config.clearance_m)

@@ -39,9 +39,6 @@ def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Tell = 
         scenes: of `contest_scenes`.
         tell: told who plays where, episodes over and episodes in all, after every control step; may raise to stop,
             which loses the batch that is being played.
-
-    Raises:
-        TopologicalError, SceneError, TrainError: something cannot be used.
     """
     # Everything that can be refused is refused before the first episode.
     plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]

@@ -125,9 +125,6 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         number: of the episode.
         filmed: keep images.
         progress: told the simulated time; may raise to stop.
-
-    Raises:
-        ConfigError: the scene has no such episode.
     """
     (venue,) = contest_scenes(contest)
     if not 0 <= number < len(venue.episodes):

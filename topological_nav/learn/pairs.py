@@ -26,20 +26,13 @@ def need_task(about: dict[str, Any], task: str, who: str) -> None:
         about: content of its network.json.
         task: expected.
         who: names it in the message, such as `FOLDER:`.
-
-    Raises:
-        RunError: it is of another.
     """
     if about["task"] != task:
         raise RunError(f"{who} was trained for '{about['task']}', expected a run of 'train {task}'")
 
 
 def load_pair(localiser_run: Path, detector_run: Path, same: Sequence[str] = SAME) -> tuple[Trained, Trained]:
-    """A room classifier and a passage detector of finished runs.
-
-    Raises:
-        RunError: one is not finished, is of another task, or they learned from different cameras.
-    """
+    """A room classifier and a passage detector of finished runs."""
     networks = load_trained(localiser_run), load_trained(detector_run)
     for run, network, task in zip((localiser_run, detector_run), networks, ("rooms", "passages"), strict=True):
         need_task(network.about, task, f"{run}:")
@@ -62,21 +55,13 @@ class Networks:
 
 
 def load_networks(localiser: Path, detector: Path) -> Networks:
-    """The networks of two finished runs; the first may be of either task, as any embedding localises.
-
-    Raises:
-        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
-    """
+    """The networks of two finished runs; the first may be of either task, as any embedding localises."""
     pair = load_trained(localiser), load_trained(detector)
     return Networks(*pair, camera_of(*pair))
 
 
 def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
-    """The settings of the camera that both networks learned from.
-
-    Raises:
-        RunError: they learned from different cameras, or the second judges no passages.
-    """
+    """The settings of the camera that both networks learned from."""
     need_task(detector.about, "passages", "the detector")
     _need_one_camera(localiser, detector, (*SAME, "headings"))
     return overlay(DataConfig(), seen_by(localiser), "network.json")

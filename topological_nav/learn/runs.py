@@ -35,11 +35,7 @@ SAVE_EVERY_S = 60.0
 
 @contextlib.contextmanager
 def claimed(out: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """A run folder for the block: of these settings, written to config.yaml, and of this process alone.
-
-    Raises:
-        RunError: the run there has other settings.
-    """
+    """A run folder for the block: of these settings, written to config.yaml, and of this process alone."""
     path = out / CONFIG
     with alone_in(out):
         if path.is_file():
@@ -88,10 +84,6 @@ def run_epochs(
 
     Returns:
         The learner.
-
-    Raises:
-        RunError: a damaged checkpoint, or a loss that is not finite.
-        Stopped: it was asked for; the epoch before it is kept.
     """
     saved, first = read_checkpoint(out / checkpoint), 0
     if saved and saved.get("phase", phase) == phase:
@@ -143,12 +135,7 @@ def packed(content: bytes) -> bytes:
 
 
 def weights_content(run: Path) -> bytes:
-    """The msgpack of a run's weights, whether it was exported or not.
-
-    Raises:
-        OSError: there are none.
-        lzma.LZMAError: they are damaged.
-    """
+    """The msgpack of a run's weights, whether it was exported or not."""
     path = run / PACKED_WEIGHTS
     return lzma.decompress(path.read_bytes()) if path.is_file() else (run / WEIGHTS).read_bytes()
 
@@ -169,9 +156,6 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
         run: its folder.
         kind: what it should hold, network or policy, for messages.
         task: of the command that trains one.
-
-    Raises:
-        RunError: the run is not finished, or the file is damaged.
     """
     path = run / DESCRIPTION
     if not path.is_file():
@@ -183,11 +167,7 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
 
 
 def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
-    """Variables of a finished run, in the template's precision.
-
-    Raises:
-        RunError: weights.msgpack is damaged, another network's, or not what an export wrote.
-    """
+    """Variables of a finished run, in the template's precision."""
     path = run / (PACKED_WEIGHTS if (run / PACKED_WEIGHTS).is_file() else WEIGHTS)
     with readable(path, RunError, "train again"):
         content = weights_content(run)
@@ -200,11 +180,7 @@ def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
-    """A checkpoint as plain mappings; None: there is none.
-
-    Raises:
-        RunError: it is damaged.
-    """
+    """A checkpoint as plain mappings; None: there is none."""
     if not path.is_file():
         return None
     with readable(path, RunError, "delete it to begin again"):
@@ -212,11 +188,7 @@ def read_checkpoint(path: Path) -> dict[str, Any] | None:
 
 
 def _restored(template: State, state: Any, path: Path) -> State:
-    """A learner as the checkpoint at a path holds it.
-
-    Raises:
-        RunError: it is another network's.
-    """
+    """A learner as the checkpoint at a path holds it."""
     try:
         learner = flax.serialization.from_state_dict(template, state)
     except (ValueError, KeyError) as error:

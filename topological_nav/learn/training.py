@@ -66,19 +66,11 @@ class Trained:
         return self.about["digest"] + (f"-{self.about['export']['precision']}" if "export" in self.about else "")
 
     def logits(self, images: np.ndarray) -> np.ndarray:
-        """[..., outputs] of images [..., H, W, 3] u8, of the size that it learned from.
-
-        Raises:
-            RunError: images of another size.
-        """
+        """[..., outputs] of images [..., H, W, 3] u8, of the size that it learned from."""
         return self._rows(images, "__call__")
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Probability that the way ahead is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`.
-
-        Raises:
-            RunError: images of another size.
-        """
+        """Probability that the way ahead is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`."""
         logits = self.logits(images).astype(float)
         return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 
@@ -141,11 +133,6 @@ def train(
 
     Returns:
         The content of results.json.
-
-    Raises:
-        DatasetError: the dataset cannot be used.
-        RunError: `out` holds another run, or the backbone to start from does not fit.
-        Stopped: it was asked for before the end.
     """
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
@@ -218,11 +205,7 @@ def save_trained(out: Path, trained: Trained) -> Trained:
 
 
 def load_trained(run: Path) -> Trained:
-    """The network of a finished run, or of an export of one (`export`): its weights are f32 in memory either way.
-
-    Raises:
-        RunError: no such run, or it is not finished, damaged, or a passage detector of one length without saying which.
-    """
+    """The network of a finished run, or of an export of one (`export`): its weights are f32 in memory either way."""
     run = Path(run)
     about = read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:

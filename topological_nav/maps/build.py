@@ -161,9 +161,6 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
     Args:
         data: what the networks learned from.
         supersample: as asked for; None: as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
-
-    Raises:
-        UserError: the engine that they learned from is not installed.
     """
     need_engine(data.engine)
     if supersample is None:

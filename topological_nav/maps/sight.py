@@ -49,9 +49,6 @@ class NetworkSight:
             localiser: its embedding localises.
             detector: judges passages.
             match: aligned or nearest, see `config.NavigatorConfig.match`.
-
-        Raises:
-            MapError: the map was made with other networks, whose embeddings mean something else.
         """
         for name, network in (("localiser", localiser), ("detector", detector)):
             used, own = made.about.get(name, ""), network.about["digest"]

@@ -35,9 +35,6 @@ def load() -> types.SimpleNamespace:
     """The modules of ROS by their first names, messages as `std_msgs.Bool` and so on.
 
     Where the master is on loopback, this process and its children stay there too, unless ROS_IP or ROS_HOSTNAME is set.
-
-    Raises:
-        RosError: a package is missing.
     """
     if importlib.util.find_spec("rospy") is None and str(DIST_PACKAGES) not in sys.path:
         sys.path.append(str(DIST_PACKAGES))

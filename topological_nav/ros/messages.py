@@ -27,11 +27,7 @@ class MessageError(UserError):
 
 
 def set_fields(message: Any, fields: Mapping[str, Any]) -> Any:
-    """Writes nested fields into a message, and returns it.
-
-    Raises:
-        AttributeError: the message has no such field.
-    """
+    """Writes nested fields into a message, and returns it."""
     for name, value in fields.items():
         if isinstance(value, Mapping):
             set_fields(getattr(message, name), value)
@@ -56,11 +52,7 @@ def image_fields(rgb: np.ndarray) -> dict[str, Any]:
 
 
 def image_array(message: Any) -> np.ndarray:
-    """[H, W, 3] u8 RGB of a sensor_msgs/Image; rows may be padded.
-
-    Raises:
-        MessageError: an encoding that is not read, or fewer bytes than told.
-    """
+    """[H, W, 3] u8 RGB of a sensor_msgs/Image; rows may be padded."""
     order = _ORDER.get(message.encoding)
     if order is None:
         raise MessageError(f"image encoding is '{message.encoding}', expected one of {', '.join(_ORDER)}")
@@ -91,11 +83,7 @@ def camera_info_fields(lens: Lens) -> dict[str, Any]:
 
 
 def info_lens(message: Any) -> Lens:
-    """The pinhole lens of a sensor_msgs/CameraInfo, its centre and its pixels' shape taken as ideal.
-
-    Raises:
-        MessageError: the camera is not calibrated, its pixels are oblong, or its picture is distorted.
-    """
+    """The pinhole lens of a sensor_msgs/CameraInfo, its centre and its pixels' shape taken as ideal."""
     fx, fy = message.K[0], message.K[4]
     if not fy > 0:
         raise MessageError("camera_info has no focal length (K[4] is 0), expected a calibrated camera")
@@ -116,9 +104,6 @@ def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
 
     Returns:
         [h, w, 3] u8: the middle of the picture, averaged over each wanted pixel.
-
-    Raises:
-        MessageError: the wanted lens sees more than the picture shows.
     """
     height, width, _ = rgb.shape
     have = Lens(width, height, fov_deg)
@@ -173,11 +158,7 @@ def yaw_quat(yaw_rad: float) -> dict[str, float]:
 
 
 def quat_yaw(quat: Any) -> float:
-    """Yaw, rad in [-pi, pi], of a geometry_msgs/Quaternion of any length but 0.
-
-    Raises:
-        MessageError: it is 0, as a driver that knows no orientation leaves it.
-    """
+    """Yaw, rad in [-pi, pi], of a geometry_msgs/Quaternion of any length but 0."""
     x, y, z, w = quat.x, quat.y, quat.z, quat.w
     norm = x * x + y * y + z * z + w * w
     if not norm > 1e-12:
@@ -215,11 +196,7 @@ def twist_fields(linear_mps: float, angular_radps: float) -> dict[str, Any]:
 
 
 def twist_command(message: Any) -> tuple[float, float]:
-    """(m/s ahead, rad/s to the left) of a geometry_msgs/Twist; the rest a robot on wheels cannot do.
-
-    Raises:
-        MessageError: not finite.
-    """
+    """(m/s ahead, rad/s to the left) of a geometry_msgs/Twist; the rest a robot on wheels cannot do."""
     command = float(message.linear.x), float(message.angular.z)
     if not all(map(math.isfinite, command)):
         raise MessageError(f"velocity command is {command}, expected finite numbers")

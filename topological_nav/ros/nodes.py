@@ -96,11 +96,7 @@ class SimulatorNode:
         ros.rospy.Subscriber(topics.DONE, ros.std_msgs.Bool, self._on_done)
 
     def run(self, stop: Asked) -> Tally:
-        """Simulates until the navigator is done, the limit is reached or a stop is asked for.
-
-        Raises:
-            RosError: in lockstep, no command came for three minutes.
-        """
+        """Simulates until the navigator is done, the limit is reached or a stop is asked for."""
         pace, tally = self._pace, Tally()
         if pace.lockstep or pace.recorded:
             self._wait_for_others(stop)
@@ -259,11 +255,7 @@ class NavigatorNode:
         ros.rospy.Subscriber(topics.IMAGE, image, self._on_image, queue_size=1, buff_size=2**24, tcp_nodelay=True)
 
     def run(self, stop: Asked) -> bool:
-        """Drives until the driver is done (True) or a stop is asked for; the robot is stopped at the end.
-
-        Raises:
-            TopologicalError: pictures or headings cannot be read, or do not fit the driver.
-        """
+        """Drives until the driver is done (True) or a stop is asked for; the robot is stopped at the end."""
         last_s, told_s = -math.inf, -math.inf
         try:
             while not stop():

@@ -31,10 +31,6 @@ def topological_driver(
         goals: pictures taken at the goal, along headings evenly about it; as wide as what the networks learned from.
         goal_heading_rad: of the first, in the map's frame.
         config: of the navigator.
-
-    Raises:
-        MapError, RunError: map or networks cannot be used, or do not belong together.
-        ConfigError: no goal picture, or one that cannot be read.
     """
     networks, made = load_networks(seeing.localiser, seeing.detector), load_map(map_file)
     lens = lens_of(networks.camera, get_robot(networks.camera.robot))

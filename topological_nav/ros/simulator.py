@@ -59,12 +59,7 @@ class RosSimulator:
     range_min_m, lidar_pos_m = LIDAR_NEAR_M, LIDAR_POS_M
 
     def __init__(self, scene: Path, config: SimulatorConfig):
-        """Builds the world and places the robot; compiles.
-
-        Raises:
-            SceneError: the scene cannot be used.
-            UserError: the start is not free, or the engine is not installed.
-        """
+        """Builds the world and places the robot; compiles."""
         need_engine(config.engine)
         self.config = config
         self._env = interactive_nav.make(
@@ -105,11 +100,7 @@ class RosSimulator:
         return self._env.robot.camera.pos_m
 
     def step(self, linear_mps: float, angular_radps: float) -> Sensed:
-        """Drives for one control step; commands beyond what the robot can do are cut.
-
-        Raises:
-            UserError: the physics broke down.
-        """
+        """Drives for one control step; commands beyond what the robot can do are cut."""
         self._force_before = float(self._state.info["nav"].force_sum_n)
         action = self._env.robot.drive(jnp.float32(linear_mps), jnp.float32(angular_radps), jnp)
         self._state = self._step(self._state, action)

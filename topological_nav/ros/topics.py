@@ -70,11 +70,7 @@ class Headings:
         return self._told[-1][0] if self._told else -math.inf
 
     def at(self, time_s: float) -> float:
-        """Heading, rad in [-pi, pi]: turned evenly between two tellings, else the nearest one.
-
-        Raises:
-            ValueError: none was told yet.
-        """
+        """Heading, rad in [-pi, pi]: turned evenly between two tellings, else the nearest one."""
         if not self._told:
             raise ValueError("no heading was told yet")
         times, yaws = np.array(self._told).T

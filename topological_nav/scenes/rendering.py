@@ -41,9 +41,6 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
         xy_w: [..., 2] m, of the base.
         heading_rad: [...], yaw of the base.
         pitch_rad: [...], how far up the camera looks beside its mount's own pitch.
-
-    Raises:
-        UserError: the robot's camera is carried by another link.
     """
     camera = robot.camera
     if camera.body != robot.base_body:
@@ -62,11 +59,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 
 
 def need_engine(engine: str) -> None:
-    """Refuses an engine of pictures or physics that is not installed, before any work is done for it.
-
-    Raises:
-        UserError: it is `warp`, and the package warp-lang is not there.
-    """
+    """Refuses an engine of pictures or physics that is not installed, before any work is done for it."""
     if engine == "warp":
         note = "; networks see by the engine that they learned from, what is drawn anew can have engine=gl"
         optional("warp", missing("engine=warp", "warp-lang", "warp", note))
@@ -86,9 +79,6 @@ class SceneRenderer:
             supersample: images are drawn this many times larger along each side and averaged.
             engine: warp or gl.
             small: small objects, out of sight where they are not placed.
-
-        Raises:
-            UserError: the engine does not start here.
         """
         need_engine(engine)
         self._lens, self._by = lens, supersample

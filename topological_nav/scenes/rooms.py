@@ -58,9 +58,6 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
         method: kmeans, gmm (full covariances, five starts) or spectral (ten nearest neighbours).
         count: of clusters.
         seed: of their starts.
-
-    Raises:
-        ConfigError: another method, or more clusters than points.
     """
     if method not in METHODS:
         raise ConfigError(f"method is '{method}', expected one of {', '.join(METHODS)}")
@@ -108,9 +105,6 @@ def find_rooms(
         known: [k, 4] recorded rooms (x0, y0, x1, y1), if there are any.
         seed: of positions and clustering.
         clearance_m: of the positions.
-
-    Raises:
-        SpaceError: too little free space for that many rooms.
     """
     centres = space.centres(clearance_m)
     rng = np.random.default_rng([seed, 1])

@@ -59,9 +59,6 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
         backend: of physics.
         radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
         objects: small objects that are strewn about.
-
-    Raises:
-        UserError: the backend is not installed.
     """
     need_engine(backend)
     config = NavConfig.of(

@@ -65,11 +65,7 @@ class FreeSpace:
         return np.asarray((self.at(along) >= max(margin_m, _FREE_M) - 1e-9).all(-1))
 
     def sample(self, rng: np.random.Generator, count: int, least_m: float) -> np.ndarray:
-        """[count, 2] m: different cell centres with at least this clearance, uniform over them.
-
-        Raises:
-            SpaceError: there are fewer.
-        """
+        """[count, 2] m: different cell centres with at least this clearance, uniform over them."""
         centres = self.centres(least_m)
         if len(centres) < count:
             raise SpaceError(

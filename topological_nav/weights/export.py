@@ -98,11 +98,6 @@ def export(
         out: the folder.
         config: limits.
         progress: told what is drawn or done, how much of it and in all; may raise to stop.
-
-    Raises:
-        RunError: a run cannot be used, lacks commit or device, or does not survive half precision; or the folder would
-            be too large.
-        MapError: a map was made with other networks.
     """
     out = _free_place(out)
     runs = {"rooms": Path(localiser), "passages": Path(detector)} | ({"policy": Path(policy)} if policy else {})
@@ -163,11 +158,7 @@ def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
 
 
 def half(variables: Any) -> Any:
-    """Variables with every array of two or more axes in half precision.
-
-    Raises:
-        RunError: a number is too large for it.
-    """
+    """Variables with every array of two or more axes in half precision."""
 
     def halved(path: Any, leaf: Any) -> np.ndarray:
         value = np.asarray(leaf)
@@ -240,9 +231,6 @@ def level_images(
         networks: localiser and detector: a scene is drawn as they learned to see.
         places: at most so many, of a dataset evenly from all.
         progress: told what is drawn, images done and in all; may raise to stop.
-
-    Raises:
-        TopologicalError, SceneError: the source cannot be used.
     """
     source = Path(source)
     if (source / "dataset.json").is_file():

@@ -63,9 +63,6 @@ def choose(
         detector: the same.
         policy: the same, or `PASSAGE_POLICY`.
         needs: rooms and passages, or the one that is looked at.
-
-    Raises:
-        RunError: neither place has them.
     """
     given = {"rooms": localiser, "passages": detector}
     missing = [task for task in needs if given[task] is None]
@@ -96,11 +93,7 @@ def choose(
 
 
 def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
-    """The first map of a scene that these networks can use; None: there is none.
-
-    Raises:
-        RunError: a run is not finished, or damaged.
-    """
+    """The first map of a scene that these networks can use; None: there is none."""
     networks = [read_description(run, "network", "TASK")["digest"] for run in (choice.localiser, choice.detector)]
     for folder in choice.maps:
         path = folder / f"{scene}.npz"

@@ -28,11 +28,7 @@ EPISODES_DRAWN = 6
 
 
 class Results:
-    """The files under a folder of results, by what they hold.
-
-    Raises:
-        FileError: there is nothing to draw, or a file cannot be read.
-    """
+    """The files under a folder of results, by what they hold."""
 
     def __init__(self, root: Path):
         self.root = root

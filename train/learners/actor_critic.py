@@ -52,9 +52,6 @@ class ActorCritic(abc.ABC):
     def of(cls, env: Any, config: TrainConfig) -> Self:
         """The networks and settings for an environment's observations and actions; with images the critics look
         through one encoder.
-
-        Raises:
-            ConfigError: images too small for the convolutions, or nothing for the critics to see.
         """
         c, network, size = getattr(config, cls.SECTION), config.network, env.observation_size
         distribution = cls.distribution(env.action_size)

@@ -33,10 +33,6 @@ class Algorithm:
             env: natively batched and resetting itself (`interactive_nav.task.wrappers.AutoResetEnv`).
             config: resolved, see `train.config.resolve`.
             callbacks: progress, files and signals.
-
-        Raises:
-            ConfigError: the networks do not fit, or a replay would take more memory than allowed.
-            DivergedError: see `train.learners.learner.run_loop`.
         """
         agent = self.make_agent(env, config)
         begin = self.start(agent, env, config.run.seed)

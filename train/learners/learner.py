@@ -117,9 +117,6 @@ def run_loop(
         steps_per_update: environment steps that one update takes.
         run: lengths and intervals, in environment steps.
         callbacks: see `Callbacks`.
-
-    Raises:
-        DivergedError: the learner is no longer finite; the batch was handed to `on_diverged`.
     """
     total = whole_updates(run.num_timesteps, steps_per_update)
     log_every = whole_updates(run.log_every_steps, steps_per_update)

@@ -200,11 +200,7 @@ def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
 def make_encoder(
     config: NetworkConfig, size: ObservationSize, images: bool, prepare: Callable[[Any, Any], Any]
 ) -> FeedForwardNetwork:
-    """What comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F].
-
-    Raises:
-        ConfigError: images too small for the convolutions, or nothing to encode.
-    """
+    """What comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F]."""
     assert isinstance(size, Mapping)
     check_image_size(config, size)
     if not images and "state" not in size:
@@ -301,9 +297,6 @@ def make_ppo_networks(
         policy_sizes: hidden layers, behind the encoder if there is one.
         value_sizes: likewise.
         normalize_observations: whether the vector is normalised.
-
-    Raises:
-        ConfigError: see `make_encoder`.
     """
     prepare = preprocess(normalize_observations)
     if not isinstance(size, Mapping):

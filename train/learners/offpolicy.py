@@ -146,9 +146,6 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
         agent: see `ActorCritic`.
         env: natively batched and resetting itself.
         seed: of the run.
-
-    Raises:
-        ConfigError: the replay would take more memory than allowed.
     """
     c = agent.config
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)

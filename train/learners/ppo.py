@@ -96,11 +96,7 @@ class PPOParts:
 
 
 def make_agent(env: Any, config: TrainConfig) -> PPOParts:
-    """Networks and optimiser for an environment's observations and actions.
-
-    Raises:
-        ConfigError: the encoders do not fit the images.
-    """
+    """Networks and optimiser for an environment's observations and actions."""
     network, size, c = config.network, env.observation_size, config.ppo
     made = nets.make_ppo_networks(
         network,

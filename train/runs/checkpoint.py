@@ -49,9 +49,6 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
     """Writes `root/<env steps>/` and removes what is no longer kept: the newest `keep` stay, and the best.
 
     Only the newest holds the environments, and only if they take no more than the limit.
-
-    Raises:
-        FileError: the disk is full or not writable; older checkpoints are untouched.
     """
     final = root / f"{meta.env_steps:012d}"
     partial = root / f".partial-{meta.env_steps:012d}"
@@ -101,11 +98,7 @@ def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
 
 
 def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
-    """A checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best.
-
-    Raises:
-        CheckpointError: there is none such.
-    """
+    """A checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best."""
     every = list_checkpoints(root)
     if not every:
         raise CheckpointError(f"{root}: holds no checkpoint; train the run first, until its first checkpoint")
@@ -123,11 +116,7 @@ def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
 
 
 def read_meta(folder: Path) -> CheckpointMeta:
-    """What a checkpoint is of.
-
-    Raises:
-        CheckpointError: its `meta.json` is damaged.
-    """
+    """What a checkpoint is of."""
     reader = Reader(CheckpointError, "remove this checkpoint", finite=False)
     return reader.record(reader.json(folder / META), CheckpointMeta, str(folder / META))
 
@@ -161,11 +150,7 @@ def weights_digest(folder: Path) -> str:
 
 
 def load_learner(folder: Path, template: Any) -> Any:
-    """The learner of a checkpoint, as arrays in the template's structure; of an exported one only the policy counts.
-
-    Raises:
-        CheckpointError: damaged, or of other networks than the template's.
-    """
+    """The learner of a checkpoint, as arrays in the template's structure; of an exported one only the policy counts."""
     path = folder / LEARNER
     if not is_whole(folder):
         path = folder / policy_file.POLICY
@@ -191,11 +176,7 @@ def load_learner(folder: Path, template: Any) -> Any:
 
 
 def load_env_state(folder: Path, template: Any) -> Any | None:
-    """The environments of a checkpoint in the template's structure; None if it has none that fit it.
-
-    Raises:
-        CheckpointError: the file is damaged.
-    """
+    """The environments of a checkpoint in the template's structure; None if it has none that fit it."""
     path = folder / ENV_STATE
     if not path.is_file():
         return None

@@ -95,11 +95,7 @@ def write(source: Path, algorithm: str, target: Path, step: float = STEP) -> Non
 
 
 def read(path: Path, template: Any) -> Any:
-    """A learner in the template's structure whose policy is the file's; what acting does not read is the template's.
-
-    Raises:
-        CheckpointError: damaged, or of another learner.
-    """
+    """A learner in the template's structure whose policy is the file's; what acting does not read is the template's."""
     with readable(path, CheckpointError, "export the run again"), np.load(path, allow_pickle=False) as stored:
         leaves = unpacked({name: stored[name] for name in stored.files})
     own = flax.serialization.to_state_dict(template)

@@ -38,11 +38,7 @@ from train.runs.run_folder import GOES_ON, RunFolder, claim
 
 
 def make_env(config: EnvConfig) -> Any:
-    """The environment that a config describes: one, not batched, not resetting itself.
-
-    Raises:
-        ConfigError: an unknown robot, an unusable scene, or settings that do not fit each other.
-    """
+    """The environment that a config describes: one, not batched, not resetting itself."""
     keep_programs()
     try:
         return interactive_nav.make(**flatten(config))
@@ -62,9 +58,6 @@ def config_to_play(
         words: `env.key=value`; a backend that they name is taken as it is.
         scenes: folders or sets of scenes; None: those that it was trained on.
         console: told of another backend.
-
-    Raises:
-        UserError: the folder is no run, or a word is wrong.
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.

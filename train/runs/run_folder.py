@@ -65,12 +65,7 @@ class RunFolder:
         self.lock = path / "lock"
 
     def read_config(self) -> TrainConfig:
-        """The resolved config of the run.
-
-        Raises:
-            FileError: the folder is no run.
-            ConfigError: its config does not fit this version.
-        """
+        """The resolved config of the run."""
         if not self.config.is_file():
             raise FileError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
         try:
@@ -87,9 +82,6 @@ class RunFolder:
 
         Returns:
             True where the run exists already.
-
-        Raises:
-            FileError: the run exists with another value of a setting that decides its meaning.
         """
         exists = self.config.is_file()
         if exists:
@@ -105,22 +97,14 @@ class RunFolder:
         return exists
 
     def origin(self) -> dict[str, Any]:
-        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known.
-
-        Raises:
-            FileError: summary.json or versions.json is damaged.
-        """
+        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known."""
         found = {}
         for path, kind in ((self.summary, _Summary), (self.path / VERSIONS, _Versions)):
             found |= dataclasses.asdict(RUNS.record(RUNS.json(path, {}), kind, str(path), others=True))
         return {**found, "device": (found["device"] or {}).get("kind")}
 
     def append_metrics(self, line: dict[str, Any]) -> None:
-        """Adds one line to metrics.jsonl.
-
-        Raises:
-            FileError: the disk is full or no longer writable.
-        """
+        """Adds one line to metrics.jsonl."""
         with writing(self.metrics, GOES_ON), open(self.metrics, "a") as file:
             file.write(json.dumps(line) + "\n")
 
@@ -140,9 +124,6 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
     Args:
         path: made with its parents.
         needed_mb: room that the run will need, beside some head room.
-
-    Raises:
-        FileError: it cannot be made or written, or the disk is too full.
     """
     needed_mb += HEADROOM_MB
     with writing(path, "expected a writable folder (run.out_dir)"):

@@ -23,11 +23,7 @@ ID_FILE = "wandb_id"
 
 
 def import_wandb() -> Any:
-    """The package.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """The package."""
     return optional("wandb", missing("run.wandb=true", "wandb", "wandb", ", or set run.wandb=false"))
 
 
@@ -65,9 +61,6 @@ class Tracker:
         folder: of the run; remembers the run's id, and holds its files.
         config: of the run.
         versions: packages, device and commit.
-
-    Raises:
-        ConfigError: not installed, not logged in, or not reachable.
     """
 
     def __init__(self, folder: Path, config: TrainConfig, versions: dict[str, Any]):

@@ -63,11 +63,7 @@ def told(env: Any) -> PlayedEnv:
 
 
 def named(word: str) -> str:
-    """`name=module:factory` of a word of `--policy`; the name is the module's and factory's where none is given.
-
-    Raises:
-        ConfigError: not such a word.
-    """
+    """`name=module:factory` of a word of `--policy`; the name is the module's and factory's where none is given."""
     name, equals, place = word.rpartition("=")
     module, _, factory = place.rpartition(":")
     if not module or not factory.isidentifier():
@@ -120,9 +116,6 @@ class BroughtPolicy(HostPolicy):
     Args:
         word: `name=module:factory`.
         env: one environment, not batched.
-
-    Raises:
-        PolicyError: no such factory, or it raises or returns nothing that can be called.
     """
 
     def __init__(self, word: str, env: Any):

@@ -91,9 +91,6 @@ class Planner(HostPolicy):
     Args:
         env: one environment, not batched.
         weight: of `Ways`; 0 pushes what stands in the shortest way, None never pushes: the avoider.
-
-    Raises:
-        UserError: the robot takes no base velocity, or a weight outside [0, 1].
     """
 
     def __init__(self, env: Any, weight: float | None):

@@ -60,11 +60,7 @@ def make_random(env: Any) -> PolicyFn:
 
 
 def make_follower(env: Any) -> PolicyFn:
-    """The baseline that follows the shortest path.
-
-    Raises:
-        UserError: the observation has no waypoints, or the robot's control mode takes no base velocity.
-    """
+    """The baseline that follows the shortest path."""
     config = env.config
     need_twist(env.robot, "policy follower")
     if "waypoints" not in config.sensors.observations:
@@ -82,11 +78,7 @@ PLANNERS = ("avoider", "namo:W")
 
 
 def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
-    """A policy or planner that never learns, by name: random, follower, avoider or namo:W.
-
-    Raises:
-        UserError: unknown name or weight, or a robot or observations that it cannot use.
-    """
+    """A policy or planner that never learns, by name: random, follower, avoider or namo:W."""
     if name in BASELINES:
         return BASELINES[name](env)
     if name == "avoider":

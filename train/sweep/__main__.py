@@ -34,11 +34,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
-    """Where jobs are to run.
-
-    Raises:
-        ConfigError: Ray is wanted and missing, or its cluster cannot be reached.
-    """
+    """Where jobs are to run."""
     if name == "ray":
         from interactive_nav_common.jobs.on_ray import RayLauncher
 

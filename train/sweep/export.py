@@ -54,9 +54,6 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
     Returns:
         Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
         over its rows, on test scenes where there are any.
-
-    Raises:
-        FileError: it cannot be written, or no run has begun.
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
     if not runs:

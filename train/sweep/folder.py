@@ -65,11 +65,7 @@ class SweepFolder:
         self.rows, self.runs = self.root / "rows", self.root / "runs"
 
     def prepare(self) -> None:
-        """Makes the folder, writes the config of each run, and removes what killed evaluations left.
-
-        Raises:
-            FileError: it cannot be written.
-        """
+        """Makes the folder, writes the config of each run, and removes what killed evaluations left."""
         for run in self.sweep.runs:
             write_text(self.config(run.name), to_yaml(run.config))
         for name in ("runs", "rows", "logs", "locks", "failed"):

@@ -139,21 +139,13 @@ class Sweep:
 
 
 def load(name_or_path: str) -> Sweep:
-    """Reads a sweep by name or path.
-
-    Raises:
-        ConfigError: no such file, or something in it cannot be run.
-    """
+    """Reads a sweep by name or path."""
     path, plain = config_io.read_file(name_or_path, SWEEP_DIR, "sweep")
     return expand(read(plain, path.name, path.stem), path.name)
 
 
 def read(plain: Any, where: str, default_name: str) -> SweepConfig:
-    """The typed sweep of nested plain values.
-
-    Raises:
-        ConfigError: an unknown key, a wrong type or a value out of range.
-    """
+    """The typed sweep of nested plain values."""
     config = overlay(SweepConfig(), plain, where)
     check_name(config.name or default_name, f"{where}: name", ConfigError)
     if not config.preset:
@@ -163,11 +155,7 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
-    """Every run of a sweep with its complete config.
-
-    Raises:
-        ConfigError: a setting that does not exist, a value it cannot have, or two runs of one name.
-    """
+    """Every run of a sweep with its complete config."""
     settings_known = list(flatten(TrainConfig()))
     for axis, values in config.grid.items():
         if axis not in settings_known:
@@ -213,9 +201,6 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
         sweep: expanded.
         where: `setting=value[,value]` words; a run must match them all.
         shard: `I/N`, every N-th run beginning with the I-th (from 0); None: all.
-
-    Raises:
-        ConfigError: another axis or value than the grid's, or a shard that is none.
     """
     runs = list(sweep.runs)
     for word in where:

@@ -101,11 +101,7 @@ class BuildingConfig:
     """Texture resolution."""
 
     def validate(self) -> BuildingConfig:
-        """Returns itself, or raises.
-
-        Raises:
-            GenerationError: a range is upside down, a number is negative, a CAD model is unknown or missing.
-        """
+        """Returns itself, or raises."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, tuple) and field.name not in NAMES and not 0 <= value[0] <= value[1]:

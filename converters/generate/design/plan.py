@@ -349,9 +349,6 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
 
     Returns:
         A plan whose rooms are all joined by doorways.
-
-    Raises:
-        GenerationError: no layout of that many rooms fits into that area.
     """
     for _ in range(max_tries):
         inside, rooms, walls, corridor = _layout(cfg, rng, parts)

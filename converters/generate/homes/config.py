@@ -61,12 +61,7 @@ class HomeConfig:
         return {robot: wanted for robot, wanted in asked.items() if wanted is not None}
 
     def validate(self) -> HomeConfig:
-        """Returns itself, or raises.
-
-        Raises:
-            GenerationError: an unknown tier or kind of artefacts, a share that is none, a range upside down, or a shell
-                that `BuildingConfig` refuses.
-        """
+        """Returns itself, or raises."""
         if self.tier not in TIERS:
             raise GenerationError(f"tier is '{self.tier}': expected one of {', '.join(TIERS)}")
         self.shell.validate()
@@ -106,9 +101,6 @@ def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = H
         tier: key of `TIERS`.
         settings: by name, of `home_fields`.
         models: names of the CAD models that may be used.
-
-    Raises:
-        GenerationError: an unknown tier, or settings that `HomeConfig.validate` refuses.
     """
     if tier not in TIERS:
         raise GenerationError(f"tier is '{tier}': expected one of {', '.join(TIERS)}")

@@ -36,12 +36,7 @@ class Furnished:
 
 
 def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Furnished:
-    """Draws and furnishes a home, its shares as asked for.
-
-    Raises:
-        GenerationError: no plan for such rooms, or none of several takes as much furniture as asked for, or stands as
-            much in the way; the message is that of the last.
-    """
+    """Draws and furnishes a home, its shares as asked for."""
     cfg.validate()
     refused: GenerationError | None = None
     full = 0

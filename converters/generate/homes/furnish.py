@@ -246,11 +246,7 @@ def _clutter(home: Home, room: int) -> bool:
 
 
 def grow(home: Home) -> None:
-    """Adds furniture to the rooms that are emptiest for their use until the share is met.
-
-    Raises:
-        Full: nothing more fits.
-    """
+    """Adds furniture to the rooms that are emptiest for their use until the share is met."""
     rng, cfg, floor = home.rng, home.cfg, home.floor
     tired: set[tuple[int, str]] = set()
     radius_m = WIDE_M
@@ -289,11 +285,7 @@ def grow(home: Home) -> None:
 
 
 def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Generator) -> Home:
-    """Furnishes a plan, whose rooms have these uses; the home has its furniture on its floor.
-
-    Raises:
-        GenerationError: too few doors hang, a room lacks what it needs, or the share is not met.
-    """
+    """Furnishes a plan, whose rooms have these uses; the home has its furniture on its floor."""
     lacking = ""
     for _ in range(MOST_BASES):
         doors = hang_doors(plan, cfg.shell, rng, [k for k, use in enumerate(uses) if use in PRIVATE])

@@ -160,9 +160,6 @@ def adjust(home: Home) -> dict[str, float]:
 
     Returns:
         Robot -> share of pairs between which it must push.
-
-    Raises:
-        GenerationError: the ranges are not reached.
     """
     rng, passages = home.rng, Passages(home)
     wanted = home.cfg.must_push

@@ -107,11 +107,7 @@ def assign_uses(plan: Plan, wanted: list[str]) -> tuple[list[str], float]:
 
 
 def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list[str]]:
-    """The plan of a home, and the use of each of its rooms.
-
-    Raises:
-        GenerationError: that many rooms do not fit into that area.
-    """
+    """The plan of a home, and the use of each of its rooms."""
     found, refused = [], None
     for k in range(PROGRAMMES):
         n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))

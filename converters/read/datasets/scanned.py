@@ -64,9 +64,6 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
         name: of `COLLECTIONS`.
         root: the scene's folder, as its collection lays it out.
         strict: refuse what would be repaired with a warning.
-
-    Raises:
-        SceneRejected: missing or damaged files, or scenezoo is not installed.
     """
     source, about = SourceFolder(root, strict), COLLECTIONS[name]
     library = optional("scenezoo", missing(f"{root}: {name}", "scenezoo", "datasets"), SceneRejected)
@@ -129,11 +126,7 @@ def label_of(name: str) -> int:
 
 
 def _of_vertices(source: SourceFolder, found: Any, count: int, faces: np.ndarray) -> np.ndarray:
-    """(n,) NYU40 id of each vertex.
-
-    Raises:
-        SceneRejected: another number of labels than the mesh has vertices or faces.
-    """
+    """(n,) NYU40 id of each vertex."""
     labels = np.asarray(found.labels)
     labels = labels if labels.ndim == 1 else labels[:, 0]
     wanted = count if found.domain == "vertex" else len(faces)

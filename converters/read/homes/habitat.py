@@ -46,11 +46,7 @@ def root_of(scene: Path) -> Path:
 
 
 def read_habitat(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
-    """Reads the only scene of a folder, or the chosen one.
-
-    Raises:
-        SceneRejected: none or several scenes, a missing or damaged file, or a value of the wrong kind.
-    """
+    """Reads the only scene of a folder, or the chosen one."""
     source = SourceFolder(root, strict)
     scenes = [chosen] if chosen else scenes_of(root)
     if len(scenes) != 1:

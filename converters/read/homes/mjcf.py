@@ -61,9 +61,6 @@ def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, with
         strict: refuse what would be repaired with a warning.
         chosen: file.
         within: folder that may be read; default `root`.
-
-    Raises:
-        SceneRejected: none or several, one that MuJoCo refuses, or it names a file outside of the folder.
     """
     source = SourceFolder(within or root, strict, REMEDY)
     mains = [chosen] if chosen else mains_of(root)
@@ -90,11 +87,7 @@ class _Files:
     """Elements of the largest model to attach."""
 
     def whole(self, path: Path) -> str:
-        """The text of an MJCF with its includes. Names mean what they mean to MuJoCo (its `xml_native_reader.cc`).
-
-        Raises:
-            SceneRejected: a file is missing, no MJCF, included twice, or lies outside of the source.
-        """
+        """The text of an MJCF with its includes. Names mean what they mean to MuJoCo (its `xml_native_reader.cc`)."""
         main = Path(os.path.abspath(path))
         root = self._parse(main)
         if root.tag != "mujoco":

@@ -105,9 +105,6 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         layout: of the source.
         parts: at least one.
         floors_m: heights of its storeys' floors from the lowest up; empty: it has one, which is found.
-
-    Raises:
-        SceneRejected: nothing built in that has a floor.
     """
     bounds = [_bounds(part) for part in parts]
     whole = joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])

@@ -51,9 +51,6 @@ def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, withi
         strict: refuse what would be repaired with a warning.
         chosen: file.
         within: folder that may be read; default `root`.
-
-    Raises:
-        SceneRejected: none or several worlds, a missing or damaged file, or a number that is none.
     """
     source = SourceFolder(within or root, strict)
     worlds = [chosen] if chosen else worlds_of(root)

@@ -80,9 +80,6 @@ def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> R
         root: folder, or the file.
         strict: refuse what would be repaired with a warning.
         chosen: file.
-
-    Raises:
-        SceneRejected: no drawing or several, a damaged archive, one too large, or a number that is none.
     """
     files = [chosen] if chosen else [root] if root.is_file() else sorted(root.glob(f"*{ENDING}"))
     if len(files) != 1 or not files[0].is_file():

@@ -26,9 +26,6 @@ def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
         path: of the archive.
         folder: where to.
         budget: bytes that may still be written, of this archive and those within it; counted down.
-
-    Raises:
-        SceneRejected: a damaged archive, a name that leads out of it, too many files or too many bytes.
     """
     budget = [UNPACKED] if budget is None else budget
     try:
@@ -53,11 +50,7 @@ def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
 
 
 def read_xml(path: Path, folder: Path) -> ElementTree.Element:
-    """The root of a drawing's `Home.xml`.
-
-    Raises:
-        SceneRejected: none (files before version 5.3), damaged, or one that declares entities.
-    """
+    """The root of a drawing's `Home.xml`."""
     if not (folder / HOME).is_file():
         raise SceneRejected(f"{path}: has no {HOME}; open it in Sweet Home 3D 5.3 or later and save it again")
     data = (folder / HOME).read_bytes()
@@ -73,11 +66,7 @@ def read_xml(path: Path, folder: Path) -> ElementTree.Element:
 
 
 def model_path(folder: Path, name: str, budget: list[int]) -> str | None:
-    """Path in the folder of the model or image that an element names, unpacked from an archive within if need be.
-
-    Raises:
-        SceneRejected: an archive within that is damaged or too large.
-    """
+    """Path in the folder of the model or image that an element names, unpacked from an archive within if need be."""
     first, _, rest = name.partition("/")
     if not first or ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute() or "\0" in name:
         return None
@@ -105,11 +94,7 @@ def called(element: ElementTree.Element) -> str:
 
 
 def number(element: ElementTree.Element, key: str, default: float | None = None) -> float:
-    """A number of an element.
-
-    Raises:
-        SceneRejected: absent without a default, none, not finite or beyond `MOST`.
-    """
+    """A number of an element."""
     text = element.get(key)
     if text is None and default is not None:
         return default

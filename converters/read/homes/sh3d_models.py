@@ -127,11 +127,7 @@ class Models:
         return plain, None
 
     def surface(self, element: ElementTree.Element) -> tuple[TexturedMesh, np.ndarray]:
-        """A piece's surface in its own frame, and the (m,) group of each face.
-
-        Raises:
-            SceneRejected: no usable size or turn.
-        """
+        """A piece's surface in its own frame, and the (m,) group of each face."""
         size = metres(element, "width", "height", "depth")
         if not (size >= 0).all() or not 0 < size.max() < EXTENT_M:
             raise SceneRejected(f"{called(element)}: is {100 * size} cm large; mend the drawing")
@@ -192,11 +188,7 @@ class Models:
         return TexturedMesh(vertices, mesh.faces, None, None)
 
     def _deformed(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of a model whose parts are opened, turned or slid as drawn.
-
-        Raises:
-            SceneRejected: a matrix that is none.
-        """
+        """Vertices and faces of a model whose parts are opened, turned or slid as drawn."""
         vertices, faces = model.vertices, model.faces
         for child in element.findall("transformation"):
             name = (child.get("name") or "?")[:60]
@@ -248,11 +240,7 @@ def _by_place(model: Model, element: ElementTree.Element, faces: np.ndarray, siz
 
 
 def _rotation(element: ElementTree.Element) -> np.ndarray:
-    """(3, 3) that turns the model's own axes upright; the identity where it is not given.
-
-    Raises:
-        SceneRejected: no rotation.
-    """
+    """(3, 3) that turns the model's own axes upright; the identity where it is not given."""
     turn = _numbers(element, "modelRotation", element.get("modelRotation") or "1 0 0 0 1 0 0 0 1")
     turn = turn.reshape(3, 3) if len(turn) == 9 else np.zeros((3, 3))
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
@@ -261,11 +249,7 @@ def _rotation(element: ElementTree.Element) -> np.ndarray:
 
 
 def _numbers(element: ElementTree.Element, what: str, text: str) -> np.ndarray:
-    """(n,) numbers of a list.
-
-    Raises:
-        SceneRejected: one that is none.
-    """
+    """(n,) numbers of a list."""
     name = element.get("name") or element.get("id") or "?"
     return np.array(
         [number(ElementTree.Element(element.tag, {"name": name, what: word}), what) for word in text.split()]

@@ -79,9 +79,6 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
         elements: `<wall>`.
         base_m: level -> height of its floor.
         note: takes a word on what is dropped.
-
-    Raises:
-        SceneRejected: a number that is none.
     """
     walls: list[Wall] = []
     pieces: dict[str, list[int]] = {}
@@ -259,11 +256,7 @@ class Room:
 
 
 def read_room(element: ElementTree.Element, look: Callable[[ElementTree.Element, str, str], Look]) -> Room | None:
-    """A room; None where its outline encloses nothing.
-
-    Raises:
-        SceneRejected: a number that is none.
-    """
+    """A room; None where its outline encloses nothing."""
     points = [point(e) for e in element.findall("point")]
     plan = shapely.make_valid(shapely.Polygon(points)) if len(points) > 2 else shapely.Polygon()
     plan = shapely.union_all([p for p in shapely.get_parts(plan) if shapely.get_type_id(p) in (3, 6)])

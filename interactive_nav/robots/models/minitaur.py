@@ -67,9 +67,6 @@ def minitaur(control_mode: str = "native") -> RobotSpec:
         control_mode: `native` or `position`, eight desired motor angles; `velocity` or `torque` of the motors;
             `leg`, swing of the four legs, then their extension; or `twist`, linear and angular velocity of the
             base through a scripted trot.
-
-    Raises:
-        ConfigError: unknown mode.
     """
     parts = (("motor", LEGS.home[0]), ("knee", _KNEE_HOME_RAD))
     home = tuple((joint.replace("motor", part), value) for joint in LEGS.joints for part, value in parts)
