@@ -221,7 +221,7 @@ def _image_files(out: Path, name: str, index: int, drives: Drives, config: Drive
 
 
 def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields the kept drives of a folder, some at a time: indices [k] among all, images [F, H, W, 3] u8 of their steps."""
+    """Yield the kept drives of a folder, some at a time: indices [k] and images [F, H, W, 3] u8 of their steps."""
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
     files = [
