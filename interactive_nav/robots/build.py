@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from interactive_nav.robots.files import read_file
 from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo, wheel_twist
 from interactive_nav_common.errors import ConfigError
 
@@ -98,16 +99,6 @@ class _Limits:
 
     range: tuple[float, float] | None
     effort: float
-
-
-def read_file(path: Path) -> mujoco.MjSpec:
-    """Parses an MJCF or URDF file."""
-    if not path.is_file():
-        raise ConfigError(f"robot file {path} does not exist, expected an MJCF or URDF file")
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigError(f"robot file {path}: MuJoCo cannot read it ({str(error).splitlines()[0]})") from error
 
 
 def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
@@ -296,10 +287,10 @@ class _Mode:
             _set_mode(child.actuator(joint.name), self.kind[i], joint, self.limits[i], bounds.get(i))
 
 
-def _load(base: WheeledBase, prepare: Callable[[mujoco.MjSpec], None] | None) -> mujoco.MjSpec:
+def _load(base: WheeledBase, base_body: str, prepare: Callable[[mujoco.MjSpec], None] | None) -> mujoco.MjSpec:
     """The robot's file, parsed and prepared; it has a joint and an actuator of each driven joint's name."""
     path = base.path or FOLDER / f"{base.name}.xml"
-    child = read_file(path)
+    child = read_file(path, base_body)
     if prepare is not None:
         prepare(child)
     missing = [j.name for j in base.joints if child.joint(j.name) is None or child.actuator(j.name) is None]
@@ -339,12 +330,12 @@ def wheeled_robot(
     """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"
-    child = _load(base, prepare)
+    child = _load(base, base_body, prepare)
     mode = _mode(base, child, control_mode)
     free = next(j.name for j in child.body(base_body).joints)
 
     def add_to(world: mujoco.MjSpec) -> None:
-        own = _load(base, prepare)
+        own = _load(base, base_body, prepare)
         mode.set_servos(own)
         attach(world, own, prefix)
 

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 
-from interactive_nav.robots.build import FOLDER, read_file
+from interactive_nav.robots.build import FOLDER
+from interactive_nav.robots.files import read_file
 from interactive_nav.robots.spec import (
     ControlLaw,
     Figures,

@@ -14,7 +14,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, read_file, stand, wheeled_robot
+from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, stand, wheeled_robot
+from interactive_nav.robots.files import compiled, read_file
 from interactive_nav.robots.repair import Facts, Wheel, complete, find, strip
 from interactive_nav.robots.spec import RobotCamera, RobotSpec
 from interactive_nav_common.errors import ConfigError
@@ -27,7 +28,7 @@ _LARGEST_WHEEL_M = 2.0
 
 
 def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mapping[str, int]) -> Facts:
-    model = child.copy().compile()
+    model = compiled(child, path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     found = []
@@ -159,7 +160,7 @@ def _factory(
             change(parsed)
 
     assert base.path is not None
-    change(read_file(base.path))
+    change(read_file(base.path, base_body))
     build = functools.partial(
         wheeled_robot,
         base,
@@ -231,7 +232,7 @@ def from_file(
         casters: bodies (links) that are spheres without friction on the floor.
         joints: other driven joints -> largest speed, rad/s (m/s for a slide); modes `whole_body`, `velocity`,
             `position`, `torque` drive them, others hold them at home.
-        home: joint -> position at the start of an episode.
+        home: joint -> position at the start of an episode; joints that nothing drives stay there.
         torque_limits: joint -> N m (N) where the file has no limit or a wrong one.
         camera: by default at the middle of the base's top, looking ahead.
         body_width_m: success distance; by default the model's width.
@@ -247,12 +248,12 @@ def from_file(
     _check(name, max_wheel_speed_rad_s, {"body_width_m": body_width_m, "track_m": track_m} | speeds)
     sides = _sides(left_wheels, right_wheels)
     driven, limits, path = dict(joints or {}), dict(torque_limits or {}), Path(path).resolve()
-    child = read_file(path)
+    child = read_file(path, base_body)
     for joint in (*sides, *driven, *(home or {}), *limits):
         find(child, path, "joint", joint)
     strip(child, path, base_body)
     facts = _read_facts(child, path, base_body, sides)
     others = _other_joints(child, driven, home or {})
     base = _base(name, path, facts, max_wheel_speed_rad_s, others, track_m, max_linear_m_s, max_angular_rad_s)
-    change = functools.partial(complete, path, facts, base, base_body, casters, limits)
+    change = functools.partial(complete, path, facts, base, base_body, casters, limits, dict(home or {}))
     return _factory(base, facts, base_body, casters, change, camera, body_width_m)

@@ -7,21 +7,20 @@ sensors and options of the file go.
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.build import Joint, WheeledBase
-from interactive_nav.robots.spec import set_servo
+from interactive_nav.robots.build import WheeledBase
+from interactive_nav.robots.files import compiled, warn
+from interactive_nav.robots.joints import add_servo, hold, place, turn_freely
 from interactive_nav_common.errors import FileError
 
 _GEOM = mujoco.mjtGeom
-_STIFFNESS_PER_EFFORT = 10.0
-"""Position servo of a joint: its torque limit is reached at an error of 0.1 rad (m)."""
 _WHEEL_FRICTION = 1.0
+_G_M_S2 = 9.81
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,10 +45,6 @@ class Facts:
     wheels: tuple[Wheel, ...]
     bottom_m: float
     """Lowest point of the wheels."""
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, UserWarning, stacklevel=2)
 
 
 def _solid(geom) -> bool:
@@ -78,7 +73,11 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         child.delete(geom)
     for other in list(child.worldbody.bodies):
         if other.name != base.name:
-            raise FileError(f"robot file {path}: body '{other.name}' is no part of '{base_body}', expected one tree")
+            carries = base.parent.name != "world"
+            raise FileError(
+                f"robot file {path}: body '{other.name}' is no part of '{base_body}', expected one tree; "
+                + (f"give base_body='{other.name}', which carries it" if carries else "remove it, or join it")
+            )
     free = [j for j in base.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         if base.joints:
@@ -86,7 +85,9 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         base.add_freejoint(name="free")
     elif not free[0].name:
         free[0].name = "free"
-    base.pos, base.quat = [0, 0, 0], [1, 0, 0, 0]
+    place(base, [0, 0, 0], [1, 0, 0, 0])
+    for k, joint in enumerate(child.joints):
+        joint.name = joint.name or f"{joint.parent.name}_joint_{k}"
     for k, geom in enumerate(list(child.geoms)):
         if not geom.name:
             geom.name = f"{geom.parent.name}_geom_{k}"
@@ -133,15 +134,25 @@ def _replace_cylinder(child: mujoco.MjSpec, geom) -> None:
 def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
     """Every body's inertia made explicit, so that what is put in for collision weighs nothing."""
     for body in child.bodies:
-        if body.name == "world" or body.explicitinertial:
+        shapes = [g for g in body.geoms if g.group == 3]
+        if body.name == "world":
             continue
-        if any(g.group == 3 for g in body.geoms):
-            _warn(f"{path}: body '{body.name}' has no inertia; taken from its shapes at 1000 kg/m3")
-        elif body.joints and body.name != base_body:
+        turns = np.nansum(np.abs([*body.inertia, *body.fullinertia])) > 0
+        if body.explicitinertial and body.mass > 0 and shapes and not turns:
+            warn(f"{path}: body '{body.name}' has mass but no inertia; taken from its shapes at that mass")
+            body.explicitinertial, body.ipos = False, [math.nan] * 3  # MuJoCo asks the shapes where ipos is none
+            for geom in shapes:
+                geom.mass = body.mass / len(shapes)
+        elif body.explicitinertial or any(g.mass == 0 for g in shapes):
+            continue
+        elif shapes:
+            warn(f"{path}: body '{body.name}' has no inertia; taken from its shapes at 1000 kg/m3")
+        elif body.joints and body.name != base_body and not body.bodies:
             raise FileError(f"robot file {path}: moving body '{body.name}' has neither inertia nor collision shapes")
-    model = child.copy().compile()
-    base, mass = child.body(base_body), float(model.body(base_body).mass[0])
-    if mass < 1e-3 and (base.explicitinertial or any(g.group == 3 for g in base.geoms)):
+    model = compiled(child, path)
+    fixed = model.body_weldid == model.body(base_body).id
+    if model.body_mass[fixed].sum() < 1e-3 * fixed.sum():
+        mass = float(model.body(base_body).mass[0])
         raise FileError(f"robot file {path}: base '{base_body}' weighs {mass:g} kg, expected its mass; give it inertia")
     for body in child.bodies:
         if body.name == "world":
@@ -159,6 +170,7 @@ def complete(
     base_body: str,
     casters: tuple[str, ...],
     torque_limits: Mapping[str, float],
+    home: Mapping[str, float],
     child: mujoco.MjSpec,
 ) -> None:
     """Every change to the file, in order; warns of each."""
@@ -166,8 +178,9 @@ def complete(
         child.joint(name).actfrcrange = [-limit, limit]
     strip(child, path, base_body)
     _fix_masses(child, path, base_body)
+    hold(child, path, facts.bottom_m, {joint.name for joint in base.joints}, casters, home)
     for wheel in facts.wheels:
-        _warn(
+        warn(
             f"{path}: wheel '{wheel.body}' now rolls on the floor as a sphere of radius {wheel.radius_m:g} m and "
             "meets furniture as a box"
         )
@@ -181,31 +194,10 @@ def complete(
                 raise FileError(f"robot file {path}: caster '{name}' is no sphere, expected one")
             geom.contype, geom.condim, geom.friction = 0, 1, [0.0, 0.0, 0.0]
     for geom in [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_CYLINDER]:
-        _warn(f"{path}: cylinder '{geom.name}' now collides as four boxes, an octagon")
+        warn(f"{path}: cylinder '{geom.name}' now collides as four boxes, an octagon")
         _replace_cylinder(child, geom)
+    slip_n_m = _WHEEL_FRICTION * _G_M_S2 * float(sum(compiled(child, path).body_mass)) * base.wheel_radius_m
     for joint in base.joints:
-        _add_servo(child, path, joint)
-
-
-def _add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
-    """The joint's native actuator; gains from its torque limit and speed."""
-    own = child.joint(joint.name)
-    effort = float(own.actfrcrange[1])
-    if not effort > 0:
-        raise FileError(
-            f"robot file {path}: joint '{joint.name}' has no torque limit; give one (URDF: <limit effort>, "
-            f"MJCF: actuatorfrcrange, or torque_limits={{'{joint.name}': ...}})"
-        )
-    own.actfrclimited = True
-    if joint.side:
-        stiff, damp = 0.0, 5.0 * effort / joint.max_speed
-        # Wheels much lighter than their servo is stiff chatter at the environment's timestep of 0.02 s.
-        least = 0.01 * damp
-    else:
-        stiff = _STIFFNESS_PER_EFFORT * effort
-        damp = 0.12 * stiff
-        least = 2e-4 * stiff
-    if own.armature < least:
-        own.armature = least
-    actuator = child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    set_servo(actuator, (stiff, damp), None)
+        if joint.side:
+            turn_freely(child.joint(joint.name), path, slip_n_m)
+        add_servo(child, path, joint)

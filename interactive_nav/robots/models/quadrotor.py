@@ -17,7 +17,8 @@ import mujoco
 import numpy as np
 
 from interactive_nav.metrics import GRAVITY
-from interactive_nav.robots.build import FOLDER, read_file
+from interactive_nav.robots.build import FOLDER
+from interactive_nav.robots.files import read_file
 from interactive_nav.robots.spec import RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import rotate_back, yaw_from_quat

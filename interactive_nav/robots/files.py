@@ -1,0 +1,127 @@
+"""Parse a robot's URDF or MJCF file; a URDF is brought into the form that MuJoCo's reader expects."""
+
+import math
+import re
+import warnings
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+
+from interactive_nav_common.errors import ConfigError
+
+_FLOATS = ("floating", "planar")
+"""URDF joints that only say that the robot moves."""
+
+
+def warn(message: str) -> None:
+    """Warn of a change to the user's file."""
+    warnings.warn(message, UserWarning, stacklevel=2)
+
+
+def _refused(path: Path, error: Exception) -> ConfigError:
+    return ConfigError(f"robot file {path}: MuJoCo cannot read it ({str(error).splitlines()[0]})")
+
+
+def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    """Compile a copy of a parsed file."""
+    try:
+        return spec.copy().compile()
+    except ValueError as error:
+        raise _refused(path, error) from error
+
+
+def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
+    """Parse an MJCF or URDF file.
+
+    Args:
+        path: of the file.
+        base_body: link of a URDF that the user names as its base; massless links above it, such as `base_footprint`
+            and `odom`, are left out.
+    """
+    if not path.is_file():
+        raise ConfigError(f"robot file {path} does not exist, expected an MJCF or URDF file")
+    data = path.read_bytes()
+    try:
+        root = ElementTree.fromstring(data)
+        text = ElementTree.tostring(root, encoding="unicode")  # without comments and namespaces that nothing uses
+    except ElementTree.ParseError as error:
+        if b"<xacro:" not in data:
+            raise _refused(path, error) from error
+        root, text = ElementTree.Element("robot"), '/xacro"'
+    if re.search(r'\$[({]|/xacro"', text):
+        out = path.name.removesuffix(".xacro")
+        out = out if out != path.name and out.endswith(".urdf") else f"{path.stem}_plain.urdf"
+        raise ConfigError(
+            f"robot file {path}: is written in xacro, expected plain URDF; run xacro first: xacro {path.name} -o {out}"
+        )
+    if root.tag not in ("robot", "mujoco"):
+        raise ConfigError(
+            f"robot file {path}: its root element is <{root.tag}>, expected <robot> (URDF) or <mujoco> (MJCF); "
+            "give the URDF that an SDF model comes from (of a xacro file, run xacro first: "
+            "xacro robot.urdf.xacro -o robot.urdf)"
+        )
+    try:
+        if root.tag == "mujoco":
+            return mujoco.MjSpec.from_file(str(path))
+        _simplify(root, path, base_body)
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    except ValueError as error:
+        raise _refused(path, error) from error
+    _weigh(spec)
+    return spec
+
+
+def _ends(joint: ElementTree.Element) -> tuple[str, ...]:
+    """Return the names of a joint's parent and child link."""
+    return tuple(getattr(joint.find(end), "attrib", {}).get("link", "") for end in ("parent", "child"))
+
+
+def _simplify(root: ElementTree.Element, path: Path, base_body: str) -> None:
+    """Drop what MuJoCo cannot read and the massless links above the base; refuse what it would misread."""
+    for kind in ("link", "joint"):
+        names = [element.get("name", "") for element in root.findall(kind)]
+        for name in names:
+            if not name or names.count(name) > 1:
+                raise ConfigError(f"robot file {path}: {names.count(name)} {kind}s are named '{name}', expected one")
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    for name, link in links.items():
+        for visual in link.findall("visual"):
+            if visual.find("geometry/mesh") is not None:
+                link.remove(visual)
+        for mass in link.findall("inertial/mass"):
+            if not 0 <= float(mass.get("value", "nan")) < math.inf:
+                raise ConfigError(f"robot file {path}: link '{name}' has mass {mass.get('value')}, expected kilograms")
+    while True:
+        ends = {joint: _ends(joint) for joint in root.findall("joint")}
+        children = [pair[1] for pair in ends.values()]
+        top = next((name for name in links if name not in children), None)
+        below = [joint for joint, pair in ends.items() if pair[0] == top]
+        if top in (None, base_body) or len(below) != 1 or below[0].get("type") not in ("fixed", *_FLOATS):
+            break
+        if links[top].find("inertial") is not None or links[top].find("collision") is not None:
+            break
+        root.remove(links.pop(top))
+        root.remove(below[0])
+    for joint, (parent, child) in ends.items():
+        if joint.get("type") in _FLOATS:
+            raise ConfigError(
+                f"robot file {path}: joint '{joint.get('name')}' from '{parent}' to '{child}' is "
+                f"{joint.get('type')}, expected the robot below it: give base_body='{child}'"
+            )
+
+
+def _weigh(spec: mujoco.MjSpec) -> None:
+    """Make the shapes of a URDF's links weightless where a link fixed to theirs declares the inertia of both."""
+
+    def moving(body) -> str:
+        while not body.joints and body.parent.name != "world":
+            body = body.parent
+        return body.name
+
+    bodies = [body for body in spec.bodies if body.name != "world"]
+    declared = {moving(body) for body in bodies if body.explicitinertial}
+    for body in bodies:
+        if not body.explicitinertial and moving(body) in declared:
+            for geom in body.geoms:
+                geom.mass = 0.0
