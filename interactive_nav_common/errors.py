@@ -13,8 +13,17 @@ from interactive_nav_common.signals import interrupts_heard
 Arguments = ParamSpec("Arguments")
 
 
+def printable(text: str) -> str:
+    """Return the text with control characters escaped: names in files must not steer the reader's terminal."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class UserError(Exception):
     """Base of the errors that programs print as one line and exit with 2."""
+
+    def __str__(self) -> str:
+        """Return the message, safe to print."""
+        return printable(super().__str__())
 
 
 class ConfigError(UserError):

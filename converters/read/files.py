@@ -1,5 +1,6 @@
 """Paths in; meshes, images, JSON and hashes out; a failure is one `SceneRejected` line."""
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -14,9 +15,11 @@ from PIL import Image
 
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene, ScanMesh
-from interactive_nav_common.errors import readable
+from interactive_nav_common.errors import printable, readable
 from interactive_nav_common.records import Reader
 
+LARGEST = 1e12
+"""Of a coordinate, whatever its unit: products of larger ones overflow."""
 MOST_CORNERS = 200
 """Of a polygon that is cut with care; larger ones are fans."""
 
@@ -31,7 +34,7 @@ class SourceFolder:
         if not root.is_dir():
             raise SceneRejected(f"{root}: is a file, expected the folder that holds the raw scene")
         self.root, self.strict, self.remedy = root, strict, remedy
-        self.resolve = functools.cache(Path.resolve)
+        self.resolve = functools.cache(_resolve)
         self.sha256: dict[str, str] = {}
         self.warnings: list[str] = []
         self.surfaces: dict[str, Any] = {}
@@ -44,12 +47,12 @@ class SourceFolder:
 
     def has(self, relative: str) -> bool:
         """True when the file exists."""
-        return (self.root / relative).is_file()
+        return os.path.isfile(self.root / relative)
 
     def use(self, relative: str, remedy: str) -> Path:
         """Path of a file that must exist; its hash goes into the record."""
         path = self.root / relative
-        if os.path.isfile(path) or path.is_symlink():
+        if os.path.isfile(path) or os.path.islink(path):
             self.inside(path)
         if not os.path.isfile(path):
             raise SceneRejected(f"{path}: no such file; {remedy}")
@@ -71,13 +74,15 @@ class SourceFolder:
         try:
             end, root = self.resolve(path), self.resolve(self.root)
         except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
-            raise SceneRejected(f"{path}: leads nowhere ({error}); put the file itself there") from error
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise SceneRejected(f"{path}: leads nowhere ({reason}); put the file itself there") from error
         if not end.is_relative_to(root):
             raise SceneRejected(f"{path}: leads out of the source folder, to {end}; {self.remedy}")
         return end.relative_to(root).as_posix()
 
     def note(self, message: str) -> None:
         """Records something the user should know; it goes into scene.json, so it names no absolute path."""
+        message = printable(message)
         if message not in self.warnings:
             self.warnings.append(message)
 
@@ -86,6 +91,14 @@ class SourceFolder:
         if self.strict:
             raise SceneRejected(f"{self.root}: {message}; --strict refuses what would be repaired")
         self.note(message)
+
+
+def _resolve(path: Path) -> Path:
+    """Follow all links of a path, which need not exist."""
+    end = path.resolve()
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+        end.lstat()  # raises OSError for names that no file system takes
+    return end
 
 
 def read_json(path: Path) -> Any:
@@ -140,9 +153,12 @@ def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
         raise SceneRejected(
             f"{path}: a face names vertex {int(faces.max())} of {len(vertices)}; the file is truncated, fetch it again"
         )
-    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    bad = int((~(np.abs(vertices) < LARGEST).all(axis=1)).sum())
     if bad:
-        raise SceneRejected(f"{path}: {bad} vertices are not finite numbers; repair or fetch the file again")
+        raise SceneRejected(
+            f"{path}: {bad} vertices are not finite numbers below {LARGEST:g}; remove them in a mesh editor, and their "
+            "faces"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

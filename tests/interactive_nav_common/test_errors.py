@@ -23,6 +23,11 @@ def test_a_users_error_is_one_line_and_2(capsys):
     assert capsys.readouterr().err == "program: seed is -1, expected 0 or more\n"
 
 
+def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
+    assert _program(ConfigError("x\x1b[2Jy\u202e\n.png: Büro – missing")) == 2
+    assert capsys.readouterr().err == "program: x\\x1b[2Jy\\u202e\\n.png: Büro – missing\n"
+
+
 @pytest.mark.parametrize("kind", [ValueError, OSError, KeyError, RuntimeError])
 def test_our_own_error_is_not_taken_for_the_users(kind):
     assert not issubclass(UserError, kind)

@@ -5,13 +5,12 @@ of a movable category, whatever its source calls it; what stands on such a part 
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import shapely
 
 from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
@@ -47,8 +46,8 @@ DOOR_MOST_M = 1.3
 """Wider leaves fold or slide: they stay where they are."""
 SLAB_M, TOUCH_M, HIDDEN_SHARE = 0.3, 0.005, 0.8
 """A level face is hidden if so much lies below another one that is higher by up to the first."""
-INNER = np.array([(a, b, 6 - a - b) for a in range(1, 5) for b in range(1, 6 - a)]) / 6
-"""(10, 3) barycentric points of a face."""
+COLUMN_M, SHOWN = 0.1, 100_000
+"""Side of the columns that level faces are compared in, and how many of these they take at most."""
 MASS_FACTOR = 2.0
 """A mass that far outside of its category's range is a placeholder."""
 
@@ -202,16 +201,18 @@ def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
 def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The faces that look up, but for those below others by up to `SLAB_M`: the slab under a floor is no floor."""
     area = face_vectors(vertices, faces) / 2
-    level = faces[area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)]
-    corners, height = vertices[level], vertices[level, 2].mean(axis=1)
-    plan: Any = shapely.polygons(corners[..., :2])
-    tree = shapely.STRtree(plan)
-    hidden = np.zeros(len(level))
-    for weights in INNER:
-        point, over = tree.query(shapely.points(np.einsum("k,nkd->nd", weights, corners)[:, :2]), "intersects")
-        above = height[over] - height[point]
-        hidden += np.bincount(point[(above > TOUCH_M) & (above < SLAB_M)], minlength=len(level)) > 0
-    return level[hidden <= HIDDEN_SHARE * len(INNER)]
+    chosen = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
+    level = faces[chosen]
+    # Samples are compared within columns: pairs of faces would be too many where thousands lie on one another.
+    cell = max(COLUMN_M, math.sqrt(area[chosen, 2].sum() / SHOWN))
+    points, of = sample_faces(vertices, level, cell / 2)
+    column = np.unique(np.floor(points[:, :2] / cell), axis=0, return_inverse=True)[1].reshape(-1)
+    z = points[:, 2] - vertices[:, 2].min()
+    key = column * (z.max(initial=0.0) + 1.0) + z
+    order = np.argsort(key)
+    above = np.append(order, -1)[np.searchsorted(key[order], key + TOUCH_M, "right")]
+    hidden = (above >= 0) & (column[above] == column) & (z[above] - z < SLAB_M)
+    return level[np.bincount(of, hidden, len(level)) <= HIDDEN_SHARE * np.bincount(of, minlength=len(level))]
 
 
 def _small(mesh: TexturedMesh) -> TexturedMesh:

@@ -23,7 +23,7 @@ from converters.records.raw import Window
 HEIGHT_M, LOW_M = 2.5, 1.2
 """Of a wall that says nothing; lower ones are built-in furniture to the map."""
 ARC_STEP_RAD = math.radians(10)
-SHORT_M, NEAR_M = 1e-3, 1e-6
+SHORT_M, NEAR_M, THIN_M = 1e-3, 1e-6, 0.01
 PARALLEL = 0.8
 """Least cosine between a wall and the openings that cut it."""
 SILL_M = 0.05
@@ -61,6 +61,10 @@ class Wall:
         """Between its ends."""
         return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
+    def square(self) -> np.ndarray:
+        """(2, 2, 2) corners, as `corners`, of the wall cut off square at its ends."""
+        return np.stack([self.ends + s * self.left * self.thickness_m / 2 for s in (1, -1)])
+
     def polygon(self) -> Any:
         """Its footprint."""
         return shapely.Polygon([*self.corners[0], *self.corners[1][::-1]])
@@ -87,10 +91,15 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
         start, end = point(element, "xStart", "yStart"), point(element, "xEnd", "yEnd")
         high = metres(element, "height", default=100 * HEIGHT_M)[0]
         tall = np.array([high, metres(element, "heightAtEnd", default=100 * high)[0]])
-        if np.linalg.norm(end - start) < SHORT_M or not 0 < thick < EXTENT_M or not 0 < tall.max() < EXTENT_M:
-            note(f"{called(element)}: has no length, thickness or height; it is left out")
+        if np.linalg.norm(end - start) < SHORT_M or not 0 < tall.max() < EXTENT_M:
+            note(f"{called(element)}: has no length or height; it is left out")
             continue
+        if thick < SHORT_M:
+            note(f"{called(element)}: has no thickness; {100 * THIN_M:g} cm is taken")
+            thick = THIN_M
         points = _round(start, end, number(element, "arcExtent", 0.0))
+        if max(thick, *np.ptp(points, axis=0)) > EXTENT_M:
+            raise SceneRejected(f"{called(element)}: is larger than {EXTENT_M:g} m; mend the drawing")
         share = np.linspace(0, 1, len(points))
         pieces.setdefault(name, [])
         for k in range(len(points) - 1):
@@ -100,7 +109,7 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
             ]
             some = np.maximum(tall[0] + share[k : k + 2] * (tall[1] - tall[0]), 0.0)
             wall = Wall(element, points[k : k + 2], thick, some, base_m[element.get("level")], joins, np.zeros(0))
-            wall.corners = np.stack([wall.ends + s * wall.left * thick / 2 for s in (1, -1)])
+            wall.corners = wall.square()
             pieces[name].append(len(walls))
             walls.append(wall)
     for k, wall in enumerate(walls):
@@ -111,6 +120,9 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
             ]
             if near and min(near)[0] < max(wall.thickness_m, SHORT_M):
                 _mitre(wall, end, others[min(near)[1]], min(near)[2])
+    for wall in walls:  # neighbours that are thicker than a wall is long would turn its sides around
+        around = (wall.corners[:, 1] - wall.corners[:, 0]) @ wall.along < SHORT_M / 2
+        wall.corners[around] = wall.square()[around]
     return walls
 
 

@@ -74,6 +74,7 @@ def test_texture_coordinates_belong_to_corners(tmp_path):
         ("v 1 2\n", "fewer than 3 coordinates"),
         ("v 1 2 inf\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "1 vertices are not finite"),
         ("v 1 2 1e999999\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "not finite"),
+        ("v 1 2 1e300\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "1 vertices are not finite numbers below 1e.12"),
         (SQUARE + "f 1 2 99999999999999999999999\n", "not readable as OBJ"),
     ],
 )
@@ -129,6 +130,17 @@ def test_a_texture_is_found_by_its_bare_name(tmp_path, name):
     strict = SourceFolder(tmp_path, strict=True)
     with pytest.raises(SceneRejected, match="red.png is taken; --strict refuses"):
         read_scan_obj(strict, "mesh.obj", "")
+
+
+@pytest.mark.parametrize("name", ["x" * 300 + ".png", "a/" * 3000 + "b.png", "x\x1b[2Jy.png"])
+def test_names_that_no_file_can_have_are_missing_files(tmp_path, name):
+    source = two_materials(tmp_path, name)
+    np.testing.assert_array_equal(sampled(read_scan_obj(source, "mesh.obj", ""), 0), (170, 170, 170))
+    shown = name.replace("\x1b", "\\x1b")
+    assert any(w.startswith(f"m.mtl: names the texture '{shown}', which is missing") for w in source.warnings)
+    assert not source.has(name)
+    with pytest.raises(SceneRejected, match="no such file; put it there"):
+        source.use(name, "put it there")
 
 
 def test_nothing_outside_the_folder_is_read(tmp_path):

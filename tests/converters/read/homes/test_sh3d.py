@@ -6,6 +6,7 @@ import io
 import math
 import shutil
 import time
+import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from PIL import Image
 
 from converters.geometry.faces import face_areas, face_labels
 from converters.pipeline import ConvertConfig, convert
-from converters.read.homes import sh3d, sh3d_archive
+from converters.read.homes import sh3d, sh3d_archive, sh3d_walls
 from converters.read.homes.sh3d import kind_of, read_sh3d
 from converters.read.homes.sh3d_archive import outline
 from converters.read.meshes import colours_of_faces
@@ -421,9 +422,41 @@ def test_a_wall_without_length_and_an_open_room_are_left_out(tmp_path):
     point, line = wall("dot", "100 100", "100 100"), "<room id='q' name='Strip'><point x='0' y='0'/></room>"
     raw = read_sh3d(write_home(tmp_path, [*HOME[:5], point, line]))
     assert [w for w in raw.warnings if "left out" in w] == [
-        "<wall> dot: has no length, thickness or height; it is left out",
+        "<wall> dot: has no length or height; it is left out",
         "<room> Strip: its outline encloses nothing; it is left out",
     ]
+
+
+def test_a_wall_shorter_than_its_neighbours_are_thick_is_read(tmp_path):
+    """The mitres of a pier of 5 cm between walls of 20 cm cross each other."""
+    pier = [
+        wall("a", "0 0", "0 150", joined("d", "b")), wall("b", "0 150", "5 154", joined("a", "c")),
+        wall("c", "5 154", "5 300", joined("b", "e")), wall("e", "5 300", "400 300", joined("c", "f")),
+        wall("f", "400 300", "400 0", joined("e", "d")), wall("d", "400 0", "0 0", joined("f", "a")),
+    ]  # fmt: skip
+    raw = read_sh3d(write_home(tmp_path, [e.replace("thickness='10'", "thickness='20'") for e in pier]))
+    areas = face_areas(raw.scan.vertices, raw.scan.faces)
+    assert areas[face_labels(raw.scan.labels, raw.scan.faces) == FLOOR].sum() == pytest.approx(3.78 * 2.8, abs=0.15)
+    corners = [w.corners for w in sh3d_walls.read_walls([ElementTree.fromstring(e) for e in pier], {None: 0.0}, print)]
+    assert all(((c[:, 1] - c[:, 0]) @ (c[0, 1] - c[0, 0]) >= 0).all() for c in corners)
+
+
+def test_walls_without_thickness_are_thin_and_rooms_that_cross_themselves_keep_all_parts(tmp_path):
+    thin = HOME[0].replace("thickness='10'", "thickness='0'")
+    bow = "".join(f"<point x='{x}' y='{y}'/>" for x, y in ((0, 0), (400, 300), (400, 0), (0, 300)))
+    raw = read_sh3d(write_home(tmp_path, [thin, *HOME[1:4], f"<room id='r' floorColor='FF102030'>{bow}</room>"]))
+    assert "<wall> north: has no thickness; 1 cm is taken" in raw.warnings
+    assert seen(raw, (0.5, -1.5, 0.0), (0, 0, 1)) == seen(raw, (3.5, -1.5, 0.0), (0, 0, 1)) == (16, 32, 48)
+    assert seen(raw, (2.0, -0.5, 0.0), (0, 0, 1)) == () and seen(raw, (3.0, -0.055 + 0.1, 1.2), (0, -1, 0)) != ()
+
+
+@pytest.mark.parametrize(
+    ("ends", "more"), [(("0 0", "90000 0"), ""), (("0 0", "300 0"), f"arcExtent='{2 * math.pi - 1e-4}'")]
+)
+def test_walls_that_are_larger_than_a_building_are_named(tmp_path, ends, more):
+    assert refusal(write_home(tmp_path, [*HOME, wall("far", *ends, more)])).endswith(
+        "<wall> far: is larger than 100 m; mend the drawing"
+    )
 
 
 @pytest.mark.parametrize("name", ["../../evil", "/evil", "a/../../evil", "a\\..\\evil"])
