@@ -20,6 +20,7 @@ from converters.bodies.physical import Physical, physical_properties, with_sourc
 from converters.bodies.placement import align_objects
 from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
+from converters.check.surfaces import kept_share
 from converters.clock import Clock, Report
 from converters.geometry.boxes import Hull
 from converters.geometry.simplify import simplify_open, simplify_parts
@@ -258,10 +259,15 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         save_maps(maps, folder)
     with clock.stage("gates"):
         spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
-        gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows))
+        shares = {
+            "scan_kept": kept_share(vertices_w, raw.scan.faces[cut.owner < 0], (structure.vertices, structure.faces)),
+            "floor_open": plan.open_share,
+        }
+        gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows), shares)
         area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
         manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
-        manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3))
+        measures = manifest.measures | {name: round(share, 4) for name, share in shares.items()}
+        manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3), measures=measures)
         save_manifest(manifest, folder)
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds, decomposed.worker_mib)
 

@@ -170,12 +170,10 @@ def free_space_warnings(maps: SceneMaps) -> tuple[str, ...]:
     )
 
 
-def objects_off_map(model: mujoco.MjModel, maps: SceneMaps) -> tuple[str, ...]:
-    """Names of the movable bodies that stand farther than `OFF_MAP_M` from all traversable floor."""
+def objects_off(model: mujoco.MjModel, maps: SceneMaps, distance: np.ndarray) -> tuple[str, ...]:
+    """Return the names of the movable bodies that stand where a distance field [rows, columns] exceeds `OFF_MAP_M`."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    distance = ndimage.distance_transform_edt(~maps.traversable, sampling=maps.resolution_m)
-    assert isinstance(distance, np.ndarray)
     off = []
     for body in movable_bodies(model) if maps.traversable.any() else []:
         at = (data.xpos[body, :2] - maps.origin_w) / maps.resolution_m
@@ -187,15 +185,20 @@ def objects_off_map(model: mujoco.MjModel, maps: SceneMaps) -> tuple[str, ...]:
 
 
 def evaluate(
-    spec: mujoco.MjSpec, maps: SceneMaps, objects: Sequence[SceneObject], kept: Mapping[str, float] | None = None
+    spec: mujoco.MjSpec,
+    maps: SceneMaps,
+    objects: Sequence[SceneObject],
+    kept: Mapping[str, float] | None = None,
+    shares: Mapping[str, Any] | None = None,
 ) -> tuple[Gate, ...]:
-    """Every gate in the table's order.
+    """Return every gate in the table's order.
 
     Args:
         spec: of the scene; changed in place.
         maps: of the scene.
         objects: from its manifest.
         kept: object -> share of its model's area that is drawn; older scenes do not say it.
+        shares: `scan_kept` and `floor_open` as the conversion measured them; older scenes do not say them.
     """
     object_names = [o.name for o in objects]
     try:
@@ -207,7 +210,8 @@ def evaluate(
     bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, b) for b in movable_bodies(model)}
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or "" for g in range(model.ngeom)]
     hulls = [sum(n.startswith(f"{o}_hull_") for n in names) for o in object_names]
-    off = objects_off_map(model, maps)
+    beside = ndimage.distance_transform_edt(~maps.traversable, sampling=maps.resolution_m)
+    off, apart = (objects_off(model, maps, np.asarray(field)) for field in (beside, _largest_piece(maps)[1]))
     who: dict[str, dict[str, str]] = {"hulls": {}, "boxes": {}}
     by_hull, by_box = physical_values(model, who["hulls"]), physical_values(boxes, who["boxes"])
     values = {
@@ -217,7 +221,11 @@ def evaluate(
         "hulls_per_object": float(max(hulls, default=0)),
         "hulls": float(sum(hulls)),
         "walls": float(sum(n.startswith("wall_") for n in names)),
+        "furniture_apart": len(apart) / max(len(bodies), 1),
     }
+    for name, without in (("scan_kept", 1.0), ("floor_open", 0.0)):
+        share = (shares or {}).get(name)
+        values[name] = float(share) if isinstance(share, int | float) else without
     for quantity in ("drift", "turn", "penetration"):
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
     agreed, warnings = manifest_values(model, objects)
@@ -226,6 +234,11 @@ def evaluate(
     told = {f"{what}_{shape}": (body,) for shape, of in who.items() for what, body in of.items()} | worst
     warnings |= {name: words for name, words in told.items() if not judge(name, (values | surface)[name]).passed}
     warnings["connected_share"] = free_space_warnings(maps)
+    if 2 * len(apart) > len(bodies):
+        warnings["furniture_apart"] = (
+            f"{len(apart)} of {len(bodies)} movable objects stand more than {OFF_MAP_M:g} m from the largest piece of "
+            "floor, which is not the home's; look at the map in the preview",
+        )
     if off:
         warnings["unmatched_objects"] = (f"{', '.join(off)}: more than {OFF_MAP_M:g} m from all free floor of the map",)
     return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
@@ -246,4 +259,4 @@ def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError:
         return manifest, (judge("compiles", 0.0),)
-    return manifest, evaluate(spec, maps, manifest.objects, drawn_shares(manifest.alignment))
+    return manifest, evaluate(spec, maps, manifest.objects, drawn_shares(manifest.alignment), manifest.measures)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
-from converters.geometry.faces import sample_faces
+from converters.geometry.faces import face_areas, sample_faces
 from converters.records.visual import TexturedMesh
 
 SPACING_M = 0.04
@@ -14,6 +14,9 @@ SPACING_M = 0.04
 HIDDEN_M, BARE_M = 0.1, 0.05
 """A hull's side farther than the first from all that is drawn is hit unseen; what is drawn farther than the second
 outside of all hulls is driven through."""
+KEPT_M, POINTS = 0.15, 50_000
+"""A scan's point so near to the drawn structure is kept: floors are levelled by up to 0.12 m. Points that are looked
+at, about."""
 SIDE = 0.7
 """Largest vertical component of the normal of what counts as a side: robots come along the floor."""
 
@@ -37,6 +40,24 @@ def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
     shape = model.tex_height[image], model.tex_width[image], model.tex_nchannel[image]
     pixels = model.tex_data[model.tex_adr[image] :][: np.prod(shape)].reshape(shape)
     return TexturedMesh(vertices, faces, uv, pixels[..., :3])
+
+
+def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the share of a scan's area that lies within `KEPT_M` of what is drawn of the structure.
+
+    Args:
+        vertices: (n, 3) m.
+        faces: (m, 3) of the scan, without those of furniture that was cut out.
+        drawn: vertices (k, 3) m and faces of the drawn structure.
+    """
+    area = face_areas(vertices, faces)
+    if not area.sum():
+        return 1.0
+    spacing_m = max(SPACING_M, float(np.sqrt(area.sum() / POINTS)))
+    points, face = sample_faces(vertices, faces, spacing_m)
+    weight = area[face] / np.bincount(face, minlength=len(faces))[face]
+    tree = KDTree(sample_faces(*drawn, KEPT_M / 2)[0])
+    return float(weight[tree.query(points, distance_upper_bound=KEPT_M)[0] < KEPT_M].sum() / weight.sum())
 
 
 def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -> tuple[float, float]:

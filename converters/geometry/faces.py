@@ -131,11 +131,32 @@ def _steps(corners: np.ndarray, spacing_m: float) -> np.ndarray:
     return np.maximum(np.ceil(np.max(_sides(corners), axis=1) / spacing_m).astype(int), 1)
 
 
-def loose_parts(faces: np.ndarray, count: int) -> np.ndarray:
-    """(m,) number of the connected part, by shared vertices of which there are `count`, that each face is of."""
-    edges = np.vstack([faces[:, :2], faces[:, 1:]])
+def weld(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Group vertices (n, 3) at equal positions, to 1e-6 of the extent.
+
+    Returns:
+        first (k,) index of one vertex of each group, sorted by position; group (n,) of each vertex.
+    """
+    step = max(float(np.ptp(vertices, axis=0).max(initial=0.0)), 1e-9) * 1e-6
+    cell = np.round(vertices / step).astype(np.int64)
+    cell -= cell.min(axis=0) if len(cell) else 0
+    key = (
+        (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+    )  # each below 2**20 + 2: the key's order is that of x, y, z
+    _, first, group = np.unique(key, return_index=True, return_inverse=True)
+    return first, group.reshape(-1)
+
+
+def loose_parts(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the number (m,) of the connected part that each face belongs to.
+
+    Faces connect where vertices lie at equal positions, so that a mesh split at its texture seams, or one whose
+    triangles share no vertices, has the parts of the same mesh with shared vertices.
+    """
+    joined = weld(vertices)[1][faces]
+    edges, count = np.vstack([joined[:, :2], joined[:, 1:]]), len(vertices)
     graph = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), (count, count))
-    return csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
+    return csgraph.connected_components(graph, directed=False)[1][joined[:, 0]]
 
 
 def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -157,11 +178,8 @@ def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     Returns:
         vertices (n', 3), faces (m', 3), keep (m',) indices of the faces that stayed.
     """
-    step = max(float(np.ptp(vertices, axis=0).max()), 1e-9) * 1e-6
-    _, first, inverse = np.unique(
-        np.round(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    faces = inverse.reshape(-1)[faces]
+    first, group = weld(vertices)
+    faces = group[faces]
     keep = np.flatnonzero((faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0]))
     return vertices[first], faces[keep], keep
 

@@ -111,7 +111,7 @@ def simplify_within(
         vertices, faces; equal positions are joined.
     """
     vertices, faces, _ = merge_vertices(vertices, faces)
-    part = loose_parts(faces, len(vertices))
+    part = loose_parts(vertices, faces)
     pieces = [compacted(vertices, faces[part == k]) for k in np.unique(part)]
     return stacked(_simplified(*p, most_m, least) if len(p[1]) > PLAIN_FACES else p for p in pieces)
 

@@ -23,7 +23,7 @@ from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, fi
 from converters.read.files import SourceFolder, check_mesh, read_labels
 from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, read_texture, scan_of, texels, use_found
 from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_extent, floor_level, labelled, with_own_corners
+from converters.read.surfaces import check_extent, floor_level, labelled, welded, with_own_corners
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, check_count
 from converters.records.raw import RawScene
@@ -161,7 +161,7 @@ def read_single_mesh(
         given = source.use(source.inside(labels_beside(path)), "")
         mesh, labels = labelled(mesh, read_labels(given), given)
     else:
-        mesh = with_own_corners(mesh)
+        mesh = with_own_corners(welded(mesh))
         labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
         source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
     licence = "unknown: a mesh file says none"

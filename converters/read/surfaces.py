@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.geometry.faces import face_vectors, sample_faces, vertex_vectors
+from converters.geometry.faces import face_vectors, sample_faces, vertex_vectors, weld
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M
@@ -32,6 +32,16 @@ def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > LONG_M
 
 
+def welded(mesh: TexturedMesh) -> TexturedMesh:
+    """Return the mesh with vertices at equal positions joined; texture coordinates belong to corners and stay.
+
+    Files split a surface at its texture seams, or give every triangle vertices of its own. Shapes are recognised by
+    normals and neighbours, which must not depend on that.
+    """
+    first, group = weld(mesh.vertices)
+    return dataclasses.replace(mesh, vertices=mesh.vertices[first], faces=group[mesh.faces])
+
+
 def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
     """The mesh with corners of their own for long faces, after its vertices.
 
@@ -46,9 +56,10 @@ def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
 
 
 def labelled(mesh: TexturedMesh, labels: np.ndarray, where: Path) -> tuple[TexturedMesh, np.ndarray]:
-    """A mesh and its labels: one a vertex, or as many as `with_own_corners` makes."""
-    own = mesh if len(labels) == len(mesh.vertices) else with_own_corners(mesh)
-    if len(labels) != len(own.vertices):
+    """Return a mesh and its labels: one for each vertex, or for each that `with_own_corners` gives, `welded` or not."""
+    choices = (mesh, with_own_corners(mesh), with_own_corners(welded(mesh)))
+    own = next((choice for choice in choices if len(choice.vertices) == len(labels)), None)
+    if own is None:
         raise SceneRejected(
             f"{where}: {len(labels)} labels for the {len(mesh.vertices)} vertices of the mesh, "
             "expected one for each; label the same mesh again"

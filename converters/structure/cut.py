@@ -21,7 +21,7 @@ LYING_ABOVE_M = 0.30
 FLOOR_CLEARANCE_M = 0.10
 """A floor label higher than this is a mislabelled leg."""
 DEBRIS_AREA_M2 = 0.02
-"""Pieces of scan smaller than this, left hanging after the cut, go too."""
+"""A cut leaves pieces smaller than this hanging; they go too."""
 INSTANCE_SHARE = 0.6
 """When this share of a connected same-label piece is cut, the rest of the piece is too."""
 
@@ -80,10 +80,11 @@ def cut_furniture(
     objects: tuple[PlacedObject, ...],
     furnished: bool = True,
 ) -> CutResult:
-    """Decides which scan faces are annotated furniture.
+    """Decide which scan faces are annotated furniture.
 
     Floor and walls stay, whatever stands against them: only faces with the object's own label, with no
-    label or of small things lying on it, and other furniture faces that touch the model, go.
+    label or of small things lying on it, and other furniture faces that touch the model, go. Of a part that loses
+    faces, pieces smaller than `DEBRIS_AREA_M2` go too; a part that loses none stays whole, however small it is.
 
     Args:
         vertices_w: (n, 3) m, floor at z = 0.
@@ -101,31 +102,31 @@ def cut_furniture(
         owner[_faces_of(centres, label, placed) & (owner < 0)] = k
     area = face_areas(vertices_w, faces)
     for category in sorted({o.category for o in objects}):
-        _take_rest_of_instances(owner, faces, label, centres, area, objects, category, len(vertices_w))
+        _take_rest_of_instances(owner, vertices_w, faces, label, centres, area, objects, category)
     keep = owner < 0
     kept = np.flatnonzero(keep)
-    piece = loose_parts(faces[kept], len(vertices_w))
-    if len(kept):
-        piece_area = np.bincount(piece, area[kept])
-        keep[kept[piece_area[piece] < DEBRIS_AREA_M2]] = False
+    if len(kept) and not keep.all():
+        part, piece = loose_parts(vertices_w, faces), loose_parts(vertices_w, faces[kept])
+        loses = np.bincount(part, ~keep)[part[kept]] > 0
+        keep[kept[loses & (np.bincount(piece, area[kept])[piece] < DEBRIS_AREA_M2)]] = False
     return CutResult(keep, owner)
 
 
 def _take_rest_of_instances(
     owner: np.ndarray,
+    vertices_w: np.ndarray,
     faces: np.ndarray,
     label: np.ndarray,
     centres: np.ndarray,
     area: np.ndarray,
     objects: tuple[PlacedObject, ...],
     category: str,
-    n_vertices: int,
 ) -> None:
     """Extends `owner` in place: a connected piece of a category's label that is mostly cut goes entirely."""
     index = np.flatnonzero(np.isin(label, CATEGORY_LABELS.get(category, ())))
     if len(index) == 0:
         return
-    piece = loose_parts(faces[index], n_vertices)
+    piece = loose_parts(vertices_w, faces[index])
     total = np.bincount(piece, area[index])
     gone = np.bincount(piece, area[index] * (owner[index] >= 0))
     rest = index[(gone[piece] > INSTANCE_SHARE * total[piece]) & (owner[index] < 0)]

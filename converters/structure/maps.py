@@ -21,6 +21,7 @@ from converters.geometry.density import label_pieces
 from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled, unit_normals
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
+from converters.structure.enclosure import beyond_obstacles, floor_outside
 from interactive_nav_common.rotations import yaw_matrix
 
 RESOLUTION_M = 0.05
@@ -40,8 +41,9 @@ MIN_OBSTACLE_CELLS = 3
 MIN_FREE_M2 = 0.25
 AWAY_SHARE = 0.4
 """Of what stands around a piece of floor, if so much faces away, it is the inside of a solid."""
-MIN_APART_M2 = 1.0
-"""Of a piece of floor that is not the largest: no way leads into less, it is a cabinet's inside."""
+MIN_APART_M2 = 2.25
+"""Least area of a piece of floor that is cut off from the largest: no path leads into less, which is the inside of a
+cabinet or of a pillar."""
 PAD_M = 0.4
 HEIGHT_STEP_M = 0.1
 """Heights of low static furniture are rounded up to this: few boxes."""
@@ -111,6 +113,8 @@ class FloorPlan:
     None: the wall's height everywhere."""
     unseen_m2: float = 0.0
     """Traversable floor that the scan does not show."""
+    open_share: float = 0.0
+    """Share of the traversable floor that lies beyond all obstacles: no walls enclose it."""
 
 
 def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
@@ -199,7 +203,7 @@ def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np
 
     What stands around a room faces it; the sides of a solid face away from its inside.
     """
-    pieces, count = label_pieces(free, np.ones((3, 3)))
+    pieces, count = label_pieces(free)
     size = np.bincount(pieces.ravel(), minlength=count + 1) * resolution_m**2
     size[0] = 0.0
     facing, around = np.zeros((2, count + 1))
@@ -267,6 +271,8 @@ def make_floor_plan(
     floor = _fill_holes(floor, occupied, resolution_m)
     if given is None and not exact:
         floor = _bridge(floor, occupied, resolution_m)
+    if given is None:
+        floor &= ~floor_outside(floor, occupied, under, resolution_m)
     traversable = _drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2))
     traversable = _without_insides(traversable, shown, resolution_m)
     if not traversable.any():
@@ -276,7 +282,8 @@ def make_floor_plan(
         )
     height, leaf = _heights(shown, occupied, 1 if exact else 5), swept & (~traversable if exact else occupied)
     unseen_m2 = float((traversable & ~floor_seen).sum()) * resolution_m**2
-    return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height, unseen_m2)
+    open_share = float(beyond_obstacles(occupied, resolution_m)[traversable].mean())
+    return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height, unseen_m2, open_share)
 
 
 @dataclasses.dataclass(frozen=True)

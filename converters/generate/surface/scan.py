@@ -120,7 +120,7 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
     """Drops connected pieces of fewer than `min_faces` faces, degenerate faces, and unused vertices."""
     degenerate = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~degenerate]
-    part = loose_parts(faces, len(vertices))
+    part = loose_parts(vertices, faces)
     return compacted(vertices, faces[np.bincount(part)[part] >= min_faces])
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from converters.__main__ import main
 from converters.check.agreement import wall_values
@@ -22,7 +23,7 @@ from converters.check.gates import (
     free_space_values,
     free_space_warnings,
     judge,
-    objects_off_map,
+    objects_off,
     physical_values,
 )
 from converters.check.settle import settle
@@ -102,7 +103,8 @@ def test_objects_beyond_the_mapped_floor_are_named():
     free = np.zeros((20, 100), bool)
     free[:, :40] = True  # 2 x 1 m from the origin on, of a map of 5 m
     maps = dataclasses.replace(maps_of(free), origin_w=(0.0, 0.0))
-    assert objects_off_map(spec.compile(), maps) == ("far", "beyond", "between")
+    distance = ndimage.distance_transform_edt(~maps.traversable, sampling=maps.resolution_m)
+    assert objects_off(spec.compile(), maps, distance) == ("far", "beyond", "between")
 
 
 def spec_of(folder: Path) -> mujoco.MjSpec:

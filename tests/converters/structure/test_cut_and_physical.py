@@ -12,7 +12,9 @@ from converters.bodies.placement import upright
 from converters.geometry.boxes import Hull, convex_hull
 from converters.geometry.faces import face_labels, loose_parts
 from converters.read.scan2cad import read_scan2cad
+from converters.records.raw import WALL
 from converters.structure.cut import cut_furniture, depth_in_hulls
+from tests.converters import tiny_raw
 
 
 def cube(side: float, centre=(0.0, 0.0, 0.0)) -> Hull:
@@ -76,8 +78,34 @@ def test_face_labels_take_the_majority():
 
 
 def test_loose_parts_join_over_shared_vertices():
-    pieces = loose_parts(np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]]), 8)
+    points = np.random.default_rng(0).random((8, 3))
+    pieces = loose_parts(points, np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]]))
     assert pieces[0] == pieces[1] != pieces[2]
+
+
+def test_loose_parts_join_over_equal_positions():
+    """Two triangles of a square that share no vertex, and one that is a micrometre away on a scale of a metre."""
+    square = np.array(
+        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 0, 0), (1, 1, 0), (0, 1, 0), (1.1, 1, 0), (1.2, 1, 0), (1.1, 2, 0)]
+    )
+    pieces = loose_parts(square.astype(float), np.arange(9).reshape(3, 3))
+    assert pieces[0] == pieces[1] != pieces[2]
+
+
+def test_only_what_a_cut_leaves_hanging_is_debris(scan2cad_raw):
+    """Two specks of 50 cm2 in the air: one was never part of anything that is cut, one hung on the basket."""
+    raw = read_scan2cad(scan2cad_raw)
+    objects = placed_objects(raw)
+    vertices = raw.scan.vertices - [0, 0, tiny_raw.FLOOR_M]
+    plain = cut_furniture(vertices, raw.scan.faces, raw.scan.labels, objects)
+    speck = np.array([(1.5, 1.0, 1.2), (1.6, 1.0, 1.2), (1.5, 1.1, 1.2)])
+    count = len(vertices)
+    cut = cut_furniture(
+        np.vstack([vertices, speck]), np.vstack([raw.scan.faces, [[count, count + 1, count + 2]]]),
+        np.concatenate([raw.scan.labels, [WALL] * 3]), objects,
+    )  # fmt: skip
+    np.testing.assert_array_equal(cut.keep[:-1], plain.keep)
+    assert cut.keep[-1] and not plain.keep.all()
 
 
 def test_depth_in_a_cube_by_hand():

@@ -169,7 +169,8 @@ def test_the_inside_of_a_closed_solid_is_not_free_and_a_room_of_its_own_is(yaw):
         box((0.02, 0.7, 1.8), (x, 0)) for x in (-0.35, 0.35)
     ]
     room = [box((2.0, 0.1, 2.4), (3.5, y)) for y in (-1, 1)] + [box((0.1, 2.0, 2.4), (3.5 + x, 0)) for x in (-1, 1)]
-    parts = [floor, pillar, *housing, *room]
+    around = [box((10.0, 0.1, 2.4), (0, y)) for y in (-3, 3)] + [box((0.1, 6.0, 2.4), (x, 0)) for x in (-5, 5)]
+    parts = [floor, pillar, *housing, *room, *around]
     whole = trimesh.util.concatenate(parts)
     labels = np.full(len(whole.vertices), 38)
     labels[:8] = FLOOR
