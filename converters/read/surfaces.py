@@ -39,7 +39,8 @@ def welded(mesh: TexturedMesh) -> TexturedMesh:
     normals and neighbours, which must not depend on that.
     """
     first, group = weld(mesh.vertices)
-    return dataclasses.replace(mesh, vertices=mesh.vertices[first], faces=group[mesh.faces])
+    order = np.argsort(first)  # as in the file: labels refer to it
+    return dataclasses.replace(mesh, vertices=mesh.vertices[first[order]], faces=np.argsort(order)[group[mesh.faces]])
 
 
 def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
