@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib
+import importlib.util
 import itertools
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn, TypeAlias
 
 from interactive_nav_common.config import nearest
+from interactive_nav_common.errors import UserError
 from interactive_nav_common.records import read_packaged
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
@@ -136,3 +141,36 @@ def program(table: Path, name: str, epilog: str | None = None, **known: Any) -> 
     made = Parser(prog=prog, description=row.help, epilog=epilog, formatter_class=how)
     add_words(made, row.words, **known)
     return made
+
+
+def first_line(error: BaseException) -> str:
+    """Return an exception's type and the first line of its message."""
+    return f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+
+
+def import_function(place: str, word: str, expected: str, kind: type[UserError]) -> Callable[..., Any]:
+    """Return the function at `module:name` or `path/to/file.py:name`; modules of the current folder count."""
+    module, _, name = place.rpartition(":")
+    is_file = module.endswith(".py")
+    folder = str(Path(module).resolve().parent) if is_file else os.getcwd()
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        loaded = _import_file(Path(module)) if is_file else importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        raise kind(f"{word}: cannot import {module} ({first_line(error)}); {expected}") from error
+    made = getattr(loaded, name, None)
+    if not callable(made):
+        own = [n for n, v in vars(loaded).items() if callable(v) and getattr(v, "__module__", "") == loaded.__name__]
+        has = hasattr(loaded, name)
+        got = f"{name!r} of type {type(made).__name__}" if has else f"no {name!r}{nearest(name, own)}"
+        raise kind(f"{word}: {module} has {got}; expected one of its functions: {', '.join(own) or 'it has none'}")
+    return made
+
+
+def _import_file(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"file_{path.stem}", path)
+    assert spec and spec.loader
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -27,6 +27,7 @@ def parser() -> argparse.ArgumentParser:
     source = made.add_mutually_exclusive_group(required=True)
     source.add_argument("--config", metavar="NAME|PATH", help=f"a preset ({known}) or a YAML file")
     source.add_argument("--resume", metavar="RUN_DIR", help="continue this run folder with its own config")
+    made.add_argument("--robot", metavar="NAME|FILE", help="as env.robot=...: a name, a file, or path.py:function")
     made.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, see below")
     return made
 
@@ -45,6 +46,7 @@ def read_config(arguments: argparse.Namespace) -> TrainConfig:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs; 0 when done, 2 on a user's error, 128 + signal when asked to stop (after saving)."""
     arguments = parser().parse_intermixed_args(argv)
+    arguments.overrides = config_io.with_robot(arguments.overrides, arguments.robot)
     config = read_config(arguments)
     # Heavy: after the config is known to be right.
     from train.runs.run import train_run

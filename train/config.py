@@ -17,7 +17,7 @@ class EnvConfig(NavConfig):
     """The task: every setting of the environment, and which robot and scenes to make it from."""
 
     robot: str = "turtlebot"
-    """Robot to drive."""
+    """Robot to drive: a name, a URDF or MJCF file, or path.py:function."""
     scenes: tuple[str, ...] = ()
     """Scene folders, relative to the current folder, or sets of them (`sparse/train`); each episode draws one."""
 

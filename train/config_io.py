@@ -1,6 +1,7 @@
 """YAML text and `key=value` words -> a `TrainConfig`, and back; every mistake named in one line."""
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,11 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
 def with_scenes(config: TrainConfig) -> TrainConfig:
     """The config with the scene folders of the sets that `env.scenes` names (`cluttered/train`)."""
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(config.env.scenes)))
+
+
+def with_robot(words: Sequence[str], robot: str | None) -> list[str]:
+    """Add the word that `--robot` stands for."""
+    return [*words, f"env.robot={json.dumps(robot)}"] if robot else [*words]
 
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:

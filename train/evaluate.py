@@ -136,6 +136,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
 def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], kept: dict[Path, str]) -> int:
     """Fills `kept` with what has been written: a run's file of rows -> how to say it."""
     console = Console()
+    arguments.words = config_io.with_robot(arguments.words, arguments.robot)
     seed = _checked_seed(arguments)
     policies = _policies(arguments)
     for word in arguments.words:

@@ -42,7 +42,7 @@ class Replay:
     """T control steps of one episode; B bodies: the robot's, then the movable objects of its scene."""
 
     robot: str
-    """Name of the robot."""
+    """Name of the robot, or the file that describes it."""
     scene: str
     """Scene folder."""
     scene_digest: str
@@ -166,7 +166,7 @@ def _replay_of(
     bodies, num_robot, pos, quat = world_poses(env.world, scene, qpos)
     counts = {name: np.diff(joined[name], prepend=0) > 0 for name in ("interaction_steps", "structure_steps")}
     return Replay(
-        robot=env.robot.name,
+        robot=env.robot.reference or env.robot.name,
         scene=str(env.scenes[scene].path),
         scene_digest=env.scenes[scene].digest,
         control_dt_s=env.config.physics.control_dt_s,
@@ -256,6 +256,9 @@ def load(path: str | Path) -> Replay:
         arrays = {name: stored[name] for name in _ARRAYS}
     if header.pop("format", None) != FORMAT:
         raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
+    robot, moved = Path(header["robot"]), path.parent.parent / "robot" / Path(header["robot"]).name
+    if robot.is_absolute() and not robot.is_file() and moved.is_file():
+        header["robot"] = str(moved)  # the run's folder is elsewhere now
     for name in ("bodies", "objects"):
         header[name] = tuple(header.get(name, ()))
     return Replay(**header, **arrays)

@@ -8,6 +8,7 @@ from interactive_nav.robots.models.minitaur import minitaur
 from interactive_nav.robots.models.quadrotor import quadrotor
 from interactive_nav.robots.models.wheeled import WHEELED
 from interactive_nav.robots.own import from_file
+from interactive_nav.robots.reference import A_FILE, is_reference, load
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
@@ -28,23 +29,32 @@ def robot_names() -> tuple[str, ...]:
 
 
 def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
-    """The robot's spec.
+    """Return a robot's spec.
 
     Args:
-        name: one of `robot_names()`.
+        name: one of `robot_names()`, a URDF or MJCF file, or `path.py:function` (see `docs/add-a-robot.md`).
         control_mode: one of the robot's `control_modes`; `native` is the original benchmark's action.
 
     Raises:
-        ConfigError: unknown name or mode; the message lists the known ones.
+        ConfigError: unknown name or mode (the message lists the known ones), or an unusable file.
     """
-    if name not in _FACTORIES:
+    factory = _FACTORIES.get(str(name))
+    if factory is None and is_reference(str(name)):
+        factory = load(str(name), _FACTORIES)
+    if factory is None:
         near = nearest(str(name), list(_FACTORIES))
-        raise ConfigError(f"unknown robot '{name}'{near}; known robots: {', '.join(robot_names())}")
-    return _FACTORIES[name](control_mode)
+        known = ", ".join(robot_names())
+        raise ConfigError(f"unknown robot '{name}'{near}; known robots: {known}; or {A_FILE}")
+    return factory(control_mode)
+
+
+def robot_name(robot: str) -> str:
+    """Return the name of a robot, which of one that a file describes the file says."""
+    return get_robot(robot).name if is_reference(robot) else robot
 
 
 def register(name: str, factory: Callable[[str], RobotSpec]) -> None:
-    """Makes a robot of the user's own known to `make`, for this process.
+    """Make a robot of the user's own known to `make`, for this process.
 
     Args:
         name: what `make` and `get_robot` call it; must be new.
@@ -61,4 +71,4 @@ def register(name: str, factory: Callable[[str], RobotSpec]) -> None:
     _FACTORIES[name] = factory
 
 
-__all__ = ["RobotSpec", "from_file", "get_robot", "register", "robot_names"]
+__all__ = ["RobotSpec", "from_file", "get_robot", "register", "robot_name", "robot_names"]

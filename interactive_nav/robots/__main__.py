@@ -14,8 +14,8 @@ from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.words import program
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return robot_names() if text == "all" else tuple(name.strip() for name in text.split(","))
+def _names(text: str | None) -> tuple[str, ...]:
+    return robot_names() if text == "all" else tuple(name.strip() for name in text.split(",")) if text else ()
 
 
 def _unit(label: str) -> str:
@@ -33,7 +33,7 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
         action = f"{robot.action_size}: " + ", ".join(f"{low:g}..{high:g}" for low, high in ranges[:2])
         camera = robot.camera
         table.add_row(
-            name,
+            robot.name,
             f"{robot.mass_kg:.4g}" if robot.mass_kg else "-",
             size,
             robot.drive_type or robot.kind,
@@ -51,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     args = program(Path(__file__).parents[1] / "words.yaml", "robots").parse_args(argv)
     console = Console(width=None if sys.stdout.isatty() else 220)
-    _print_table(_names(args.robots), console)
+    _print_table((*_names(args.robots or ("" if args.files else "all")), *args.files), console)
     return 0
 
 

@@ -14,9 +14,9 @@ _FLOATS = ("floating", "planar")
 """URDF joints that only say that the robot moves."""
 
 
-def warn(message: str) -> None:
-    """Warn of a change to the user's file."""
-    warnings.warn(message, UserWarning, stacklevel=2)
+def warn(path: Path, message: str) -> None:
+    """Warn of a change to the user's file, which is named as the place."""
+    warnings.warn_explicit(message, UserWarning, str(path), 0)
 
 
 def _refused(path: Path, error: Exception) -> ConfigError:
@@ -65,6 +65,7 @@ def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
         if root.tag == "mujoco":
             return mujoco.MjSpec.from_file(str(path))
         _simplify(root, path, base_body)
+        [float(limit.get("velocity", 0)) for limit in root.iter("limit")]  # MuJoCo does not read it
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     except ValueError as error:
         raise _refused(path, error) from error

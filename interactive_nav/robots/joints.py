@@ -13,7 +13,7 @@ from interactive_nav_common.errors import FileError
 
 _STIFFNESS_PER_EFFORT = 10.0
 """Position servo of a joint: its torque limit is reached at an error of 0.1 rad (m)."""
-_FLOOR_M = 0.02
+FLOOR_M = 0.02
 """A wheel of a joint that nothing drives rolls on the floor when it comes this near to it."""
 
 
@@ -26,12 +26,13 @@ def place(body, pos, quat) -> None:
 def turn_freely(joint, path: Path, slip_n_m: float) -> None:
     """Take a driven wheel's position limits away, and bound its torque by that of a wheel that carries the robot."""
     if joint.limited and joint.range[0] < joint.range[1]:
-        warn(f"{path}: wheel joint '{joint.name}' has position limits {joint.range.tolist()}; it turns without")
+        warn(path, f"wheel joint '{joint.name}' has position limits {joint.range.tolist()}; it turns without")
     joint.limited, joint.range = False, [0, 0]
     if joint.actfrcrange[1] > slip_n_m:
         warn(
-            f"{path}: wheel joint '{joint.name}' has a torque limit of {joint.actfrcrange[1]:g} N m; bounded to "
-            f"{slip_n_m:.3g} N m, at which a wheel that carries the whole robot slips"
+            path,
+            f"wheel joint '{joint.name}' has a torque limit of {joint.actfrcrange[1]:g} N m; bounded to "
+            f"{slip_n_m:.3g} N m, at which a wheel that carries the whole robot slips",
         )
         joint.actfrcrange = [-slip_n_m, slip_n_m]
 
@@ -72,7 +73,7 @@ def hold(
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in below and model.geom_group[g] == 3]
         lowest = min((data.geom_xpos[g, 2] - _height_m(model, data, g) for g in geoms), default=np.inf)
         on_floor = joint.type == hinge and not model.jnt_limited[model.joint(joint.name).id]
-        on_floor = on_floor and lowest < bottom_m + _FLOOR_M
+        on_floor = on_floor and lowest < bottom_m + FLOOR_M
         if on_floor or any(model.body(name).id in below for name in casters):
             swinging.append(joint)
             continue
@@ -83,7 +84,7 @@ def hold(
         place(joint.parent, axes.T @ (data.xpos[body] - data.xpos[parents[body]]), quat)
     for joints, said in ((held, "are held at home; name those to drive in joints"), (swinging, "turn freely")):
         if joints:
-            warn(f"{path}: nothing drives {', '.join(repr(j.name) for j in joints)}: they {said}")
+            warn(path, f"nothing drives {', '.join(repr(j.name) for j in joints)}: they {said}")
     for joint in held:
         child.delete(joint)
 

@@ -102,6 +102,11 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
             geom.group, geom.mass = 2, 0.0
 
 
+def slip_torque_n_m(model: mujoco.MjModel, wheel_radius_m: float) -> float:
+    """Return the torque at which a wheel that carries the whole robot slips."""
+    return _WHEEL_FRICTION * _G_M_S2 * float(sum(model.body_mass)) * wheel_radius_m
+
+
 def _replace_wheel(child: mujoco.MjSpec, wheel: Wheel, base_body: str) -> None:
     body = child.body(wheel.body)
     old = next(g for g in body.geoms if g.group == 3)
@@ -139,14 +144,14 @@ def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
             continue
         turns = np.nansum(np.abs([*body.inertia, *body.fullinertia])) > 0
         if body.explicitinertial and body.mass > 0 and shapes and not turns:
-            warn(f"{path}: body '{body.name}' has mass but no inertia; taken from its shapes at that mass")
+            warn(path, f"body '{body.name}' has mass but no inertia; taken from its shapes at that mass")
             body.explicitinertial, body.ipos = False, [math.nan] * 3  # MuJoCo asks the shapes where ipos is none
             for geom in shapes:
                 geom.mass = body.mass / len(shapes)
-        elif body.explicitinertial or any(g.mass == 0 for g in shapes):
+        elif body.explicitinertial or (shapes and not any(math.isnan(g.mass) for g in shapes)):
             continue
         elif shapes:
-            warn(f"{path}: body '{body.name}' has no inertia; taken from its shapes at 1000 kg/m3")
+            warn(path, f"body '{body.name}' has no inertia; taken from its shapes at 1000 kg/m3")
         elif body.joints and body.name != base_body and not body.bodies:
             raise FileError(f"robot file {path}: moving body '{body.name}' has neither inertia nor collision shapes")
     model = compiled(child, path)
@@ -181,8 +186,9 @@ def complete(
     hold(child, path, facts.bottom_m, {joint.name for joint in base.joints}, casters, home)
     for wheel in facts.wheels:
         warn(
-            f"{path}: wheel '{wheel.body}' now rolls on the floor as a sphere of radius {wheel.radius_m:g} m and "
-            "meets furniture as a box"
+            path,
+            f"wheel '{wheel.body}' now rolls on the floor as a sphere of radius {wheel.radius_m:g} m and "
+            "meets furniture as a box",
         )
         _replace_wheel(child, wheel, base_body)
         if wheel.backwards:
@@ -194,9 +200,9 @@ def complete(
                 raise FileError(f"robot file {path}: caster '{name}' is no sphere, expected one")
             geom.contype, geom.condim, geom.friction = 0, 1, [0.0, 0.0, 0.0]
     for geom in [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_CYLINDER]:
-        warn(f"{path}: cylinder '{geom.name}' now collides as four boxes, an octagon")
+        warn(path, f"cylinder '{geom.name}' now collides as four boxes, an octagon")
         _replace_cylinder(child, geom)
-    slip_n_m = _WHEEL_FRICTION * _G_M_S2 * float(sum(compiled(child, path).body_mass)) * base.wheel_radius_m
+    slip_n_m = slip_torque_n_m(compiled(child, path), base.wheel_radius_m)
     for joint in base.joints:
         if joint.side:
             turn_freely(child.joint(joint.name), path, slip_n_m)

@@ -135,6 +135,8 @@ class RobotSpec:
     """How it moves, in words."""
     source: str = ""
     """Where the figures come from."""
+    reference: str = ""
+    """The file, or `path.py:function`, that `get_robot` builds it from again; empty: its name suffices."""
 
     @property
     def action_size(self) -> int:

@@ -16,6 +16,7 @@ from rich.console import Console
 import interactive_nav
 from interactive_nav.config import WINDOW
 from interactive_nav.physics import keep_programs, resolve_backend
+from interactive_nav.robots import robot_name
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
@@ -168,7 +169,7 @@ class FolderCallbacks:
             score=mean_over_episodes(lines, f"episode/{run.best_metric}"),
             began_together=self._began_together,
             algorithm=self._config.algorithm,
-            robot=self._config.env.robot,
+            robot=robot_name(self._config.env.robot),
             observations=self._config.env.sensors.observations,
             observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
@@ -197,7 +198,7 @@ class FolderCallbacks:
 def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
     """Raises `CheckpointError` where a checkpoint was trained on another robot or other observations."""
     facts = (
-        ("robot", meta.robot, config.robot),
+        ("robot", meta.robot, robot_name(config.robot)),
         ("observations", meta.observations, config.observations),
         ("observation size", meta.observation_size, checkpoint.plain_size(env.observation_size)),
         ("action size", meta.action_size, int(env.action_size)),
@@ -312,7 +313,7 @@ def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics
     return {
         "run": config.run.name,
         "algorithm": config.algorithm,
-        "robot": config.env.robot,
+        "robot": robot_name(config.env.robot),
         "k_int": config.env.rules.k_int,
         "seed": config.run.seed,
         "completed": result.completed,

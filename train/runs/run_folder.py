@@ -6,6 +6,7 @@
                  tensorboard/      the same as events
                  checkpoints/      see `checkpoint`
                  summary.json      how it ended
+                 robot/            the file of a robot of the user's own
                  lock              held by the process that trains it
 """
 
@@ -16,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from interactive_nav_common.config import Natural, NotNegative, flatten
+from interactive_nav_common.config import Natural, NotNegative, flatten, replace
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_text, writing
 from interactive_nav_common.records import METRICS, RUNS, read_metrics, write_metrics
@@ -63,6 +64,7 @@ class RunFolder:
         self.tensorboard = path / "tensorboard"
         self.summary = path / "summary.json"
         self.lock = path / "lock"
+        self.robot = path / "robot"
 
     def read_config(self) -> TrainConfig:
         """The resolved config of the run."""
@@ -75,7 +77,16 @@ class RunFolder:
             raise FileError(f"{self.config}: cannot be read ({reason}); expected the config of a run") from None
         if not text.strip():
             raise FileError(f"{self.config}: is empty, expected the config of a run; fetch the run again")
-        return from_yaml(text, where=str(self.config))
+        config, robot = from_yaml(text, where=str(self.config)), self._kept_robot()
+        return dataclasses.replace(config, env=replace(config.env, robot=robot[0])) if robot else config
+
+    def _kept_robot(self) -> tuple[str, str] | None:
+        """Return the reference and identity of a robot of the user's own."""
+        if not self.robot.is_dir():
+            return None
+        from interactive_nav.robots.reference import kept  # heavy, and most runs need none
+
+        return kept(self.robot)
 
     def open(self, config: TrainConfig) -> bool:
         """Writes config and versions of a new run, or checks that an existing one is continued as it began.
@@ -83,9 +94,13 @@ class RunFolder:
         Returns:
             True where the run exists already.
         """
+        from interactive_nav.robots.reference import identity, keep
+
         exists = self.config.is_file()
         if exists:
-            old, new = flatten(self.read_config()), flatten(config)
+            old, new, robot = flatten(self.read_config()), flatten(config), self._kept_robot()
+            old["env.robot"] = robot[1] if robot else old["env.robot"]
+            new["env.robot"] = identity(config.env.robot)
             for name, value in new.items():
                 if old[name] != value and name not in MAY_CHANGE:
                     raise FileError(
@@ -93,6 +108,7 @@ class RunFolder:
                         "set run.name to begin another run, or remove the folder"
                     )
         write_text(self.config, to_yaml(config))
+        keep(config.env.robot, self.robot)
         write_text(self.path / VERSIONS, json.dumps(versions(), indent=1) + "\n")
         return exists
 

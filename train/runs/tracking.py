@@ -14,6 +14,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
 
+from interactive_nav.robots import robot_name
 from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError, missing, optional
 from interactive_nav_common.files import write_text
@@ -75,7 +76,7 @@ class Tracker:
                 id=kept.read_text().strip(),
                 resume="allow",
                 dir=str(folder),
-                group=f"{config.env.robot}-{config.algorithm}-k_int{config.env.rules.k_int:g}",
+                group=f"{robot_name(config.env.robot)}-{config.algorithm}-k_int{config.env.rules.k_int:g}",
                 config={**flatten(config), "versions": versions},
                 settings=wandb.Settings(console="off", silent=True),
             )

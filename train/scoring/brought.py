@@ -1,22 +1,17 @@
 """`name=module:factory` in, a policy that plays out: any Python callable, NumPy, JAX or PyTorch, on the host."""
 
 import dataclasses
-import importlib
-import importlib.util
-import os
 import re
-import sys
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 
-from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.words import first_line, import_function
 from train.errors import PolicyError
 from train.scoring.planners import HostPolicy
 
@@ -76,40 +71,6 @@ def named(word: str) -> str:
     return f"{name}={place}"
 
 
-def _first_line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
-
-
-def _load(place: str) -> Callable[[PlayedEnv], Any]:
-    """The factory at `module:factory` or `path/to/file.py:factory`; modules of the current folder count."""
-    module, _, name = place.rpartition(":")
-    is_file = module.endswith(".py")
-    folder = str(Path(module).resolve().parent) if is_file else os.getcwd()
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    try:
-        loaded = _load_file(Path(module)) if is_file else importlib.import_module(module)
-    except (Exception, SystemExit) as error:
-        raise PolicyError(f"--policy: cannot import {module} ({_first_line(error)}); {EXPECTED}") from error
-    made = getattr(loaded, name, None)
-    if not callable(made):
-        own = [n for n, v in vars(loaded).items() if callable(v) and getattr(v, "__module__", "") == loaded.__name__]
-        has = hasattr(loaded, name)
-        got = f"{name!r} of type {type(made).__name__}" if has else f"no {name!r}{nearest(name, own)}"
-        raise PolicyError(
-            f"--policy: {module} has {got}; expected a function of one description: {', '.join(own) or 'it has none'}"
-        )
-    return made
-
-
-def _load_file(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"policy_of_{path.stem}", path)
-    assert spec and spec.loader
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 class BroughtPolicy(HostPolicy):
     """A callable of the user's; see `docs/benchmark-your-policy.md`.
 
@@ -120,7 +81,7 @@ class BroughtPolicy(HostPolicy):
 
     def __init__(self, word: str, env: Any):
         self._name, _, place = word.partition("=")
-        self._act = self._call("factory", _load(place), told(env))
+        self._act = self._call("factory", import_function(place, "--policy", EXPECTED, PolicyError), told(env))
         if not callable(self._act):
             raise self._error(f"its factory returned type {type(self._act).__name__}, expected a callable")
         self._size = env.action_size
@@ -163,7 +124,7 @@ class BroughtPolicy(HostPolicy):
             frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
             own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
             where = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
-            raise self._error(f"{what}: raised {_first_line(error)}{where}") from error
+            raise self._error(f"{what}: raised {first_line(error)}{where}") from error
 
     def _error(self, text: str) -> PolicyError:
         return PolicyError(f"policy {self._name}: {text}")

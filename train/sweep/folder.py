@@ -134,7 +134,10 @@ class SweepFolder:
 
     def episode_files(self, run: RunSpec) -> tuple[str, ...]:
         """Files of the fixed episodes that a run is to play."""
-        return tuple(f.replace("{robot}", run.config.env.robot) for f in self.sweep.config.evaluate.episode_files)
+        from interactive_nav.robots import robot_name  # heavy, and the table of a sweep does without
+
+        files = self.sweep.config.evaluate.episode_files
+        return tuple(file.replace("{robot}", robot_name(run.config.env.robot)) for file in files)
 
     def evaluated(self, run: RunSpec) -> bool:
         """Rows are there, as wanted, of the run as far as it is trained."""

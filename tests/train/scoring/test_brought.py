@@ -250,10 +250,10 @@ def test_rows_of_a_command(module, tmp_path):
         (["nowhere.py:make"], "--policy: cannot import nowhere.py (FileNotFoundError: "),
         (
             ["my_policy:folower"],
-            "--policy: my_policy has no 'folower', did you mean 'Follower'?; expected a function of one description: "
+            "--policy: my_policy has no 'folower', did you mean 'Follower'?; expected one of its functions: "
             "Follower, Constant, broken, not_callable, ",
         ),
-        (["my_policy:number"], "--policy: my_policy has 'number' of type int; expected a function"),
+        (["my_policy:number"], "--policy: my_policy has 'number' of type int; expected one of its functions"),
         (["m=my_policy:broken"], "policy m: factory: raised RuntimeError: no weights here at my_policy.py:32"),
         (["m=my_policy:not_callable"], "policy m: its factory returned type int, expected a callable"),
         (["m=my_policy:wrong_shape"], "policy m: actions have shape (2, 3), expected (2, 2)"),
