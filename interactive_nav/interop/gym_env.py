@@ -11,6 +11,7 @@ Environment i of a batch reset with seed s plays the episodes of a single enviro
 """
 
 import functools
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from interactive_nav.interop.gym_steps import reset_where, step
+from interactive_nav.interop.gym_steps import NONFINITE_ACTIONS, reset_where, step
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.views import ThirdPerson
 from interactive_nav.robots import robot_names
@@ -37,9 +38,31 @@ except ImportError as error:
     raise MissingPackage(missing(__name__, "gymnasium", "gymnasium")) from error
 
 ARRAYS = ("numpy", "jax", "torch")
+SCENES = ("scenes_mjcf/apartment_0",)
+"""Come with the package; taken where none are given."""
+STEP_INFO = (*REWARD_TERMS, NONFINITE_ACTIONS)
+"""What `info` holds at every step."""
 VERSION = 0
 """Raised whenever reported numbers would move."""
 _SPELLING = {"turtlebot": "TurtleBot", "jackrabbot": "JackRabbot"}
+
+
+_PROCESS = os.getpid()
+_SPACES: list[spaces.Space] = []
+"""Of observations and actions of the last environment, for one in a forked process, which cannot be built."""
+
+
+def _forked() -> bool:
+    return os.getpid() != _PROCESS
+
+
+def _refuse_fork() -> None:
+    """Refuse to run in a forked process, in which JAX waits forever for threads that only its parent has."""
+    if _forked():
+        raise ConfigError(
+            "the environment runs in a forked process, in which JAX hangs; expected a spawned one: "
+            'AsyncVectorEnv(..., context="spawn"), or vector_kwargs={"context": "spawn"} of gymnasium.make_vec'
+        )
 
 
 def env_id(robot: str) -> str:
@@ -108,7 +131,8 @@ class InteractiveNavEnv(gymnasium.Env):
     Observation: float32 (29,) by default, see `interactive_nav.sensing.observation`; a dictionary where it has images.
     Action: float32 (A,) in [-1, 1].
     `terminated` on success or a state that is no longer finite, `truncated` at the time limit.
-    `info` holds the step's reward terms (`reward/...`) and, on an episode's last step, its scores
+    `info` holds the step's reward terms (`reward/...`), how many entries of the action were not finite and counted as
+    0 (`nonfinite_actions`) and, on an episode's last step, its scores
     (`EPISODE_METRICS`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
     `reset(options={"start": EpisodeStart})` plays a given episode.
     """
@@ -118,7 +142,7 @@ class InteractiveNavEnv(gymnasium.Env):
     def __init__(
         self,
         robot: str,
-        scenes: Sequence[str],
+        scenes: Sequence[str] = SCENES,
         render_mode: str | None = None,
         slot: int | None = None,
         **settings: Any,
@@ -126,7 +150,7 @@ class InteractiveNavEnv(gymnasium.Env):
         """Builds it.
 
         Args:
-            robot: a name from `robot_names()`.
+            robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
             scenes: scene folders; each episode draws one.
             render_mode: none, or "rgb_array": `render` returns a third-person view.
             slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
@@ -135,12 +159,18 @@ class InteractiveNavEnv(gymnasium.Env):
         Raises:
             ConfigError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
         """
+        if _forked() and _SPACES:  # Gymnasium's worker passes on what its first `reset` raises, but nothing from here
+            self._state, self.render_mode = None, render_mode
+            self.observation_space, self.action_space = _SPACES  # pyright: ignore[reportAttributeAccessIssue]
+            return
+        _refuse_fork()
         self.env = interactive_nav.make(robot, scenes, **settings)
         kept = _checked_slot(self.env, slot)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
         self.render_mode, self._camera = _checked_render_mode(render_mode), ThirdPerson(self.env)
         self.observation_space = observation_space_of(self.env)
         self.action_space = action_space_of(self.env)
+        _SPACES[:] = self.observation_space, self.action_space
         self._reset = jax.jit(lambda key: self.env.reset(key, kept))
         self._reset_to = jax.jit(self.env.reset_to)
         self._step = jax.jit(self.env.step)
@@ -148,6 +178,7 @@ class InteractiveNavEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draws an episode; with a seed, always the same sequence of episodes from here on."""
+        _refuse_fork()
         super().reset(seed=seed)
         given = _check_options(options, ("start",))
         fresh = seed is not None or self._state is None
@@ -157,11 +188,14 @@ class InteractiveNavEnv(gymnasium.Env):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control period."""
+        _refuse_fork()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step was called before reset")
-        self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        action = np.asarray(action, np.float32)
+        self._state = state = self._step(self._state, jnp.asarray(action))
         done, truncated = bool(state.done > 0), bool(state.info["truncation"] > 0)
         info = {name: float(state.metrics[name]) for name in REWARD_TERMS}
+        info[NONFINITE_ACTIONS] = float((~np.isfinite(action)).sum())
         if done:
             info |= {name: float(state.metrics[name]) for name in EPISODE_METRICS}
         return _to_numpy(state.obs), float(state.reward), done and not truncated, truncated, info
@@ -188,7 +222,7 @@ class InteractiveNavVectorEnv(VectorEnv):
     def __init__(
         self,
         robot: str,
-        scenes: Sequence[str],
+        scenes: Sequence[str] = SCENES,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         arrays: str = "numpy",
@@ -198,7 +232,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         """Builds it.
 
         Args:
-            robot: a name from `robot_names()`.
+            robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
             scenes: scene folders; each episode draws one.
             num_envs: N.
             autoreset_mode: an `AutoresetMode` or its value ("SameStep", "NextStep", "Disabled").
@@ -243,6 +277,7 @@ class InteractiveNavVectorEnv(VectorEnv):
                 on with its own sequence.
             options: `reset_mask` [N] bool: only these; `start`: an `EpisodeStart` with leaves [N, ...] to play.
         """
+        _refuse_fork()
         seed = int(seed) if isinstance(seed, np.integer) else seed
         super().reset(seed=seed if isinstance(seed, int) else None)
         given = _check_options(options, ("reset_mask", "start"))
@@ -265,6 +300,7 @@ class InteractiveNavVectorEnv(VectorEnv):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control period; see the class for what follows an episode's end."""
+        _refuse_fork()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step was called before reset")
         if self.autoreset_mode is AutoresetMode.DISABLED and bool(self._ended.any()):
@@ -308,13 +344,13 @@ class InteractiveNavVectorEnv(VectorEnv):
         """Values with their masks `_name`, in the places where `SyncVectorEnv` has them."""
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         if self.arrays != "numpy":
-            terms = {name: metrics[name] for name in REWARD_TERMS}
+            terms = {name: metrics[name] for name in STEP_INFO}
             scores = {name: metrics[name] for name in EPISODE_METRICS}
             final = {"final_obs": obs, "final_info": {**terms, **scores}} if same_step else scores
             return self._out({**terms, **final, **{f"_{name}": self._ended for name in final}})
         ended = np.array(self._ended)
         running = ~ended if same_step else ~np.array(was_over)
-        info = _masked({name: metrics[name] for name in REWARD_TERMS}, running)
+        info = _masked({name: metrics[name] for name in STEP_INFO}, running)
         if not ended.any():
             return info
         scores = {name: metrics[name] for name in EPISODE_METRICS}
@@ -324,7 +360,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             final_obs[i] = jax.tree.map(lambda x, i=i: x[i].copy(), rows)
-        final_info = _masked({name: metrics[name] for name in (*REWARD_TERMS, *EPISODE_METRICS)}, ended)
+        final_info = _masked({name: metrics[name] for name in (*STEP_INFO, *EPISODE_METRICS)}, ended)
         masks = {"_final_obs": ended, "_final_info": ended.copy()}
         return {**info, "final_obs": final_obs, "final_info": final_info, **masks}
 

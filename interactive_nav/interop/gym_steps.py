@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
 
 
+NONFINITE_ACTIONS = "nonfinite_actions"
+"""Entries of a step's action that are no finite number; the environment takes 0 for them."""
+
+
 def _where(mask: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
@@ -42,4 +46,5 @@ def step(
     told = new if mode.name == "NEXT_STEP" else stepped
     truncated = told.info["truncation"] > 0
     over = ended if mode.name == "NEXT_STEP" else jnp.zeros_like(ended)
-    return new, over, (told.obs, told.reward, (told.done > 0) & ~truncated, truncated, dict(told.metrics))
+    metrics = {**told.metrics, NONFINITE_ACTIONS: (~jnp.isfinite(actions)).sum(-1).astype(jnp.float32)}
+    return new, over, (told.obs, told.reward, (told.done > 0) & ~truncated, truncated, metrics)

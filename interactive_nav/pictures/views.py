@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import cKDTree
 
-from interactive_nav.pictures.camera import Painter
+from interactive_nav.pictures.camera import BEHIND_M, Painter, clear_way
 from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, SCENE, THINGS, SceneModel, cast, trace
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
@@ -176,10 +176,13 @@ class ThirdPerson:
     def _frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
         view = self._view(scene)
         view.pose(self.env.world, scene, qpos)
-        base = view.data.body(self.env.robot.base_body)
-        camera = chase_camera(base.xpos, yaw_from_quat(base.xquat), self.rows, self.columns)
-        paint = FloorPaint(goal_xy_w, self.env.success_distance_m)
-        return view.look(*camera, OUTSIDE, paint).colour
+        base, (back_m, up_m) = view.data.body(self.env.robot.base_body), BEHIND_M["follow"]
+        yaw, middle_m = yaw_from_quat(base.xquat), 0.6 * self.env.robot.height_m
+        target = np.array([*base.xpos[:2], base.xpos[2] - self.env.robot.spawn_height_m + middle_m])
+        back = np.array([-back_m * np.cos(yaw), -back_m * np.sin(yaw), up_m - middle_m])
+        back *= clear_way(view, target, back)
+        camera = look_along(target + back, -back), Lens(self.columns, self.rows, 60.0)
+        return view.textured(*camera, (*SCENE, ROBOT), FloorPaint(goal_xy_w, self.env.success_distance_m))
 
 
 def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:

@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from interactive_nav.robots.files import warn
 from interactive_nav.robots.infer import from_description
@@ -93,7 +93,7 @@ def _of_python(path: Path, function: str, registry: Mapping[str, Factory]) -> Fa
             f"robot {path}{function}: gave type {type(spec).__name__}, expected a RobotSpec for a control mode, or "
             "what from_file returns"
         )
-    return made
+    return cast(Factory, made)
 
 
 def keep(robot: str, folder: Path) -> None:

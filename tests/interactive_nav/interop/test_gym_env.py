@@ -1,5 +1,7 @@
 """Gymnasium's view: its own checker, its own `SyncVectorEnv` as the oracle of ours, seeds, masks, autoreset modes."""
 
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -267,3 +269,73 @@ def test_each_environment_of_a_batch_keeps_its_scene(room, two_rooms):
         gym_env.InteractiveNavEnv("turtlebot", **settings)
     with pytest.raises(ConfigError, match="slot is 1 with scene_choice='episode'"):
         gym_env.InteractiveNavEnv("turtlebot", slot=1, **{**settings, "scene_choice": "episode"})
+
+
+def test_a_robot_alone_names_an_environment():
+    env = gymnasium.make(ID, backend="native", num_objects=1)
+    assert [scene.name for scene in env.unwrapped.env.scenes] == ["apartment_0"]
+    batch = gymnasium.make_vec(ID, num_envs=2, backend="native", num_objects=1)
+    assert [scene.name for scene in batch.unwrapped.env.scenes] == ["apartment_0"]  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_actions_that_are_not_finite_are_zero_and_counted(single, same_step):
+    bad, zero = np.array([np.nan, np.inf], np.float32), np.zeros(2, np.float32)
+    single.reset(seed=5)
+    first = single.step(bad)
+    single.reset(seed=5)
+    second = single.step(zero)
+    np.testing.assert_array_equal(first[0], second[0])
+    assert (first[4]["nonfinite_actions"], second[4]["nonfinite_actions"]) == (2.0, 0.0)
+    same_step.reset(seed=5)
+    info = same_step.step(np.stack([bad, zero, [np.nan, 0.5]]).astype(np.float32))[4]
+    assert info["nonfinite_actions"].tolist() == [2.0, 0.0, 1.0] and info["_nonfinite_actions"].all()
+
+
+def test_pictures_have_textures(settings):
+    env = gymnasium.make(ID, render_mode="rgb_array", backend="native", num_objects=2)
+    env.reset(seed=3)
+    frame = env.render()
+    assert isinstance(frame, np.ndarray) and frame.shape == (360, 480, 3)
+    wood = frame[300:].reshape(-1, 3).astype(int)  # the floor in front of the camera: brown, with a grain
+    assert (wood[:, 0] > wood[:, 2]).mean() > 0.8 and len(np.unique(wood, axis=0)) > 300
+
+
+WORKERS = """
+import functools, sys, time
+import gymnasium
+from gymnasium.vector import AsyncVectorEnv
+import interactive_nav.interop.gym_env
+if __name__ == "__main__":
+    one = functools.partial(gymnasium.make, "{id}", scenes=["{scene}"], backend="native", num_objects=1)
+    envs = AsyncVectorEnv([one] * 2, context="{context}")
+    print(envs.reset(seed=0)[0].shape, len(envs.processes), flush=True)
+    print(len(envs.step(envs.action_space.sample())), flush=True)
+    time.sleep(600)
+"""
+
+
+def start(tmp_path, room, context):
+    path = tmp_path / "workers.py"
+    path.write_text(WORKERS.format(id=ID, scene=room, context=context))
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", path], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.heavy
+def test_forked_workers_are_refused_in_the_parent(tmp_path, room):
+    out, error = start(tmp_path, room, "fork").communicate()
+    assert out == "" and error.strip().splitlines()[-1].endswith(
+        "ConfigError: the environment runs in a forked process, in which JAX hangs; expected a spawned one: "
+        'AsyncVectorEnv(..., context="spawn"), or vector_kwargs={"context": "spawn"} of gymnasium.make_vec'
+    )
+
+
+@pytest.mark.heavy
+def test_spawned_workers_step_and_end_with_their_parent(tmp_path, room):
+    parent = start(tmp_path, room, "spawn")
+    assert parent.stdout is not None
+    assert parent.stdout.readline().startswith("(2, 29) ") and parent.stdout.readline() == "5\n"
+    parent.kill()
+    # Returns when nobody holds the output any more: the workers, which share it, have ended.
+    assert parent.communicate()[0] == ""
