@@ -1,11 +1,13 @@
 """Paths in; meshes, images, JSON and hashes out; a failure is one `SceneRejected` line."""
 
+import collections
 import contextlib
 import dataclasses
 import functools
 import hashlib
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -179,29 +181,50 @@ class ObjMesh:
     group: np.ndarray
     """(m,) int64 into `groups`; -1 before the first `g` or `o`."""
     groups: tuple[str, ...]
+    colours: np.ndarray | None
+    """(n, 3) uint8 of the vertices, or None."""
+    unused: dict[str, int]
+    """Keyword that is not read -> how many lines begin with it."""
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file, which older exporters write in Latin-1."""
+    data = path.read_bytes()
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
 
 
 def read_obj(path: Path) -> ObjMesh:
     """Reads a polygon OBJ in its own vertex order (labels refer to it; mesh libraries reorder at seams)."""
     positions: list[str] = []
+    tints: dict[int, list[str]] = {}
     uvs: list[str] = []
     corners: list[str] = []
     sizes: list[int] = []
     material: list[tuple[int, int]] = []
     names: dict[str, int] = {}
     groups: dict[str, int] = {}
-    libraries: list[str] = []
+    libraries: dict[str, int] = {}
+    tables = {"usemtl": names, "mtllib": libraries, "g": groups, "o": groups}
+    unused: collections.Counter[str] = collections.Counter()
     current = group = -1
     try:
-        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-            if line.startswith("v "):
-                positions.extend(line.split()[1:4])
-                if len(positions) % 3:
-                    raise SceneRejected(f"{path}:{number}: a vertex has fewer than 3 coordinates; fetch the file again")
-            elif line.startswith("vt "):
-                uvs.extend((line.split() + ["0"])[1:3])
-            elif line.startswith("f "):
-                words = line.split()[1:]
+        for number, line in enumerate(read_text(path).split("\n"), 1):
+            key, *words = line.partition("#")[0].split() or [""]
+            if key == "v":
+                if len(words) > 5:
+                    tints[len(positions) // 3] = words[-3:]
+                positions.extend(words[:3])
+                if len(words) < 3:
+                    raise SceneRejected(
+                        f"{path}:{number}: a vertex has fewer than 3 coordinates{_comma(line)}; export it again"
+                    )
+            elif key == "vt":
+                uvs.extend((*words, "0", "0")[:2])
+            elif key == "f":
                 if len(words) == 2:
                     continue  # an edge: it has no surface, and other programs pass over it
                 if len(words) < 3:
@@ -211,32 +234,52 @@ def read_obj(path: Path) -> ObjMesh:
                 corners.extend(words)
                 sizes.append(len(words))
                 material.append((current, group))
-            elif line.startswith("usemtl"):
-                current = names.setdefault(line[6:].strip(), len(names))
-            elif line.startswith(("g ", "o ")):
-                group = groups.setdefault(line[2:].strip(), len(groups))
-            elif line.startswith("mtllib"):
-                libraries.append(line[6:].strip())
+            elif key in tables:
+                index = tables[key].setdefault(line.strip()[len(key) :].strip(), len(tables[key]))
+                current, group = index if key == "usemtl" else current, index if key in "go" else group
+            elif key not in ("", "vn", "s"):
+                unused[key[:20]] += 1
         vertices = np.array(positions, float).reshape(-1, 3)
         uv = np.array(uvs, float).reshape(-1, 2)
-        index, uv_index = _corner_indices(corners)
+        index_of, uv_index = _corner_indices(corners)
     except (ValueError, OverflowError) as error:
-        raise SceneRejected(f"{path}: not readable as OBJ ({error}); the file is damaged, fetch it again") from error
+        raise SceneRejected(f"{path}: not readable as OBJ ({error}{_comma(str(error))}); export it again") from error
     corner, face = _fans(np.array(sizes, np.int64))
-    check_mesh(path, vertices, index[corner] - 1)
-    _unfold(vertices, index - 1, corner, face)
-    faces = index[corner] - 1
-    corner_uv = None
-    if len(uv) and uv_index is not None:
-        if uv_index.min() < 1 or uv_index.max() > len(uv):
-            raise SceneRejected(
-                f"{path}: a face names texture coordinate {int(uv_index.max())} of {len(uv)}; fetch the file again"
-            )
-        corner_uv = uv[uv_index - 1][corner]
-        if not np.isfinite(corner_uv).all():
-            corner_uv = np.where(np.isfinite(corner_uv), corner_uv, 0.0)
+    check_mesh(path, vertices, index_of[corner] - 1)
+    _unfold(vertices, index_of - 1, corner, face)
     of = np.array(material, np.int64)[face].T
-    return ObjMesh(vertices, faces, corner_uv, of[0], tuple(names), tuple(libraries), of[1], tuple(groups))
+    return ObjMesh(
+        vertices, index_of[corner] - 1, None if uv_index is None else _corner_uv(path, uv, uv_index, corner), of[0],
+        tuple(names), tuple(libraries), of[1], tuple(groups), _tinted(len(vertices), tints), dict(unused),
+    )  # fmt: skip
+
+
+def _corner_uv(path: Path, uv: np.ndarray, index: np.ndarray, corner: np.ndarray) -> np.ndarray | None:
+    """Return (m, 3, 2) of texture coordinates (n, 2) by the indices, from 1, of corners (m, 3)."""
+    if not len(uv):
+        return None
+    if index.min() < 1 or index.max() > len(uv):
+        raise SceneRejected(
+            f"{path}: a face names texture coordinate {int(index.max())} of {len(uv)}; fetch the file again"
+        )
+    return np.nan_to_num(uv[index - 1][corner], posinf=0.0, neginf=0.0)
+
+
+def _comma(text: str) -> str:
+    """Return a hint where numbers are written with decimal commas."""
+    found = re.search(r"\d,\d", text)
+    return ": it has decimal commas, expected points, which exporters write under English number settings" * bool(found)
+
+
+def _tinted(count: int, tints: dict[int, list[str]]) -> np.ndarray | None:
+    """Return (n, 3) uint8 colours of vertices, white where a line has none; None without any."""
+    if not tints:
+        return None
+    values = np.nan_to_num([[as_number(word) for word in words] for words in tints.values()])
+    colours = np.full((count, 3), 255, np.uint8)
+    # Files have 0 to 1, or bytes.
+    colours[list(tints)] = np.clip(np.round(values if values.max() > 1 else 255 * values), 0, 255)
+    return colours
 
 
 def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:

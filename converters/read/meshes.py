@@ -21,14 +21,22 @@ from trimesh.visual import ColorVisuals
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
 from converters.read.files import SourceFolder, check_mesh, read_labels
-from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, read_texture, scan_of, texels, use_found
+from converters.read.formats.gltf import read_gltf
+from converters.read.obj import (
+    TexturedMesh,
+    join_meshes,
+    read_scan_obj,
+    read_texture,
+    scan_of,
+    texels,
+    textured_by_face,
+    use_found,
+)
 from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_extent, floor_level, labelled, welded, with_own_corners
 from converters.records.errors import SceneRejected
-from converters.records.limits import NUMBERS, check_count
 from converters.records.raw import RawScene
 from interactive_nav_common.errors import readable
-from interactive_nav_common.records import Reader
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
 """Of files that may be a scan."""
@@ -90,18 +98,6 @@ def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMe
     return source.surfaces[relative]
 
 
-def _check_gltf(path: Path) -> None:
-    """Refuses accessors without data: they are zeros, as many as they say."""
-    content = path.read_bytes()
-    if content[:4] == b"glTF":
-        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
-    tree = Reader(SceneRejected, "export it again").decoded(content, "JSON", str(path))
-    accessors = tree.get("accessors", []) if isinstance(tree, dict) else []
-    counts = [a.get("count") for a in accessors if isinstance(a, dict) and "bufferView" not in a]
-    numbers = sum(abs(count) for count in counts if isinstance(count, int | float))
-    check_count(path, numbers, NUMBERS, "elements in accessors without a bufferView", "export it again")
-
-
 def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
     if relative.lower().endswith(".obj"):
         return read_scan_obj(source, relative, remedy)
@@ -110,7 +106,7 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
     try:
         with readable(path, SceneRejected, "expected OBJ, PLY, STL, GLB or DAE", " as a mesh"), path.open("rb") as file:
             if path.suffix.lower() in (".glb", ".gltf"):
-                _check_gltf(path)
+                return _joined(path, read_gltf(source, path))
             loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
             assert isinstance(loaded, trimesh.Scene)
             parts = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
@@ -121,9 +117,13 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
         raise resolver.refusal from None
     if resolver.refusal is not None:
         raise resolver.refusal
+    return _joined(path, [_painted(path, part, turn) for part in parts])
+
+
+def _joined(path: Path, parts: list[TexturedMesh]) -> TexturedMesh:
     if not parts:
         raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
-    return join_meshes(*(_painted(path, part, turn) for part in parts))
+    return join_meshes(*parts)
 
 
 def read_single_mesh(
@@ -216,18 +216,6 @@ def face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
     if diffuse is not None:
         return np.tile(np.asarray(diffuse, np.uint8)[:3], (count, 1))
     return np.full((count, 3), 160, np.uint8)
-
-
-def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> TexturedMesh:
-    """A mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
-    palette, index = np.unique(np.asarray(colours, np.uint8), axis=0, return_inverse=True)
-    side = math.ceil(math.sqrt(len(palette)))
-    image = np.zeros((side * side, 3), np.uint8)
-    image[: len(palette)] = palette
-    image = np.repeat(np.repeat(image.reshape(side, side, 3), 4, axis=0), 4, axis=1)
-    row, column = np.divmod(index.reshape(-1), side)
-    uv = np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=1)
-    return TexturedMesh(vertices, faces, np.repeat(uv[:, None], 3, axis=1), image)
 
 
 def colours_of_faces(mesh: TexturedMesh) -> np.ndarray:

@@ -4,7 +4,11 @@ Names of files that an OBJ or MTL gives are sought generously, for folders trave
 missing costs colour only and is a warning.
 """
 
+import collections
+import dataclasses
+import math
 import os
+import unicodedata
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -12,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from converters.geometry.faces import stacked
-from converters.read.files import ObjMesh, SourceFolder, read_image, read_obj
+from converters.read.files import ObjMesh, SourceFolder, as_number, read_image, read_obj, read_text
 from converters.records.errors import SceneRejected
 from converters.records.limits import PIXELS
 from converters.records.raw import ScanMesh
@@ -22,6 +26,10 @@ GREY = (170, 170, 170)
 """Colour of what has none."""
 MAX_TEXTURE_PX = 8192
 """Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
+UNUSED = ("ke", "map_ke", "map_ka", "map_d", "map_tr")
+"""Statements of an MTL that change what viewers show, unless their numbers are 0."""
+NUMBERED = {"-o": 0.0, "-s": 1.0, "-t": 0.0}
+"""Options of a texture that take one to three numbers, and what the absent ones are; -mm takes two, others one word."""
 SMALL_IMAGE = 10_000
 """Numbers in an image that is compared with others to be kept once."""
 
@@ -30,18 +38,23 @@ def find_file(source: SourceFolder, folder: Path, name: str) -> Path | None:
     """The file that a model names, sought also by its bare name (paths of another machine, letter case)."""
     words = name.strip().strip('"').removeprefix("file://")
     bare = words.replace("\\", "/")
-    names = dict.fromkeys(n for n in (bare, bare.split()[-1] if bare.split() else bare, unquote(bare)) if n)
+    names = dict.fromkeys(n for n in (bare, unquote(bare)) if n)
     for candidate in names:
         path = folder / candidate
         if _is_there(path) and Path(os.path.abspath(path)).is_relative_to(os.path.abspath(source.root)):
             source.inside(path)
             return path
-    wanted = {n.rsplit("/", 1)[-1].lower() for n in names}
+    wanted = {_folded(n.rsplit("/", 1)[-1]) for n in names}
     for path in sorted(folder.iterdir()):
-        if path.name.lower() in wanted and _is_there(path):
+        if _folded(path.name) in wanted and _is_there(path):
             source.inside(path)
             return path
     return None
+
+
+def _folded(name: str) -> str:
+    """Return a file's name without regard to case and to how accents are composed."""
+    return unicodedata.normalize("NFC", name).lower()
 
 
 def _is_there(path: Path) -> bool:
@@ -60,19 +73,23 @@ def use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | 
     return source.use(relative, "")
 
 
-def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) -> dict[str, np.ndarray]:
+def read_materials(
+    source: SourceFolder, obj: Path, libraries: tuple[str, ...], moved: dict[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
     """Image of every material of an OBJ's MTL files; a material without a usable texture gets its colour (Kd).
 
     Args:
         source: the folder; takes warnings.
         obj: path of the OBJ, inside the folder.
         libraries: MTL names in the OBJ.
+        moved: takes the (2, 2) scale and offset of the texture coordinates of materials that have them.
 
     Returns:
         Material -> (h, w, 3) uint8; (1, 1, 3) for a plain colour.
     """
     where = source.relative(obj) or obj.name
-    found = [use_found(source, obj.parent, name, where) for name in libraries]
+    each = [[n] if find_file(source, obj.parent, n) else n.split() for n in libraries]  # a line may name several
+    found = [use_found(source, obj.parent, name, where) for names in each for name in names]
     paths = [p for p in found if p is not None]
     if not paths and obj.with_suffix(".mtl").is_file():
         paths = [source.use(source.relative(obj.with_suffix(".mtl")) or "", "")]
@@ -82,10 +99,18 @@ def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) 
         )
     result: dict[str, np.ndarray] = {}
     for path in paths:
-        for name, (colour, image_name) in parse_mtl(path.read_text(encoding="utf-8", errors="replace")).items():
+        text = read_text(path)
+        lines = [line.split() for line in text.split("\n") if line.lower().lstrip().startswith(UNUSED)]
+        words = [line[0] for line in lines if any(as_number(word) != 0 for word in line[1:])]
+        for word, count in sorted(collections.Counter(words).items()):
+            source.note(f"{source.relative(path)}: not used: {count} {word}")
+        for name, (colour, named) in parse_mtl(text).items():
             result[name] = np.array(colour, np.uint8).reshape(1, 1, 3)
-            if image_name:
+            if named:
+                image_name, placing = texture_options(named)
                 image = read_texture(source, path, image_name)
+                if moved is not None and (placing != [[1, 1], [0, 0]]).any():
+                    moved[name] = placing
                 result[name] = result[name] if image is None else image
     return result
 
@@ -128,6 +153,24 @@ def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
     return result
 
 
+def texture_options(text: str) -> tuple[str, np.ndarray]:
+    """Split the value of a `map_Kd`: name of the file, and (2, 2) the scale and the offset of its coordinates."""
+    placing = np.array([[1.0, 1.0], [0.0, 0.0]])
+    while (words := text.split(None, 1))[0].startswith("-") and len(words) > 1:
+        option, text = words[0].lower(), words[1]
+        values: list[float] = []
+        while option in NUMBERED and len(values) < 3 and math.isfinite(as_number(text.split(None, 1)[0])):
+            first, *rest = text.split(None, 1)
+            values, text = [*values, float(first)], "".join(rest)
+            if not text:
+                return "", placing
+        if option not in NUMBERED:
+            text = text.split(None, 2 if option == "-mm" else 1)[-1]
+        elif option != "-t":
+            placing[int(option == "-o")] = [*values, NUMBERED[option], NUMBERED[option]][:2]
+    return text, placing
+
+
 def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
     """Reads an OBJ with all its materials.
 
@@ -141,10 +184,13 @@ def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[
     """
     path = source.use(relative, remedy)
     mesh = read_obj(path)
-    if mesh.corner_uv is None and not mesh.libraries:
+    for word, count in sorted(mesh.unused.items()):
+        source.note(f"{relative}: not used: {count} {word}")
+    if mesh.corner_uv is None and not mesh.libraries and mesh.colours is None:
         source.note(f"{relative}: has no texture; it stays grey")
         return mesh, np.zeros(len(mesh.faces), np.int64), []
-    images = read_materials(source, path, mesh.libraries)
+    moved: dict[str, np.ndarray] = {}
+    images = read_materials(source, path, mesh.libraries, moved) if mesh.libraries or mesh.colours is None else {}
     grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
     chosen = [images.get(name, grey) for name in mesh.materials]
     absent = sorted({n for n in mesh.materials if n not in images})
@@ -156,7 +202,19 @@ def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[
         only = next(iter(images.values())) if len(images) == 1 else grey
         number[number < 0] = len(chosen)
         chosen.append(only)
-    return mesh, number, chosen
+    uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv.copy()
+    for name, (scale, offset) in moved.items():
+        of = np.array([n == name for n in mesh.materials] + [False])[mesh.material]
+        uv[of] = uv[of] * scale + offset
+    plain = np.array([image.shape[:2] == (1, 1) for image in chosen])[number]
+    if mesh.colours is not None and plain.any():
+        # Viewers differ in what colours of vertices do to a texture: there they are left out.
+        faces = mesh.faces[plain]
+        tinted = textured_by_face(mesh.vertices, faces, np.round(mesh.colours[faces].mean(axis=1)))
+        assert tinted.corner_uv is not None and tinted.texture is not None
+        uv[plain], number[plain] = tinted.corner_uv, len(chosen)
+        chosen.append(tinted.texture)
+    return dataclasses.replace(mesh, corner_uv=uv), number, chosen
 
 
 def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
@@ -222,6 +280,18 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
         result[of, :, 1] = (height - top - h + uv[..., 1] * h) / height
         top += h
     return result, joint
+
+
+def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> TexturedMesh:
+    """A mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
+    palette, index = np.unique(np.asarray(colours, np.uint8), axis=0, return_inverse=True)
+    side = math.ceil(math.sqrt(len(palette)))
+    image = np.zeros((side * side, 3), np.uint8)
+    image[: len(palette)] = palette
+    image = np.repeat(np.repeat(image.reshape(side, side, 3), 4, axis=0), 4, axis=1)
+    row, column = np.divmod(index.reshape(-1), side)
+    uv = np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=1)
+    return TexturedMesh(vertices, faces, np.repeat(uv[:, None], 3, axis=1), image)
 
 
 def at_most(image: np.ndarray, side: int) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import unicodedata
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from converters.read.files import SourceFolder, read_obj
-from converters.read.obj import TexturedMesh, join_meshes, join_textures, parse_mtl, read_scan_obj
+from converters.read.obj import TexturedMesh, join_meshes, join_textures, parse_mtl, read_scan_obj, texture_options
 from converters.records.errors import SceneRejected
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -92,6 +94,96 @@ def test_mtl_options_and_colours():
         "b": ((0, 0, 255), ""),
         "c": ((170, 170, 170), ""),
     }
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "placing"),
+    [
+        ("wood.png", "wood.png", [[1, 1], [0, 0]]),
+        ("my wood 2.png", "my wood 2.png", [[1, 1], [0, 0]]),
+        ("-clamp on -s 2 3 1 my wood.png", "my wood.png", [[2, 3], [0, 0]]),
+        ("-s 2 -o 0.5 -0.25 wood.png", "wood.png", [[2, 1], [0.5, -0.25]]),
+        ("-mm 0 1 -bm 0.5 -blendu off -imfchan r -texres 512 -t 1 1 1 a.png", "a.png", [[1, 1], [0, 0]]),
+    ],
+)
+def test_options_of_a_texture(text, name, placing):
+    found, where = texture_options(text)
+    assert found == name
+    np.testing.assert_array_equal(where, placing)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        str,
+        lambda t: t.replace(" ", "\t"),
+        lambda t: t.replace("v 1 1 0", "v 1 \\\n 1 0"),
+        lambda t: "\ufeff" + t.replace("\n", "\r\n"),
+        lambda t: t.replace("\nf", " # a corner, 1,5 high\nf"),
+    ],
+)
+def test_tabs_continued_lines_marks_and_comments(tmp_path, change):
+    path = tmp_path / "m.obj"
+    path.write_bytes(change(SQUARE + "f 1 2 3\nf 1 3 4\n").encode())
+    mesh = read_obj(path)
+    np.testing.assert_array_equal(mesh.vertices, [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)])
+    np.testing.assert_array_equal(mesh.faces, [(0, 1, 2), (0, 2, 3)])
+
+
+@pytest.mark.parametrize("line", ["v 0,5 1,0 0,0", "v 0,5,1", "vt 0,5 0,5"])
+def test_decimal_commas_are_named(tmp_path, line):
+    with pytest.raises(SceneRejected, match="decimal commas, expected points.*; export it again"):
+        read_obj(obj(tmp_path, SQUARE + line + "\nf 1 2 3\n"))
+
+
+@pytest.mark.parametrize("of", ["1 0.5 0", "255 128 0", "0.9 1 0.5 0", "1 0.5 none"])
+def test_colours_of_vertices_are_kept_where_no_texture_is(tmp_path, of):
+    """The textured face keeps its texture; a plain material gives way, as in mesh viewers."""
+    source = two_materials(tmp_path)
+    path = tmp_path / "mesh.obj"
+    lines = path.read_text().splitlines()
+    path.write_text("".join(f"{line} {of}\n" if line[:2] == "v " else f"{line}\n" for line in lines))
+    mesh = read_scan_obj(source, "mesh.obj", "")
+    assert [tuple(map(int, sampled(mesh, k))) for k in range(3)] == [(255, 0, 0), (255, 128, 0), (255, 128, 0)]
+    path.write_text("v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 1 1 0 0 0 1\nf 1 2 3\n")
+    assert tuple(sampled(read_scan_obj(SourceFolder(tmp_path), "mesh.obj", ""), 0)) == (85, 85, 85)
+
+
+def test_scale_and_offset_move_a_texture(tmp_path):
+    pixels = np.array([[(1, 1, 1), (2, 2, 2)], [(3, 3, 3), (4, 4, 4)]], np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "Boden Textur.png")
+    (tmp_path / "m.mtl").write_text(
+        "newmtl a\nmap_Kd Boden Textur.png\nnewmtl b\nmap_Kd -o 0.5 0 0 Boden Textur.png\n"
+        "newmtl c\nmap_Kd -s 1 3 1 -clamp on Boden Textur.png\n"
+    )
+    faces = "".join(f"usemtl {name}\nf 1/1 2/1 3/1\n" for name in "abc")
+    obj(tmp_path, f"mtllib m.mtl\n{SQUARE}vt 0.25 0.25\n{faces}")
+    source = SourceFolder(tmp_path)
+    mesh = read_scan_obj(source, "mesh.obj", "")
+    assert [int(sampled(mesh, k)[0]) for k in range(3)] == [3, 4, 1] and source.warnings == []
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+def test_names_with_umlauts_and_spaces_and_several_libraries(tmp_path, encoding):
+    Image.fromarray(np.full((2, 2, 3), (0, 9, 0), np.uint8)).save(tmp_path / unicodedata.normalize("NFD", "Büro ä.png"))
+    (tmp_path / "Möbel 1.mtl").write_bytes("newmtl Stuhl ü\r\nmap_Kd Büro ä.png\r\n".encode(encoding))
+    (tmp_path / "b.mtl").write_text("newmtl plain\nKd 0 0 1\n")
+    text = "mtllib Möbel 1.mtl\nmtllib c.mtl b.mtl\n" + SQUARE
+    text += "vt 0.5 0.5\nusemtl Stuhl ü\nf 1/1 2/1 3/1\nusemtl plain\nf 1 3 4\n"
+    (tmp_path / "mesh.obj").write_bytes(text.encode(encoding))
+    mesh = read_scan_obj(SourceFolder(tmp_path), "mesh.obj", "")
+    assert [tuple(map(int, sampled(mesh, k))) for k in range(2)] == [(0, 9, 0), (0, 0, 255)]
+
+
+def test_what_is_not_used_is_said_once(tmp_path):
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 1 0 0\nKe 0 0.0 0.000\nmap_d x.png\nmap_Bump y.png\nKe 1 0 0\nNs 9\n")
+    lines = "s off\no thing\n# word\nvn 0 0 1\nl 1 2\nl 2 3\ncurv 0 1 1 2\n"
+    obj(tmp_path, f"mtllib m.mtl\n{SQUARE}{lines}usemtl a\nf 1 2 3\n")
+    source = SourceFolder(tmp_path)
+    read_scan_obj(source, "mesh.obj", "")
+    assert source.warnings == [
+        "mesh.obj: not used: 1 curv", "mesh.obj: not used: 2 l", "m.mtl: not used: 1 Ke", "m.mtl: not used: 1 map_d",
+    ]  # fmt: skip
 
 
 def sampled(mesh: TexturedMesh, face: int) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""File formats whose libraries drop what changes place or colour."""

@@ -1,0 +1,353 @@
+"""Read glTF 2.0 files: placed meshes with the colours that viewers show in even white light.
+
+By the standard, factors and vertex colours are linear and images are sRGB. Products and sums are taken in linear light,
+and everything that leaves this module is sRGB, as in the other formats' images. trimesh writes all its colours as sRGB,
+and its default grey as the factor of every texture: in its files they are taken so.
+"""
+
+import base64
+import collections
+import dataclasses
+import io
+import re
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote_to_bytes
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from converters.read.files import SourceFolder, check_mesh
+from converters.read.obj import join_textures, read_texture, textured_by_face, use_found
+from converters.records.errors import SceneRejected
+from converters.records.limits import NUMBERS, PIXELS, check_count
+from converters.records.visual import TexturedMesh
+from interactive_nav_common.records import Reader
+
+READ = {
+    "KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit",
+    "KHR_materials_emissive_strength", "EXT_texture_webp", "EXT_mesh_gpu_instancing",
+}  # fmt: skip
+"""Extensions; others are refused where a file requires them, and reported where it only uses them."""
+COMPRESSED = {
+    "KHR_draco_mesh_compression": "Draco",
+    "EXT_meshopt_compression": "meshopt",
+    "KHR_meshopt_compression": "meshopt",
+}
+USED = ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_0")
+"""Attributes, besides the texture coordinates that a material names."""
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+TRIANGLES, STRIP, FAN = 4, 5, 6
+TRIMESH_GREY = 0.4
+TINTS = 16
+"""Copies of a texture, in different colours of vertices, that a primitive may need."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layer:
+    """A linear colour (3,), times a texture."""
+
+    colour: np.ndarray
+    image: np.ndarray | None = None
+    coordinates: str = ""
+    """Attribute."""
+    matrix: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
+    """(3, 3) of the texture's coordinates, their origin at the upper left."""
+
+
+def read_gltf(source: SourceFolder, path: Path) -> list[TexturedMesh]:
+    """Return the meshes of the default scene in its own frame.
+
+    Args:
+        source: the folder; takes hashes and warnings.
+        path: of a GLB or glTF file in the folder.
+    """
+    file = _File(source, path)
+    meshes = file.meshes()
+    for what, count in sorted(file.unused.items()):
+        source.note(f"{file.where}: not used: {count} {what}")
+    return meshes
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Return linear light of sRGB values, both 0 to 1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(light: np.ndarray) -> np.ndarray:
+    """Return sRGB bytes of linear light; what is brighter than white is white."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.round(255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)).astype(
+        np.uint8
+    )
+
+
+BYTES = linear(np.arange(256) / 255)
+
+
+class _File:
+    """A decoded file; counts what it does not use."""
+
+    def __init__(self, source: SourceFolder, path: Path) -> None:
+        self.source, self.path, self.where = source, path, source.relative(path) or path.name
+        content = path.read_bytes()
+        self.binary = b""
+        if content[:4] == b"glTF":
+            end = 20 + int.from_bytes(content[12:16], "little")
+            self.binary = content[end + 8 : end + 8 + int.from_bytes(content[end : end + 4], "little")]
+            content = content[20:end]
+        self.tree = Reader(SceneRejected, "export it again").decoded(content, "JSON", str(path))
+        self._check()
+        self.buffers: dict[int, bytes] = {}
+        self.images: dict[int, np.ndarray | None] = {}
+        self.painted: dict[tuple[Any, ...], np.ndarray] = {}
+        self.unused: collections.Counter[str] = collections.Counter()
+        for key in ("animations", "cameras", "skins"):
+            self.unused[key] += len(self.tree.get(key, []))
+        self.unused["scenes besides the default one"] += max(len(self.tree.get("scenes", [])) - 1, 0)
+        self.unused = +self.unused
+        self.srgb = "trimesh" in str(self.tree.get("asset", {}).get("generator"))
+        for name in set(self.tree.get("extensionsUsed", [])) - READ:
+            self.unused[f"extension {name}"] += 1
+
+    def _check(self) -> None:
+        version = str(self.tree.get("asset", {}).get("version", "2.0"))
+        if not version.startswith("2."):
+            raise SceneRejected(f"{self.path}: is glTF {version}, expected 2.0; export it as glTF 2.0")
+        required = set(self.tree.get("extensionsRequired", []))
+        absent = any("bufferView" not in a and "sparse" not in a for a in self.tree.get("accessors", []))
+        for name in sorted((set(self.tree.get("extensionsUsed", [])) if absent else required) & COMPRESSED.keys()):
+            raise SceneRejected(
+                f"{self.path}: is compressed with {COMPRESSED[name]}; export it without compression, or convert it "
+                f"with 'npx @gltf-transform/cli copy {self.path.name} plain.glb'"
+            )
+        if required - READ:
+            raise SceneRejected(
+                f"{self.path}: needs {', '.join(sorted(required - READ))}, which is not read; export it without that "
+                "extension (for KHR_texture_basisu: with PNG or JPEG textures)"
+            )
+        # Accessors without data are zeros, as many as they say.
+        counts = [a["count"] for a in self.tree.get("accessors", []) if "bufferView" not in a]
+        check_count(
+            self.path, sum(map(abs, counts)), NUMBERS, "elements in accessors without a bufferView", "export it again"
+        )
+
+    def meshes(self) -> list[TexturedMesh]:
+        """Return every primitive of every node that the scene shows."""
+        nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes", [])
+        below = {child for node in nodes for child in node.get("children", [])}
+        roots = scenes[self.tree.get("scene", 0)].get("nodes", []) if scenes else set(range(len(nodes))) - below
+        left, seen, found, faces = [(k, np.eye(4)) for k in roots], set(), [], 0
+        while left:
+            k, pose = left.pop()
+            if k in seen:
+                continue
+            seen.add(k)
+            pose = pose @ _pose(nodes[k])
+            left += [(child, pose) for child in nodes[k].get("children", [])]
+            if "mesh" not in nodes[k]:
+                continue
+            if "skin" in nodes[k]:
+                raise SceneRejected(
+                    f"{self.path}: bones move its node '{nodes[k].get('name', k)}'; apply the armature and export again"
+                )
+            mesh = self.tree["meshes"][nodes[k]["mesh"]]
+            weights = nodes[k].get("weights", mesh.get("weights", []))
+            for part in mesh["primitives"]:
+                for own in self._instances(nodes[k]):
+                    found += self._primitive(part, pose @ own, weights)
+                    faces += len(found[-1].faces) if found else 0
+                    check_count(self.path, faces, NUMBERS, "faces in its nodes", "simplify it")
+        return found
+
+    def _instances(self, node: Any) -> list[np.ndarray]:
+        """Poses (4, 4) in a node's frame of the copies of its mesh."""
+        given = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes")
+        if given is None:
+            return [np.eye(4)]
+        keys = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}
+        values = {keys[name]: self._accessor(k) for name, k in given.items() if name in keys}
+        return [_pose(dict(zip(values, row, strict=True))) for row in zip(*values.values(), strict=True)]
+
+    def _bytes(self, item: Any, what: str) -> bytes:
+        """Content of a buffer or image: a data URI, or a file beside the model."""
+        match = re.match(r"data:[^,]*?(;base64)?,", item["uri"])
+        if match:
+            data = unquote_to_bytes(item["uri"][match.end() :])
+            return base64.b64decode(data) if match[1] else data
+        found = use_found(self.source, self.path.parent, item["uri"], self.where)
+        if found is None:
+            raise SceneRejected(f"{self.path}: names the {what} '{item['uri']}', which is not there; put it there")
+        return found.read_bytes()
+
+    def _view(self, k: int) -> bytes:
+        """Return the bytes of a buffer view."""
+        view = self.tree["bufferViews"][k]
+        number, start = view["buffer"], view.get("byteOffset", 0)
+        if number not in self.buffers:
+            buffer = self.tree["buffers"][number]
+            self.buffers[number] = self._bytes(buffer, "buffer") if "uri" in buffer else self.binary
+        return memoryview(self.buffers[number])[start : start + view["byteLength"]]  # type: ignore[return-value]
+
+    def _array(self, at: Any, kind: str, count: int, width: int, stride: int = 0) -> np.ndarray:
+        row = np.dtype(kind).itemsize * width
+        if stride and stride < row:
+            raise ValueError(f"a byteStride of {stride}")
+        strides = (stride or row, np.dtype(kind).itemsize)
+        return np.ndarray((count, width), kind, self._view(at["bufferView"]), at.get("byteOffset", 0), strides)
+
+    def _accessor(self, k: int, width: int = 0, normalized: bool = False) -> np.ndarray:
+        """Return (count, width) numbers, normalised ones as floats; with `width`, of no other width."""
+        a = self.tree["accessors"][k]
+        kind, columns, count = COMPONENTS[a["componentType"]], WIDTHS.get(a["type"], 0), a["count"]
+        if not columns or width not in (0, columns):
+            raise SceneRejected(
+                f"{self.path}: accessor {k} is of type {a['type']!s:.20}, expected "
+                f"{next((w for w, n in WIDTHS.items() if n == width), 'a scalar or vector')}; export it again"
+            )
+        values = np.zeros((count, columns), kind)
+        if "bufferView" in a:
+            stride = self.tree["bufferViews"][a["bufferView"]].get("byteStride", 0)
+            values = self._array(a, kind, count, columns, stride)
+        if "sparse" in a:
+            sparse, values = a["sparse"], values.copy()
+            at = self._array(sparse["indices"], COMPONENTS[sparse["indices"]["componentType"]], sparse["count"], 1)
+            values[at[:, 0]] = self._array(sparse["values"], kind, sparse["count"], columns)
+        if (normalized or a.get("normalized")) and values.dtype.kind in "iu":
+            return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
+        return values.astype(float if values.dtype.kind == "f" else np.int64)
+
+    def _primitive(self, part: Any, pose: np.ndarray, weights: Any) -> list[TexturedMesh]:
+        """Return a primitive as one mesh; nothing of points and lines."""
+        mode, attributes = part.get("mode", TRIANGLES), part["attributes"]
+        if mode not in (TRIANGLES, STRIP, FAN):
+            self.unused["primitives of points or lines"] += 1
+            return []
+        vertices = self._accessor(attributes["POSITION"], 3).astype(float)
+        for weight, target in zip(weights, part.get("targets", []), strict=False):
+            vertices += weight * self._accessor(target["POSITION"], 3) if weight and "POSITION" in target else 0.0
+        index = self._accessor(part["indices"], 1)[:, 0] if "indices" in part else np.arange(len(vertices))
+        k = np.arange(max(len(index) - 2, 0))
+        if mode == TRIANGLES:
+            faces = index[: len(index) // 3 * 3].reshape(-1, 3)
+        else:
+            corners = [k, k + 1 + k % 2, k + 2 - k % 2] if mode == STRIP else [k + 1, k + 2, 0 * k]
+            faces = index[np.stack(corners, axis=1)]
+        if not len(faces):
+            return []
+        check_mesh(self.path, vertices, faces)
+        vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
+        faces = faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else faces
+        check_mesh(self.path, vertices, faces)
+        layers = self._layers(self.tree["materials"][part["material"]]) if "material" in part else None
+        named = {layer.coordinates for layer in layers or []}
+        for name in attributes.keys() - named - set(USED):
+            self.unused[f"attributes {name:.40}"] += 1
+        if layers is None and "COLOR_0" not in attributes:
+            return [TexturedMesh(vertices, faces, None, None)]
+        light = np.ones((len(faces), 3))
+        if "COLOR_0" in attributes:
+            light = self._light(self._accessor(attributes["COLOR_0"], normalized=True)[:, :3])[faces].mean(axis=1)
+        return [self._paint(vertices, faces, layers or [_Layer(np.ones(3))], light, attributes)]
+
+    def _light(self, colours: np.ndarray) -> np.ndarray:
+        return linear(np.clip(colours, 0.0, 1.0)) if self.srgb else colours
+
+    def _layers(self, material: Any) -> list[_Layer]:
+        """Return what a material reflects of white light, and what it emits."""
+        more = material.get("extensions", {})
+        pbr, gloss = material.get("pbrMetallicRoughness", {}), more.get("KHR_materials_pbrSpecularGlossiness")
+        base = ("baseColorFactor", "baseColorTexture") if gloss is None else ("diffuseFactor", "diffuseTexture")
+        strength = more.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        layers = [self._layer(pbr if gloss is None else gloss, *base, np.ones(3))]
+        emitted = self._layer(material, "emissiveFactor", "emissiveTexture", np.zeros(3))
+        return [*layers, dataclasses.replace(emitted, colour=emitted.colour * strength)]
+
+    def _layer(self, at: Any, factor: str, texture: str, default: np.ndarray) -> _Layer:
+        colour = np.array(at.get(factor, default), float)[:3] + np.zeros(3)
+        if self.srgb:
+            colour = default if texture in at and np.allclose(colour, TRIMESH_GREY) else self._light(colour)
+        if texture not in at or not colour.any():
+            return _Layer(colour)
+        info = at[texture]
+        image = self._image(self.tree["textures"][info["index"]])
+        moved = info.get("extensions", {}).get("KHR_texture_transform", {})
+        turn = moved.get("rotation", 0.0)
+        scale, c, s = np.diag([*moved.get("scale", (1.0, 1.0)), 1.0]), np.cos(turn), np.sin(turn)
+        matrix = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ scale
+        matrix[:2, 2] = moved.get("offset", (0.0, 0.0))
+        return _Layer(colour, image, f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}", matrix)
+
+    def _image(self, texture: Any) -> np.ndarray | None:
+        """Return a texture's image (h, w, 3) uint8; None and a warning where it cannot be read."""
+        others = [e["source"] for e in texture.get("extensions", {}).values() if "source" in e]
+        k = others[0] if others and "EXT_texture_webp" in texture["extensions"] else texture.get("source", *others[:1])
+        if k not in self.images:
+            image = self.tree["images"][k]
+            if "uri" in image and not image["uri"].startswith("data:"):
+                self.images[k] = read_texture(self.source, self.path, image["uri"])
+            else:
+                data = self._view(image["bufferView"]) if "bufferView" in image else self._bytes(image, "image")
+                try:
+                    with Image.open(io.BytesIO(data)) as opened:
+                        self.images[k] = np.asarray(opened.convert("RGB"))
+                except Exception:  # noqa: BLE001  (Pillow raises many kinds)
+                    self.source.repaired(f"{self.where}: cannot decode image {k}; the material's plain colour is taken")
+                    self.images[k] = None
+        return self.images[k]
+
+    def _paint(
+        self, vertices: np.ndarray, faces: np.ndarray, layers: list[_Layer], light: np.ndarray, attributes: Any
+    ) -> TexturedMesh:
+        """Return a mesh in the colours of its layers, the first of them times the faces' own `light` (m, 3)."""
+        layers = [x if x.image is not None and x.coordinates in attributes else _Layer(x.colour) for x in layers]
+        first = next((x for x in layers if x.image is not None), None)
+        if first is None:
+            emitted = sum((x.colour for x in layers[1:]), np.zeros(3))
+            return textured_by_face(vertices, faces, to_srgb(layers[0].colour * light + emitted))
+        for k, x in enumerate(layers):
+            if x.image is not None and (x.coordinates, x.matrix.tolist()) != (first.coordinates, first.matrix.tolist()):
+                self.unused["emissive textures in places of their own (their mean colour is added)"] += 1
+                layers[k] = _Layer(x.colour * BYTES[x.image].mean(axis=(0, 1)))
+        uv = np.nan_to_num(self._accessor(attributes[first.coordinates], 2).astype(float), posinf=0.0, neginf=0.0)
+        uv = uv @ first.matrix[:2, :2].T + first.matrix[:2, 2]
+        uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)[faces]
+        assert first.image is not None
+        colours, number = np.unique(np.round(255 * light), axis=0, return_inverse=True)
+        most = max(1, min(TINTS, PIXELS // 4 // first.image[..., 0].size))
+        if len(colours) > most:
+            row = Image.fromarray(np.clip(np.round(255 * light), 0, 255).astype(np.uint8)[None]).quantize(most)
+            palette = row.getpalette() or []
+            colours, number = np.reshape(palette, (-1, 3)), np.asarray(row)
+        images = [self._mixed(layers, colour / 255) for colour in colours]
+        return TexturedMesh(vertices, faces, *join_textures(uv, number.reshape(-1), images))
+
+    def _mixed(self, layers: list[_Layer], light: np.ndarray) -> np.ndarray:
+        """Return the image of layers in one place, the first of them times `light` (3,); the same object each time."""
+        layers = [dataclasses.replace(layers[0], colour=layers[0].colour * light), *layers[1:]]
+        key = tuple((id(x.image), *x.colour) for x in layers)
+        if key not in self.painted:
+            size = max((x.image.shape[:2] for x in layers if x.image is not None), key=lambda s: s[0] * s[1])
+            channels = []
+            for c in range(3):
+                total = np.zeros(size, np.float32)
+                for x in layers:
+                    table = (x.colour[c] * BYTES).astype(np.float32)
+                    plane = None if x.image is None else np.asarray(Image.fromarray(x.image[..., c]).resize(size[::-1]))
+                    total += np.float32(x.colour[c]) if plane is None else table[plane]
+                channels.append(to_srgb(total))
+            self.painted[key] = np.stack(channels, axis=-1)
+        return self.painted[key]
+
+
+def _pose(node: Any) -> np.ndarray:
+    """Return (4, 4) of a node in its parent."""
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    pose = trimesh.transformations.quaternion_matrix([w, x, y, z])
+    pose[:3, :3] *= node.get("scale", (1.0, 1.0, 1.0))
+    pose[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return pose
