@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from interactive_nav_common.errors import UserError
 from tests.mutations import SECRETS, mutated
@@ -85,8 +86,28 @@ def scans() -> dict[str, Target]:
         mesh = "<collision><geometry><mesh filename='box.obj' scale='1 1 1'/></geometry></collision>"
         (root / "thing.urdf").write_text(DRESSER.replace("revolute", "fixed").replace("</link>", mesh + "</link>", 1))
 
+    def painted(root: Path) -> None:
+        shell = trimesh.creation.box((4.0, 3.0, 2.4))
+        shell.invert()
+        shell = shell.subdivide()
+        table = trimesh.creation.box((0.8, 0.6, 0.7)).apply_translation((0.5, 0.3, -0.85))
+        image = Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
+        shell.visual = trimesh.visual.TextureVisuals(shell.vertices[:, :2] / 4, image=image)
+        table.visual.vertex_colors = [10, 200, 30, 255]
+        trimesh.Scene([shell, table]).export(root / "room.glb")
+
+    def coloured(root: Path) -> None:
+        room("obj")(root)
+        lines = (root / "room.obj").read_text().splitlines()
+        body = [f"{line} 0.1 0.5 0.9" if line.startswith("v ") else line for line in lines]
+        (root / "room.obj").write_text("\n".join(["mtllib room.mtl", *body[:-8], "usemtl wood", *body[-8:]]) + "\n")
+        (root / "room.mtl").write_text("newmtl wood\nKd 0.5 0.4 0.3\nmap_Kd -s 2 2 1 -o 0.5 0 0 -clamp on wood.png\n")
+        Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(root / "wood.png")
+
     meshes = {f"mesh {e}": _layout("", room(e), start=f"room.{e}") for e in ("ply", "obj", "glb", "stl", "dae", "off")}
     return meshes | {
+        "mesh painted": _layout("", painted, start="room.glb"),
+        "mesh coloured": _layout("", coloured, start="room.obj"),
         "gibson": _layout("gibson", fresh(tiny_raw.write_gibson)),
         "scan2cad": _layout("scan2cad", fresh(tiny_raw.write_scan2cad)),
         "interactive-gibson": _layout("interactive-gibson", released),
@@ -238,7 +259,7 @@ def runs() -> dict[str, Target]:
     }
 
 
-GROUPS = {"scans": (scans, 10), "homes": (homes, 4), "scenes": (scenes, 5), "runs": (runs, 4)}
+GROUPS = {"scans": (scans, 12), "homes": (homes, 4), "scenes": (scenes, 5), "runs": (runs, 4)}
 """Name -> its targets, and how many there are."""
 
 

@@ -6,6 +6,7 @@ word about what is missing. A COLLADA file states its unit and up axis; the othe
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import math
 import xml.etree.ElementTree as ElementTree
@@ -40,6 +41,14 @@ from interactive_nav_common.errors import readable
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
 """Of files that may be a scan."""
+COLLADA_UNUSED = ("animation", "camera", "controller", "light", "lines", "linestrips", "trifans", "tristrips")
+PLY_USED = {"element vertex", "element face"} | {
+    f"property {name}"
+    for name in (
+        *("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v", "texture_u"),
+        *("texture_v", "vertex_index", "vertex_indices", "texcoord"),
+    )
+}
 UP_AXES = {
     "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
     "Y_UP": Y_UP_TO_Z_UP,
@@ -117,7 +126,28 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
         raise resolver.refusal from None
     if resolver.refusal is not None:
         raise resolver.refusal
+    for what, count in sorted(_unused(path).items()):
+        source.note(f"{relative}: not used: {count} {what}")
     return _joined(path, [_painted(path, part, turn) for part in parts])
+
+
+def _unused(path: Path) -> dict[str, int]:
+    """Count what trimesh's readers pass over."""
+    if path.suffix.lower() == ".dae":
+        elements = collections.Counter(e.tag.rpartition("}")[2] for e in ElementTree.parse(path).iter())
+        return {tag: elements[tag] for tag in COLLADA_UNUSED if elements[tag]}
+    content = path.read_bytes()
+    if path.suffix.lower() == ".ply":
+        lines = [line.split() for line in content.partition(b"end_header")[0].decode("latin-1").splitlines()]
+        words = [f"{line[0]} {line[-1] if line[0] == 'property' else line[1]}" for line in lines if len(line) > 2]
+        return collections.Counter(w for w in words if w.startswith(("property", "element")) and w not in PLY_USED)
+    if path.suffix.lower() == ".off":
+        rows = [line.partition("#")[0].split() for line in content.decode("latin-1").splitlines()]
+        body = [row for row in rows if row][1:]
+        coloured = [row for row in body if row[0].isdigit() and len(row) > int(row[0]) + 1 > 3]
+        found = {"colours of faces": len(coloured), "colours of vertices": int(content.lstrip()[:1] == b"C")}
+        return {what: count for what, count in found.items() if count}
+    return {}
 
 
 def _joined(path: Path, parts: list[TexturedMesh]) -> TexturedMesh:

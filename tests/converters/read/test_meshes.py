@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +174,48 @@ def test_colladas_missing_texture_and_strange_unit_are_said(tmp_path):
     for asset in ('<unit meter="0"/>', '<unit meter="cm"/>', "<up_axis>W_UP</up_axis>"):
         with pytest.raises(SceneRejected, match="expected a positive number and one of X_UP, Y_UP, Z_UP"):
             read_surface(dae(tmp_path, asset), "models/m.dae", "")
+
+
+PLACES = np.array([(448262.0001, 5411932.0003, 520.00001), (448263, 5411932.0003, 520), (448263, 5411933.0007, 520.5)])
+
+
+@pytest.mark.parametrize(("kind", "order"), [("ascii", "<"), ("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_doubles_of_a_ply_keep_all_digits_and_other_properties_are_said(tmp_path, kind, order):
+    fields = [("x", "double"), ("y", "double"), ("z", "double"), ("quality", "float"), ("red", "uchar"),
+              ("green", "uchar"), ("blue", "uchar")]  # fmt: skip
+    head = f"ply\nformat {kind} 1.0\nelement vertex 3\n" + "".join(f"property {t} {name}\n" for name, t in fields)
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    text = "".join(f"{' '.join(repr(float(v)) for v in row)} 0.5 60 90 160\n" for row in PLACES) + "3 0 1 2\n"
+    data = b"".join(struct.pack(f"{order}3df3B", *row, 0.5, 60, 90, 160) for row in PLACES)
+    data += struct.pack(f"{order}B3i", 3, 0, 1, 2)
+    (tmp_path / "m.ply").write_bytes(head.encode() + (text.encode() if kind == "ascii" else data))
+    source = SourceFolder(tmp_path)
+    mesh = read_surface(source, "m.ply", "")
+    np.testing.assert_array_equal(mesh.vertices, PLACES)
+    assert tuple(colours_of_faces(mesh)[0]) == (60, 90, 160)
+    assert source.warnings == ["m.ply: not used: 1 property quality"]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", []),
+        ("COFF\n3 1 0\n0 0 0 9 9 9 9\n1 0 0 9 9 9 9\n0 1 0 9 9 9 9\n3 0 1 2\n", ["1 colours of vertices"]),
+        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 200 0 0\n", ["1 colours of faces"]),
+    ],
+)
+def test_colours_of_an_off_file_are_said(tmp_path, text, what):
+    (tmp_path / "m.off").write_text(text)
+    source = SourceFolder(tmp_path)
+    assert len(read_surface(source, "m.off", "").faces) == 1
+    assert source.warnings == [f"m.off: not used: {each}" for each in what]
+
+
+def test_what_of_a_collada_file_is_not_used_is_said(tmp_path):
+    image(tmp_path / "images/t t.png")
+    source = dae(tmp_path, "")
+    path = tmp_path / "models/m.dae"
+    more = '<library_animations><animation id="a"/><animation id="b"/></library_animations>'
+    path.write_text(path.read_text().replace("<library_images>", f"{more}<library_images>"))
+    read_surface(source, "models/m.dae", "")
+    assert source.warnings == ["models/m.dae: not used: 2 animation"]
