@@ -25,8 +25,10 @@ _TILTED = np.array([0.8, 0.36, 0.48, 0.0])
 FEET = 12
 """Points of each movable object that can touch the floor."""
 _FOOT_RADIUS_M = 2e-3
-_SOLID, _FLOOR = 1, 2
-"""Collision bits: bodies against each other, and what can touch the floor."""
+_SOLID, _FLOOR, _CEILING = 1, 2, 4
+"""Collision bits: bodies against each other, what can touch the floor, and flying robots against the ceiling."""
+CEILING_M = 1.2
+"""Height of the ceiling that flying robots meet: just below the tops of walls, which are cut above ground robots."""
 FLOOR_FRICTION = 0.05
 """Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
 
@@ -218,7 +220,19 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
                 actuator.ctrlrange = [-max(-low, high), max(-low, high)]
     for geom in spec.geoms:
         if geom.name != "floor" and (geom.contype or geom.conaffinity):
-            geom.contype |= _FLOOR
+            geom.contype |= _FLOOR | (_CEILING if robot.kind == "flying" else 0)
+    if robot.kind == "flying":
+        spec.worldbody.add_geom(
+            name="ceiling",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            pos=[0, 0, CEILING_M],
+            quat=[0, 1, 0, 0],
+            size=[0, 0, 0.1],
+            friction=[FLOOR_FRICTION, 0.005, 0.0001],
+            contype=0,
+            conaffinity=_CEILING,
+            group=4,
+        )
     return spec
 
 

@@ -228,8 +228,10 @@ class InteractiveNav(Env):
         # Contacts were dropped: what the robot did is no longer known, and the episode ends here.
         lost = ~broken & (signals.overflow > 0)
 
-        away = jnp.concatenate([nav.goal_xy_w, jnp.zeros(1)]) - nav.robot_pos_w
-        away = away if self.config.rules.success_in_3d else away[:2]
+        flies = self.robot.kind == "flying"
+        goal_w = jnp.concatenate([nav.goal_xy_w, jnp.full(1, self.robot.spawn_height_m if flies else 0.0)])
+        away = goal_w - nav.robot_pos_w
+        away = away if self.config.rules.success_in_3d or flies else away[:2]
         success = ~broken & ~lost & (jnp.linalg.norm(away) < self.success_distance_m)
         lifted = ~broken & ~lost & ~success & (nav.lifted_steps > 0) & self.config.rules.fail_when_lifted
         if self.config.rules.interaction_with == "anything":
