@@ -31,7 +31,7 @@ from converters.read.storeys import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.gate import Gate
-from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene
+from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene, at_origin
 from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
 from converters.structure.cut import cut_furniture
 from converters.structure.fill import fill_holes, wall_planes
@@ -266,8 +266,8 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
         gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows), shares)
         area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
         manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
-        measures = manifest.measures | {name: round(share, 4) for name, share in shares.items()}
-        manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3), measures=measures)
+        rounded = {name: round(share, 4) for name, share in shares.items()}
+        manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3), **rounded)
         save_manifest(manifest, folder)
     return Converted(folder, manifest, gates, settled, len(walls), clock.seconds, decomposed.worker_mib)
 
@@ -278,6 +278,7 @@ def _read(source: Path, name: str, config: ConvertConfig, annotations: Path | No
     raw = read_source(source, config.format, config.strict, *about)
     if annotations is not None:
         raw = with_annotations(raw, annotations, config.library)
+    raw = at_origin(raw)
     labelled = np.isin(raw.scan.labels, [label for own in CATEGORY_LABELS.values() for label in own]).any()
     unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
     told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit

@@ -72,6 +72,10 @@ class SceneManifest:
     """How full the scene is and how hard to get through (`converters/write/measures.py`); empty: not measured."""
     floor_unseen_m2: float = 0.0
     """Of the floor, what the source does not show: under and behind furniture, and gaps that were bridged."""
+    scan_kept: float | None = None
+    """Share of the scan, without its furniture, that is drawn; None: not measured."""
+    floor_open: float | None = None
+    """Share of the free floor that lies beyond all walls; None: not measured."""
     schema_version: int = SCHEMA_VERSION
 
 

@@ -77,6 +77,7 @@ def write_room(
                 pos=centre,
                 size=half,
                 density=mass / volume,
+                friction=[friction, 0.005, 0.0001],
                 contype=0,
                 conaffinity=0,
                 group=4,

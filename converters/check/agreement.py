@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from converters.structure.walls import border_cells
+from scenes_mjcf.agreement import differences, sliding_friction
 from scenes_mjcf.categories import ANY_MASS_KG, TABLE
 from scenes_mjcf.schema import SceneMaps, SceneObject
 
@@ -61,24 +62,15 @@ def manifest_values(
         model: of `scene.xml`.
         objects: as `scene.json` lists them; one that the model lacks is another gate's matter.
     """
-    differs, ratios, friction = [], [1.0], [1.0]
+    ratios, friction, differs = [1.0], [1.0], differences(model, objects)
     for item in objects:
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name)
         if body < 0:
             continue
         mass_kg = float(model.body_mass[body])
-        solid = [g for g in np.flatnonzero(model.geom_bodyid == body) if not model.geom(g).name.endswith("_visual")]
-        sliding = [float(model.geom_friction[g, 0]) for g in solid] or [item.friction]
-        told = (
-            ("mass_kg", mass_kg, item.mass_kg),
-            *(("friction", found, item.friction) for found in sorted(set(sliding))),
-        )
-        for what, found, said in told:
-            if abs(found - said) > 1e-3 * max(abs(said), 1e-3):
-                differs.append(f"{item.name}: {what} is {found:g} in scene.xml, {said:g} in scene.json")
         low, high = USUAL.get(item.category, ANY_MASS_KG)
         ratios.append(max(mass_kg / high, low / max(mass_kg, 1e-9)))
-        friction += sliding
+        friction += sliding_friction(model, body) or [item.friction]
     changed = [f"{name} is {got}, expected {expected}" for name, got, expected in _physics(model) if got != expected]
     values = {
         "manifest_differs": float(len(differs)),
@@ -86,7 +78,7 @@ def manifest_values(
         "least_friction": min(friction),
         "physics_changed": float(len(changed)),
     }
-    return values, {"manifest_differs": tuple(differs), "physics_changed": tuple(changed)}
+    return values, {"manifest_differs": differs, "physics_changed": tuple(changed)}
 
 
 def _physics(model: mujoco.MjModel) -> list[tuple[str, object, object]]:

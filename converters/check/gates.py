@@ -189,7 +189,7 @@ def evaluate(
     maps: SceneMaps,
     objects: Sequence[SceneObject],
     kept: Mapping[str, float] | None = None,
-    shares: Mapping[str, Any] | None = None,
+    shares: Mapping[str, float | None] | None = None,
 ) -> tuple[Gate, ...]:
     """Return every gate in the table's order.
 
@@ -198,7 +198,7 @@ def evaluate(
         maps: of the scene.
         objects: from its manifest.
         kept: object -> share of its model's area that is drawn; older scenes do not say it.
-        shares: `scan_kept` and `floor_open` as the conversion measured them; older scenes do not say them.
+        shares: `scan_kept` and `floor_open` as the conversion measured them; older scenes have neither gate.
     """
     object_names = [o.name for o in objects]
     try:
@@ -223,9 +223,7 @@ def evaluate(
         "walls": float(sum(n.startswith("wall_") for n in names)),
         "furniture_apart": len(apart) / max(len(bodies), 1),
     }
-    for name, without in (("scan_kept", 1.0), ("floor_open", 0.0)):
-        share = (shares or {}).get(name)
-        values[name] = float(share) if isinstance(share, int | float) else without
+    values |= {name: share for name, share in (shares or {}).items() if share is not None}
     for quantity in ("drift", "turn", "penetration"):
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
     agreed, warnings = manifest_values(model, objects)
@@ -241,7 +239,7 @@ def evaluate(
         )
     if off:
         warnings["unmatched_objects"] = (f"{', '.join(off)}: more than {OFF_MAP_M:g} m from all free floor of the map",)
-    return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS)
+    return tuple(judge(name, values[name], warnings.get(name, ())) for name in LIMITS if name in values)
 
 
 def drawn_shares(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -259,4 +257,5 @@ def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError:
         return manifest, (judge("compiles", 0.0),)
-    return manifest, evaluate(spec, maps, manifest.objects, drawn_shares(manifest.alignment), manifest.measures)
+    shares = {"scan_kept": manifest.scan_kept, "floor_open": manifest.floor_open}
+    return manifest, evaluate(spec, maps, manifest.objects, drawn_shares(manifest.alignment), shares)

@@ -176,3 +176,39 @@ class RawScene:
     """What the reader repaired or found missing, for scene.json."""
     attribution: str = dataclasses.field(default="", metadata=NOT_HASHED)
     """Whose the models are, for a file beside it; empty: there is none."""
+
+
+FAR_M = 100.0
+"""Coordinates beyond this lose accuracy in files and in single precision."""
+
+
+def at_origin(raw: RawScene) -> RawScene:
+    """Return the scene with its middle at x = y = 0, whole metres moved, if it reaches beyond `FAR_M`; heights stay."""
+    vertices = raw.scan.vertices[np.unique(raw.scan.faces)][:, :2]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if max(-low.min(), high.max()) <= FAR_M:
+        return raw
+    x, y = np.round((low + high) / 2)
+    by = np.array([x, y, 0.0])
+
+    def moved_map(given: GivenMap | None) -> GivenMap | None:
+        return given and dataclasses.replace(given, origin=(given.origin[0] - float(x), given.origin[1] - float(y)))
+
+    shift = np.eye(4)
+    shift[:3, 3] = -by
+    return dataclasses.replace(
+        raw,
+        scan=dataclasses.replace(raw.scan, vertices=raw.scan.vertices - by),
+        annotations=tuple(
+            dataclasses.replace(a, pose=shift @ a.pose, keypoints_scan=a.keypoints_scan - by) for a in raw.annotations
+        ),
+        given_map=moved_map(raw.given_map),
+        storeys=tuple(dataclasses.replace(s, given_map=moved_map(s.given_map)) for s in raw.storeys),
+        picture=tuple((points - by, faces) for points, faces in raw.picture),
+        lamps=tuple(dataclasses.replace(lamp, at=lamp.at - by) for lamp in raw.lamps),
+        windows=tuple(dataclasses.replace(window, middle=window.middle - by) for window in raw.windows),
+        warnings=(
+            *raw.warnings,
+            f"moved by ({-x:.0f}, {-y:.0f}) m to the origin; add ({x:.0f}, {y:.0f}) m to return to the source's frame",
+        ),
+    )

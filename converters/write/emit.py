@@ -373,4 +373,20 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
     spec = build_spec(parts, shared)
     spec.modelfiledir = str(folder)
     spec.compile()
-    (folder / "scene.xml").write_text(spec.to_xml(), encoding="utf-8")
+    (folder / "scene.xml").write_text(_full_lengths(spec), encoding="utf-8")
+
+
+def _full_lengths(spec: mujoco.MjSpec) -> str:
+    """Return the spec as XML with all digits of positions and sizes of 10 m and more, of which MuJoCo writes six."""
+
+    def full(match: re.Match[str]) -> str:
+        kind, name = match[1], match[2]
+        element = spec.body(name) if kind == "body" else spec.geom(name) if kind == "geom" else spec.site(name)
+        text = match[0]
+        for key in ("pos", "size") if element is not None else ():
+            values = np.asarray(getattr(element, key, ()), float)
+            if len(values) and np.isfinite(values).all() and np.abs(values).max() >= 10:
+                text = re.sub(rf' {key}="[^"]*"', f' {key}="{" ".join(f"{v:.12g}" for v in values)}"', text)
+        return text
+
+    return re.sub(r'<(body|geom|site) name="([^"]*)"[^>]*>', full, spec.to_xml())

@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from interactive_nav.scenes.checks import check_scene
 from interactive_nav_common.rotations import rotate
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 from scenes_mjcf.sets import PACKAGED, installed, meant
@@ -78,7 +79,7 @@ class Scene:
         friction and categories. Names, textures, colours and other looks are not in it."""
         maps = self.maps
         parts = [maps.traversable.shape, np.packbits(maps.traversable).tobytes().hex()]
-        parts += [_rounded([maps.resolution_m, *maps.origin_w]), _rounded(self.walls)]
+        parts += [_rounded([maps.resolution_m, *maps.origin_w]), _rounded(_six_digits(self.walls))]
         hulls = hull_sources(self.path / "scene.xml") if any(m.hulls for m in self.movables) else {}
         for movable in self.movables:
             parts += task_parts(movable, hulls.get(movable.name, []))
@@ -90,11 +91,20 @@ def _rounded(value: object) -> list:
     return (np.round(np.asarray(value, float), _DECIMALS) + 0.0).tolist()
 
 
+def _six_digits(rows: np.ndarray) -> np.ndarray:
+    """Return rows of centre, quaternion and half sizes, the lengths with six digits: older scenes have no more."""
+    rows = np.array(rows)
+    lengths = np.r_[0:3, 7:10] if rows.ndim == 2 else slice(None)
+    rows[..., lengths] = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[float])(rows[..., lengths])
+    return rows
+
+
 def task_parts(movable: Movable, hulls: list) -> list:
     """What of a body decides a task, to be hashed: all but its name; its hulls as `hull_sources` has them."""
     numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
     for name in ("name", "hulls", "hinge", "category"):
         del numbers[name]
+    numbers |= {"pos_w": _six_digits(movable.pos_w), "boxes": _six_digits(movable.boxes)}
     hinge = movable.hinge and [_rounded(v) for v in dataclasses.astuple(movable.hinge) if v is not None]
     return [movable.category, {name: _rounded(value) for name, value in numbers.items()}, hinge, hulls]
 
@@ -209,4 +219,5 @@ def load_scene(folder: str | Path) -> Scene:
         row[:3] = model.body_pos[structure] + rotate(model.body_quat[structure], row[:3])
     if not np.allclose(model.body_quat[structure], [1, 0, 0, 0]):
         raise SceneError(f"{xml}: body 'structure' is rotated, expected the identity")
+    check_scene(folder, manifest, maps, walls, movables, model)
     return Scene(folder, manifest.name, manifest.split, digest, manifest, maps, walls, tuple(movables))

@@ -1,0 +1,37 @@
+"""Compare what `scene.json` states about objects with a compiled `scene.xml`."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from scenes_mjcf.schema import SceneObject
+
+TOLERANCE = 1e-3
+"""Largest relative difference of two numbers that mean the same."""
+
+
+def sliding_friction(model: mujoco.MjModel, body: int) -> list[float]:
+    """Return the sliding coefficients of a body's geoms, without those that only show it."""
+    solid = [g for g in np.flatnonzero(model.geom_bodyid == body) if not model.geom(g).name.endswith("_visual")]
+    return [float(model.geom_friction[g, 0]) for g in solid]
+
+
+def differences(model: mujoco.MjModel, objects: Sequence[SceneObject]) -> tuple[str, ...]:
+    """Return a line for each mass or friction in which the two files differ; objects that the model lacks are skipped.
+
+    Args:
+        model: of `scene.xml`.
+        objects: as `scene.json` lists them.
+    """
+    lines = []
+    for item in objects:
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name)
+        if body < 0:
+            continue
+        pairs = [("mass_kg", float(model.body_mass[body]), item.mass_kg)]
+        pairs += [("friction", value, item.friction) for value in sorted(set(sliding_friction(model, body)))]
+        for what, value, stated in pairs:
+            if not abs(value - stated) <= TOLERANCE * max(abs(stated), 1e-3):
+                lines.append(f"{item.name}: {what} is {value:g} in scene.xml, {stated:g} in scene.json")
+    return tuple(lines)
