@@ -18,6 +18,7 @@ from interactive_nav.episodes import EpisodeFileError
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import load_maps, save_maps
+from tests.toys import write_room
 
 
 @pytest.fixture(scope="module")
