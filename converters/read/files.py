@@ -149,7 +149,7 @@ def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     """Refuses what no stage can use."""
     if len(vertices) == 0 or len(faces) == 0:
         raise SceneRejected(
-            f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; fetch the file again"
+            f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; export its surface"
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SceneRejected(

@@ -29,7 +29,7 @@ from converters.read.homes.sh3d_sheet import WHITE
 from converters.read.homes.sh3d_walls import (
     HEIGHT_M,
     LOW_M,
-    Room,
+    enclosed,
     level_parts,
     opening_of,
     read_room,
@@ -39,6 +39,7 @@ from converters.read.homes.sh3d_walls import (
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.read.storeys import storey_of
+from converters.read.surfaces import check_extent
 from converters.records.errors import SceneRejected
 from converters.records.limits import DRAWN, UNPACKED, check_count
 from converters.records.raw import Lamp, RawScene
@@ -181,10 +182,16 @@ class _Drawing:
             mine = [w for w in walls if w.base_m == base]
             here = [r for r in rooms if self.base_m.get(r.level, 0.0) == base]
             high = max([self.high_m[r.level] for r in here], default=HEIGHT_M)
+            if base == min(self.base_m.values()) or not here:  # higher up, what no room covers is open to below
+                bare = enclosed(mine, here)
+                if here and bare:
+                    area = sum(shapely.area(room.plan) for room in bare)
+                    self.source.note(f"{area:.1f} m2 within walls are in no room: taken for floor")
+                here = bare + here
             through = [[p for e, p in shafts.items() if self._crosses(e, z)] for z in (base, base + high)]
             made = level_parts(here, mine, openings, base, base + high, *(shapely.union_all(s) for s in through))
             parts += made
-            if made and any(r.floor is not None for r in here or [Room("", None, None, (np.zeros(0), None), None)]):
+            if made and any(r.floor is not None for r in here):
                 floors_m.add(base)
         for what, count in sorted(self.dropped.items()):
             if count:
@@ -192,6 +199,8 @@ class _Drawing:
         if not floors_m:
             raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
         storeys = _storeys(sorted(floors_m))
+        places = [p.surface.vertices @ p.pose[:3, :3].T + p.pose[:3, 3] for p in parts]
+        check_extent(str(self.source.root), np.vstack(places))
         lamps = self._brightest(storeys)
         return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps, windows=windows)
 

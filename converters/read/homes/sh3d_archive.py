@@ -45,7 +45,7 @@ def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
     except SceneRejected:
         raise
     except Exception as error:  # damaged archives fail in zipfile, zlib or the file system, each in its own way
-        reason = " ".join(str(error).replace(str(folder), "").split()) or type(error).__name__
+        reason = " ".join(str(error).replace(str(folder), "").split())[:200] or type(error).__name__
         raise SceneRejected(f"{path}: not readable as a Sweet Home 3D file ({reason}); save the home again") from None
 
 

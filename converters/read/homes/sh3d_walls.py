@@ -24,6 +24,8 @@ HEIGHT_M, LOW_M = 2.5, 1.2
 """Of a wall that says nothing; lower ones are built-in furniture to the map."""
 ARC_STEP_RAD = math.radians(10)
 SHORT_M, NEAR_M, THIN_M = 1e-3, 1e-6, 0.01
+SHAFT_M, COVERED = 0.6, 0.1
+"""Least width of what walls enclose and becomes floor without a room, and most of it that rooms may cover."""
 PARALLEL = 0.8
 """Least cosine between a wall and the openings that cut it."""
 SILL_M = 0.05
@@ -287,6 +289,18 @@ def read_room(element: ElementTree.Element, look: Callable[[ElementTree.Element,
     )
 
 
+def enclosed(walls: list[Wall], rooms: list[Room]) -> list[Room]:
+    """Return what the walls of a level enclose without any room in it, but for narrow shafts."""
+    stands = shapely.union_all([wall.polygon() for wall in walls])
+    drawn = shapely.union_all([room.plan for room in rooms])
+    inside = [shapely.Polygon(ring) for p in shapely.get_parts(stands) for ring in getattr(p, "interiors", ())]
+    return [
+        Room("room", None, plan, (WHITE, None), None) for plan in inside
+        if not shapely.is_empty(shapely.buffer(plan, -SHAFT_M / 2))
+        and shapely.area(shapely.intersection(plan, drawn)) < COVERED * shapely.area(plan)
+    ]  # fmt: skip
+
+
 def level_parts(
     rooms: list[Room],
     walls: list[Wall],
@@ -299,7 +313,7 @@ def level_parts(
     """Floors and ceilings of one level; of rooms that overlap the later one is seen.
 
     Args:
-        rooms: of the level. Without any, what its walls enclose is one.
+        rooms: of the level.
         walls: of the level; doorways through them have a floor too.
         openings: any.
         floor_m: height.
@@ -312,10 +326,6 @@ def level_parts(
     def level(height: float) -> Callable[[np.ndarray], np.ndarray]:
         return lambda flat: np.column_stack([flat, np.full(len(flat), height)])
 
-    stands = shapely.union_all([wall.polygon() for wall in walls])
-    if not rooms:
-        inside = [shapely.Polygon(ring) for p in shapely.get_parts(stands) for ring in getattr(p, "interiors", ())]
-        rooms = [Room("room", None, plan, (WHITE, None), None) for plan in inside]
     for room in reversed(rooms):
         if room.floor is not None:
             plan = shapely.difference(room.plan, taken)

@@ -344,6 +344,27 @@ def test_a_drawing_without_rooms_has_a_floor(tmp_path):
     assert seen(raw, (2.0, -1.5, 0.0), (0, 0, 1)) == (235, 235, 230)
 
 
+def test_what_walls_enclose_without_a_room_is_floor_on_the_ground(tmp_path):
+    parted = [*HOME[:4], wall("middle", "255 0", "255 300"), HOME[4].replace("x='400'", "x='245'")]
+    raw = read_sh3d(write_home(tmp_path, parted))
+    assert seen(raw, (1.0, -1.5, 0.0), (0, 0, 1)) == (16, 32, 48)
+    assert seen(raw, (3.0, -1.5, 0.0), (0, 0, 1)) == (235, 235, 230)
+    assert "4.2 m2 within walls are in no room: taken for floor" in raw.warnings
+    levels = "".join(f"<level id='{k}' elevation='{z}' height='250'/>" for k, z in (("low", 0), ("high", 262)))
+    both = [
+        e.replace("<wall ", f"<wall level='{k}' ").replace("<room ", f"<room level='{k}' ")
+        for k in ("low", "high") for e in parted
+    ]  # fmt: skip
+    raw = read_sh3d(write_home(tmp_path, [levels, *both]))
+    assert seen(raw, (1.0, -1.5, 2.62), (0, 0, 1)) == (16, 32, 48)
+    assert seen(raw, (3.0, -1.5, 2.62), (0, 0, 1)) == () and seen(raw, (3.0, -1.5, 0.0), (0, 0, 1)) != ()
+
+
+def test_pieces_that_stand_far_apart_are_refused(tmp_path):
+    far = wall("far", "990000 0", "990300 0")
+    assert "expected a building of at most 100 m" in refusal(write_home(tmp_path, [*HOME[:5], far]))
+
+
 def test_outlines():
     half = outline("M0,1 a0.5,0.997 0 1,1 1,0 z")
     assert half is not None and half.min() > -0.01 and half[:, 1].min() == pytest.approx(0.0, abs=0.05)
