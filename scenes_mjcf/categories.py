@@ -63,6 +63,9 @@ class Category:
     """Usual ranges of the longer horizontal side and of the height; None: it is not looked for in scans."""
     longest: float | None = None
     """Greatest usual ratio of the sides, of things that stand in rows: a row of chairs is no chair."""
+    most_m: Range | None = None
+    """Greatest horizontal side and height of the largest of its kind: what is larger is something else, whatever its
+    name; None: any size."""
     top_m: tuple[float, float, float] | None = None
     """Greatest usual depth, m, greatest and middle ratio of length to depth, of a rectangular top. A long table may be
     two, or one; what is longer than that, or deeper, is several put together."""

@@ -72,9 +72,10 @@ def read_source(
         mirror: of a mesh file: take -x for x.
     """
     about_mesh = (up, unit, mirror) != ("auto", "auto", False)
-    if source.is_file() and layout == "auto":
+    chosen = READERS[layout][1] if layout != "auto" else None
+    if source.is_file() and (chosen is None or chosen in [read for _, read in FILES.values()]):
         for endings, (root_of, read) in FILES.items():
-            if source.name.lower().endswith(endings) and not about_mesh:
+            if (source.name.lower().endswith(endings) if chosen is None else read is chosen) and not about_mesh:
                 raw = _read(read, root_of(source), strict, source, within=within)
                 return dataclasses.replace(raw, name=source.name.partition(".")[0])
         if source.suffix.lower() not in meshes.SUFFIXES:

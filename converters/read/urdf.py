@@ -6,6 +6,7 @@ known, from which it follows.
 
 import dataclasses
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from converters.read.files import SourceFolder, read_obj
 from converters.read.meshes import read_surface
 from converters.read.obj import TexturedMesh, find_file, join_meshes
 from converters.records.errors import SceneRejected
+
+MOST_KINDS = 30
+"""Of elements that are reported as not read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,9 +82,48 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
 def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
     """As many numbers as the default has, from text."""
     values = np.array((text or "").split() or default, float)
-    if values.shape != np.shape(default) or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e6:
+    if values.shape != np.shape(default) or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e8:
         raise ValueError(f"'{text}' is not {len(default)} usable numbers")
     return values
+
+
+def parse_xml(path: Path, kind: str) -> ElementTree.Element:
+    """Return the root of an XML file."""
+    try:
+        return ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise SceneRejected(f"{path}: not readable as {kind} ({error}); fetch the file again") from error
+
+
+def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Counter[str]) -> None:
+    """Count the elements and attributes that a reader does not use.
+
+    Args:
+        root: element.
+        table: element -> the names of those within it that are read and, after `|`, that need not be.
+        unread: kind -> count.
+    """
+    left = [(root, root.tag)]
+    while left:
+        element, row = left.pop()
+        used, _, more = table.get(row, "").partition("|")
+        known = {*used.split(), *more.split(), *table["any"].split()}
+        unread.update(f"{key}= of <{element.tag}>" for key in element.attrib if f"@{key}" not in known)
+        for child in element:
+            inner = f"{row}/{child.tag}"
+            if child.tag in used.split():
+                left.append((child, inner if inner in table else child.tag))
+            elif child.tag not in known:
+                unread[f"<{child.tag}> in <{element.tag}>"] += 1
+
+
+def report_unread(source: SourceFolder, where: str, unread: Counter[str]) -> None:
+    """Warn once of each kind that was not read, and of the number of kinds where there are many."""
+    counts = sorted((+unread).items(), key=lambda item: -item[1])
+    for kind, count in sorted(counts[:MOST_KINDS]):
+        source.note(f"{where}: {count} x {kind}: not read")
+    if len(counts) > MOST_KINDS:
+        source.note(f"{where}: {len(counts) - MOST_KINDS} more kinds of elements: not read")
 
 
 def _value(link: ElementTree.Element, tag: str) -> float | None:
@@ -158,24 +201,34 @@ def _bare(source: SourceFolder, relative: str) -> TexturedMesh:
     return TexturedMesh(mesh.vertices, mesh.faces, None, None)
 
 
+SHAPES = {
+    "box": (3, lambda s: trimesh.creation.box(s)),
+    "sphere": (1, lambda s: trimesh.creation.icosphere(2, s[0])),
+    "ellipsoid": (3, lambda s: trimesh.creation.icosphere(2).apply_scale(s)),
+    "cylinder": (2, lambda s: trimesh.creation.cylinder(*s, sections=16)),
+    "capsule": (2, lambda s: trimesh.creation.capsule(s[1], s[0], count=(12, 12))),
+    "cone": (2, lambda s: trimesh.creation.cone(*s, sections=16).apply_translation((0.0, 0.0, -s[1] / 2))),
+}
+"""Shape -> how many numbers are its size, and what builds it around its origin."""
+
+
 def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> TexturedMesh:
-    """A box, cylinder or sphere, uncoloured.
+    """Build an uncoloured shape of `SHAPES`.
 
     Args:
         path: named in errors.
         kind: of shape.
         text: a dimension's name -> its text, m.
     """
-    if kind == "box":
-        solid = trimesh.creation.box(numbers(text("size"), (0.0, 0.0, 0.0)))
-    elif kind == "cylinder":
-        solid = trimesh.creation.cylinder(
-            numbers(text("radius"), (0.0,))[0], numbers(text("length"), (0.0,))[0], sections=16
-        )
-    elif kind == "sphere":
-        solid = trimesh.creation.icosphere(2, numbers(text("radius"), (0.0,))[0])
-    else:
-        raise SceneRejected(f"{path}: geometry <{kind}>, expected mesh, box, cylinder or sphere")
+    if kind not in SHAPES:
+        raise SceneRejected(f"{path}: geometry <{kind}>, expected mesh, {', '.join(SHAPES)}")
+    count, build = SHAPES[kind]
+    names = {"box": ("size",), "ellipsoid": ("radii",)}.get(kind, ("radius", "length")[:count])
+    words = " ".join(text(name) or "" for name in names)
+    size = numbers(words, (0.0,) * count)
+    if size.min() < 0 or not size.any() or (kind != "box" and size.min() == 0):
+        raise SceneRejected(f"{path}: a <{kind}> of {size.tolist()} m, expected positive numbers")
+    solid = build(size)
     return TexturedMesh(np.asarray(solid.vertices, float), np.asarray(solid.faces, np.int64), None, None)
 
 

@@ -4,6 +4,7 @@ Authors of simulated homes fix most furniture to the world to save time. Here a 
 of a movable category, whatever its source calls it; what stands on such a part moves with it.
 """
 
+import collections
 import dataclasses
 import math
 import re
@@ -11,17 +12,19 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_attribution, read_licence
+from converters.read.homes.solids import flat
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
-from converters.read.meshes import colours_of_faces
+from converters.read.meshes import colours_of_faces, textured_by_face
 from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of
 from converters.read.storeys import label_storeys, storey_of
-from converters.read.surfaces import floor_level, with_own_corners
+from converters.read.surfaces import check_extent, floor_level, with_own_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
@@ -50,6 +53,12 @@ COLUMN_M, SHOWN = 0.1, 100_000
 """Side of the columns that level faces are compared in, and how many of these they take at most."""
 MASS_FACTOR = 2.0
 """A mass that far outside of its category's range is a placeholder."""
+HEAVY = 10.0
+"""A mass that many times the greatest of its category is no placeholder: the part is something else."""
+MOST_M, MOST_KG = (4.0, 3.0), 300.0
+"""Greatest horizontal side, height and mass of what is moved."""
+PLINTH_M, FLOOR_SHARE = 0.4, 0.25
+"""The floor of a home on a plane lies up to the first above it, over at least the second of the home's extent."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +83,8 @@ class Part:
     are found."""
     low: bool = False
     """Built in, and no higher than it shows."""
+    endless: bool = False
+    """A level plane at its pose, which has no end; its surface gives the colour."""
 
     @property
     def category(self) -> Category | None:
@@ -105,11 +116,9 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         parts: at least one.
         floors_m: heights of its storeys' floors from the lowest up; empty: it has one, which is found.
     """
+    parts, floors_m = _on_floors(source, parts, floors_m)
+    parts = _by_size(source, parts, weighed=layout == "sdf")
     bounds = [_bounds(part) for part in parts]
-    whole = joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])
-    if whole is None:
-        raise SceneRejected(f"{source.root}: holds no part; expected a floor")
-    floors_m = floors_m or (floor_level(whole.vertices, _shown(whole.vertices, whole.faces), str(source.root)),)
     floor_m = np.array(floors_m)[storey_of(np.array([low[2] for low, _ in bounds]), floors_m)]
     moves = [_moves(part, low, high, z) for part, (low, high), z in zip(parts, bounds, floor_m, strict=True)]
     check_count(source.root, sum(moves), MOVABLES, "pieces of furniture on its floor")
@@ -213,6 +222,81 @@ def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     above = np.append(order, -1)[np.searchsorted(key[order], key + TOUCH_M, "right")]
     hidden = (above >= 0) & (column[above] == column) & (z[above] - z < SLAB_M)
     return level[np.bincount(of, hidden, len(level)) <= HIDDEN_SHARE * np.bincount(of, minlength=len(level))]
+
+
+def _on_floors(
+    source: SourceFolder, parts: list[Part], floors_m: tuple[float, ...]
+) -> tuple[list[Part], tuple[float, ...]]:
+    """Return the parts with what shows of a plane without an end, and the heights of the floors.
+
+    The plane reaches as far as all other parts. It is the floor unless others, a little higher, cover so much of it
+    that they are: then it is the ground that the home stands on, and drawn only where it is no lower than a doorstep.
+    """
+    planes = [p for p in parts if p.endless]
+    rest = [p for p in parts if not p.endless] or planes
+    whole = _whole(rest)
+    if whole is None:
+        raise SceneRejected(f"{source.root}: holds no part; expected a floor")
+    shown = whole.vertices, _shown(whole.vertices, whole.faces)
+    if not planes or rest is planes:
+        return rest, floors_m or (floor_level(*shown, str(source.root)),)
+    plane = max(planes, key=lambda p: p.pose[2, 3])
+    ground_m = float(plane.pose[2, 3])
+    check_extent(str(source.root), whole.vertices)
+    height = shown[0][shown[1], 2].mean(axis=1)
+    above = height > ground_m - TOUCH_M
+    near = shown[1][above & (height < ground_m + PLINTH_M)]
+    low, high = whole.vertices[:, :2].min(axis=0), whole.vertices[:, :2].max(axis=0)
+    area_m2 = float(face_vectors(whole.vertices, near)[:, 2].sum()) / 2
+    floor_m = ground_m
+    if area_m2 > FLOOR_SHARE * float(np.prod(high - low)):
+        floor_m = floor_level(whole.vertices, shown[1][above], str(source.root))
+    if floor_m > ground_m + STANDS_M:
+        return rest, (floor_m,)
+    fixed = _whole([p for p in rest if p.static and (p.category is None or not p.category.is_object)])
+    covers = np.zeros((0, 3, 3)) if fixed is None else fixed.vertices[_shown(fixed.vertices, fixed.faces)]
+    off = covers[..., 2].mean(axis=1) - ground_m
+    covers = shapely.polygons(covers[(off > -TOUCH_M) & (off < SLAB_M)][..., :2])
+    vertices, faces = flat(shapely.difference(shapely.box(*low, *high), shapely.union_all(covers)))
+    if len(faces):
+        colour = np.tile(colours_of_faces(plane.surface)[:1], (len(faces), 1))
+        place = np.eye(4)
+        place[2, 3] = ground_m
+        rest = [*rest, dataclasses.replace(plane, pose=place, surface=textured_by_face(vertices, faces, colour))]
+    return rest, (floor_m,)
+
+
+def _by_size(source: SourceFolder, parts: list[Part], weighed: bool) -> list[Part]:
+    """Return the parts as their sizes and masses allow: a name alone makes no furniture of a wall.
+
+    A static part whose size or mass is none of its category's is built in; a loose one is of the category `other`, or
+    built in where it is too large or too heavy to be moved. Masses count where they are `weighed`: others than Gazebo's
+    are often placeholders.
+    """
+    result, changed = [], collections.defaultdict(list)
+    for part in parts:
+        category = part.category
+        if not part.held and (not part.static if category is None else category.is_object and category.name != "door"):
+            low, high = _bounds(part)
+            size_m, mass_kg = np.array([max((high - low)[:2]), high[2] - low[2]]), (weighed and part.mass_kg) or 0.0
+            most_m, most_kg = MOST_M, MOST_KG
+            if category is not None and category.most_m is not None and category.material is not None:
+                most_m, most_kg = category.most_m, HEAVY * category.material.mass_range_kg[1]
+            fits = (size_m <= most_m).all() and mass_kg <= most_kg
+            if not fits and (part.static or (size_m > MOST_M).any() or mass_kg > MOST_KG):
+                part = dataclasses.replace(part, held=True)
+                changed["too large or heavy for furniture, and built in"].append(part.name)
+            elif not fits:
+                part = dataclasses.replace(part, known_as="other")
+                changed["too large or heavy for their names, and of the category 'other'"].append(part.name)
+        result.append(part)
+    for what, names in changed.items():
+        source.note(f"{len(names)} parts are {what}: {', '.join(sorted(names)[:5])}")
+    return result
+
+
+def _whole(parts: list[Part]) -> TexturedMesh | None:
+    return joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])
 
 
 def _small(mesh: TexturedMesh) -> TexturedMesh:

@@ -1,0 +1,43 @@
+"""Build meshes of outlines in plan and of height fields."""
+
+from typing import Any
+
+import numpy as np
+import shapely
+
+
+def flat(region: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners (n, 3) at z = 0 and the faces (m, 3), which look up, of polygons in plan."""
+    polygons = [p for p in shapely.get_parts(region) if shapely.get_type_id(p) == 3 and shapely.area(p) > 1e-6]
+    triangles = [t for p in polygons for t in shapely.get_parts(shapely.constrained_delaunay_triangles(p))]
+    corners = [shapely.get_coordinates(shapely.orient_polygons(t))[:3] for t in triangles if shapely.area(t) > 1e-9]
+    plan = np.array(corners).reshape(-1, 2)
+    return np.column_stack([plan, np.zeros(len(plan))]), np.arange(len(plan)).reshape(-1, 3)
+
+
+def extruded(region: Any, height_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of the solid that rises from polygons in plan."""
+    low, faces = flat(region)
+    vertices, count = [low, low + [0.0, 0.0, height_m]], len(low)
+    every = [faces[:, ::-1], faces + count]
+    for ring in shapely.get_parts(shapely.boundary(shapely.orient_polygons(region))):
+        points = shapely.get_coordinates(ring)
+        for a, b in zip(points[:-1], points[1:], strict=True):
+            every.append(np.array([(0, 1, 2), (0, 2, 3)]) + sum(map(len, vertices)))
+            vertices.append(np.array([(*a, 0.0), (*b, 0.0), (*b, height_m), (*a, height_m)]))
+    return np.vstack(vertices), np.vstack(every)
+
+
+def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of a surface over the plane around the origin.
+
+    Args:
+        height_m: [rows along y, columns along x].
+        half_m: of its sides along x and y.
+    """
+    rows, columns = height_m.shape
+    x, y = np.meshgrid(np.linspace(-half_m[0], half_m[0], columns), np.linspace(-half_m[1], half_m[1], rows))
+    number = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    return np.column_stack([x.ravel(), y.ravel(), height_m.ravel()]), faces
