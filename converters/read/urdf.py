@@ -15,10 +15,24 @@ import trimesh
 
 from converters.geometry.pieces import convex_pieces
 from converters.read.files import SourceFolder, read_obj
-from converters.read.meshes import read_surface
+from converters.read.meshes import read_surface, textured_by_face
 from converters.read.obj import TexturedMesh, find_file, join_meshes
 from converters.records.errors import SceneRejected
 
+READ = {
+    "any": "| @name",
+    "robot": "link joint material | @version",
+    "link": "inertial visual collision contact | @type",
+    "inertial": "mass | origin inertia",
+    "visual": "origin geometry material",
+    "collision": "origin geometry | @group verbose",
+    "geometry": "mesh box sphere ellipsoid cylinder capsule cone",
+    "joint": "origin parent child | @type axis limit dynamics calibration safety_controller",
+    "contact": "lateral_friction | rolling_friction spinning_friction stiffness damping inertia_scaling contact_cfm "
+    "contact_erp",
+    "material": "color",
+}
+"""Element -> the names within it (@ before attributes) that are read and, after `|`, that change nothing seen."""
 MOST_KINDS = 30
 """Of elements that are reported as not read."""
 
@@ -51,14 +65,18 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
         root = ElementTree.parse(path).getroot()
         links = {str(e.get("name")): e for e in root.findall("link")}
         places = _link_places(path, root, links, hold)
-        visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual")]
-        solid = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision")]
+        rgba = {m.get("name"): str(c.get("rgba")) for m in root.iter("material") for c in m.findall("color")}
+        visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual", rgba)]
+        solid = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision", {})]
         masses = [_value(e, "inertial/mass") for e in links.values()]
         frictions = [_value(e, "contact/lateral_friction") for e in links.values()]
     except (ElementTree.ParseError, ValueError, KeyError, LookupError) as error:
         if isinstance(error, SceneRejected):
             raise
         raise SceneRejected(f"{path}: not readable as URDF ({type(error).__name__}: {error})") from error
+    unread: Counter[str] = Counter()
+    count_unread(root, READ, unread)
+    report_unread(source, relative, unread)
     surface = joined(visual or solid)
     if surface is None:
         raise SceneRejected(f"{path}: names no mesh to see or to collide with; expected a <visual> with geometry")
@@ -106,6 +124,8 @@ def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Count
     left = [(root, root.tag)]
     while left:
         element, row = left.pop()
+        if row not in table and not len(element):
+            continue
         used, _, more = table.get(row, "").partition("|")
         known = {*used.split(), *more.split(), *table["any"].split()}
         unread.update(f"{key}= of <{element.tag}>" for key in element.attrib if f"@{key}" not in known)
@@ -119,8 +139,8 @@ def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Count
 
 def report_unread(source: SourceFolder, where: str, unread: Counter[str]) -> None:
     """Warn once of each kind that was not read, and of the number of kinds where there are many."""
-    counts = sorted((+unread).items(), key=lambda item: -item[1])
-    for kind, count in sorted(counts[:MOST_KINDS]):
+    counts = sorted((+unread).items(), key=lambda item: (-item[1], item[0]))
+    for kind, count in counts[:MOST_KINDS]:
         source.note(f"{where}: {count} x {kind}: not read")
     if len(counts) > MOST_KINDS:
         source.note(f"{where}: {len(counts) - MOST_KINDS} more kinds of elements: not read")
@@ -171,8 +191,10 @@ def _link_places(
     return places
 
 
-def _geometries(source: SourceFolder, path: Path, link: ElementTree.Element, kind: str) -> list[TexturedMesh]:
-    """Meshes of a link's `<visual>` or `<collision>` elements, in the link's frame."""
+def _geometries(
+    source: SourceFolder, path: Path, link: ElementTree.Element, kind: str, rgba: dict[str | None, str]
+) -> list[TexturedMesh]:
+    """Return the meshes of a link's `<visual>` or `<collision>` elements, in the link's frame, coloured by `rgba`."""
     found = []
     for element in link.findall(kind):
         geometry = element.find("geometry")
@@ -189,6 +211,13 @@ def _geometries(source: SourceFolder, path: Path, link: ElementTree.Element, kin
             mesh = placed(mesh, np.diag([*numbers(shape.get("scale"), (1.0, 1.0, 1.0)), 1.0]))
         else:
             mesh = primitive(path, shape.tag, shape.get)
+        for material in element.findall("material"):
+            own = [str(color.get("rgba")) for color in material.findall("color")] or [
+                rgba.get(material.get("name"), "")
+            ]
+            if mesh.texture is None and own[0]:
+                colour = np.clip(np.round(255 * numbers(own[0], (0.0,) * 4)[:3]), 0, 255)
+                mesh = textured_by_face(mesh.vertices, mesh.faces, np.tile(colour, (len(mesh.faces), 1)))
         found.append(placed(mesh, _origin(element)))
     return found
 

@@ -13,6 +13,7 @@ from PIL import Image
 
 from converters.__main__ import main
 from converters.read.files import SourceFolder
+from converters.read.meshes import colours_of_faces
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
 from converters.single_object import ObjectConfig, convert_object, guess_category
@@ -64,6 +65,20 @@ def test_links_on_fixed_joints_are_one_body(tmp_path):
     assert item.mass_kg == 3.0 and item.pieces is not None and len(item.pieces) == 2
     np.testing.assert_allclose(item.surface.vertices[:, 2].max(), 0.2)
     np.testing.assert_allclose(max(v[:, 2].max() for v, _ in item.pieces), 0.2)
+
+
+def test_a_urdfs_colours_are_read_and_what_is_not_read_is_counted(tmp_path):
+    more = """<material name="red"><color rgba="1 0 0 1"/></material><gazebo/><gazebo/><transmission name="t"/>
+      <link name="top"><visual><geometry><capsule radius="0.1" length="0.2"/></geometry><material name="red"/></visual>
+      </link><joint name="on" type="fixed"><parent link="base"/><child link="top"/><mimic joint="on"/></joint>"""
+    source = SourceFolder(tmp_path)
+    item = read_urdf(source, write(tmp_path, more=more).name, "")
+    assert (255, 0, 0) in {tuple(colour) for colour in colours_of_faces(item.surface).tolist()}
+    assert [w for w in source.warnings if "not read" in w] == [
+        "thing.urdf: 2 x <gazebo> in <robot>: not read",
+        "thing.urdf: 1 x <mimic> in <joint>: not read",
+        "thing.urdf: 1 x <transmission> in <robot>: not read",
+    ]
 
 
 @pytest.mark.parametrize("mesh", ["package://objects/box.obj", "C:\\models\\BOX.obj"])

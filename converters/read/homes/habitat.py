@@ -29,6 +29,16 @@ SCENE, STAGE, OBJECT, ARTICULATED = (
     f".{kind}.json" for kind in ("scene_instance", "stage_config", "object_config", "ao_config")
 )
 LEXICON = "semantic_lexicon.json"
+KEYS = {
+    "scene": "stage_instance object_instances articulated_object_instances translation_origin user_defined",
+    "instance": "template_name translation rotation translation_origin motion_type uniform_scale non_uniform_scale "
+    "fixed_base shader_type user_defined",
+    "config": "render_asset collision_asset is_collidable up front scale units_to_meters COM mass friction_coefficient "
+    "semantic_id urdf_filepath shader_type requires_lighting force_flat_shading margin inertia restitution_coefficient "
+    "join_collision_meshes semantic_asset has_semantic_textures semantic_descriptor_filename nav_asset gravity "
+    "user_defined",
+}
+"""The keys that are read, or that change neither place, size nor colour."""
 DEFAULT_MASS_KG = 1.0
 """Habitat's own for what says nothing."""
 
@@ -98,13 +108,16 @@ class _Reader:
                 raise SceneRejected(f"{path}: {key} is {_short(found)}, expected a list of objects")
             instances += [(instance, kind) for instance in found]
         check_count(path, len(instances), PARTS, "instances")
-        for key in ("default_lighting", "navmesh_instance", "semantic_scene_instance", "default_pbr_shader_config"):
-            if scene.get(key):
-                self.dropped[f"{key} (not read)"] += 1
+        self._count(scene, "scene")
         for instance, kind in instances:
             yield self._part(instance, kind, local, path)
 
+    def _count(self, about: dict[str, Any], kind: str) -> None:
+        """Count the keys that are not read."""
+        self.dropped.update(f"{_short(key)[1:-1]} (not read)" for key in about if key not in KEYS[kind].split())
+
     def _part(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> Part:
+        self._count(instance, "instance")
         name = _word(instance, "template_name", path)
         if not name:
             raise SceneRejected(f"{path}: an instance has no template_name, expected the name of a stage or an object")
@@ -151,6 +164,7 @@ class _Reader:
             config, about = model, {"render_asset": model.name}
         else:
             about = self._table(config)
+            self._count(about, "config")
         render = self._mesh(about, "render_asset", config)
         if render is None:
             raise SceneRejected(f"{config}: names no render_asset, expected a mesh file")

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import trimesh
 
 from converters.read.files import SourceFolder
-from converters.read.homes.parts import Part, category_of, home
+from converters.read.homes.parts import LEVEL, Part, category_of, home
+from converters.read.homes.solids import height_field
 from converters.read.meshes import textured_by_face
 from converters.read.obj import TexturedMesh
-from converters.read.urdf import joined, placed
+from converters.read.urdf import SHAPES, joined, parse_xml, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_image
 from converters.records.raw import RawScene
@@ -30,6 +30,8 @@ from scenes_mjcf.categories import CATEGORIES, Category
 
 NUMBER = re.compile(r"\+?\d+\.?\d*(e\+?\d+)?", re.IGNORECASE)
 FARTHEST_M = 1e4
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
+"""MuJoCo's own for geoms: any other colour takes the place of the material's."""
 REMEDY = "put a copy of the file there, or give --root DIR, a folder that holds both"
 UNREAD = {
     **{"actuator": "nu", "sensor": "nsensor", "tendon": "ntendon", "equality": "neq", "flex": "nflex", "skin": "nskin"},
@@ -165,11 +167,7 @@ class _Files:
     def _parse(self, path: Path) -> ElementTree.Element:
         self.parsed += 1
         check_count(path, self.parsed, FILES, "MJCF files")
-        checked = self.source.use(self.source.inside(path), "an MJCF names it")
-        try:
-            return ElementTree.parse(checked).getroot()
-        except (ElementTree.ParseError, ValueError, LookupError) as error:
-            raise SceneRejected(f"{path}: not readable as MJCF ({error}); fetch the file again") from error
+        return parse_xml(self.source.use(self.source.inside(path), "an MJCF names it"), "MJCF")
 
 
 def _first(element: ElementTree.Element, *keys: str) -> float:
@@ -210,11 +208,17 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
             if mesh is None:
                 dropped[f"{_GEOM(model.geom_type[geom]).name[7:].lower()}: dropped"] += 1
                 continue
-            at = back @ _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
+            place = _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
+            at = back @ place
             collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+            is_plane = model.geom_type[geom] == _GEOM.mjGEOM_PLANE
+            if is_plane and place[2, 2] > LEVEL and (collides or not model.geom_size[geom, :2].all()):
+                # Planes collide without an end, whatever the size that they are drawn in.
+                parts.append(Part(model.body(body).name or "plane", place, mesh, None, True, held=True, endless=True))
+                continue
             if collides:
                 solid.append((placed(mesh, at), float(model.geom_friction[geom, 0])))
-            if model.geom_group[geom] < 3 and model.geom_rgba[geom, 3] > 0:
+            if model.geom_group[geom] < 3 and _rgba(model, int(geom))[3] > 0:
                 seen.append((placed(mesh, at), collides, int(model.geom_group[geom])))
         # Where a body has a group of geoms to look at, those of other groups that it collides with are not drawn; the
         # world's own geoms stand each for itself.
@@ -292,25 +296,30 @@ def _matrix(position: np.ndarray, quat: np.ndarray | None, turn: np.ndarray | No
 def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | None:
     """A geom's surface in its own frame; None for kinds without one. Planes without an end reach `span_m` far."""
     size, kind = model.geom_size[geom], _GEOM(model.geom_type[geom])  # a NumPy integer is `in` no tuple of kinds
-    material = int(model.geom_matid[geom])
-    rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+    rgba, data = _rgba(model, geom), int(model.geom_dataid[geom])
     if kind == _GEOM.mjGEOM_MESH:
-        return _of_mesh(model, int(model.geom_dataid[geom]), material, rgba)
+        return _of_mesh(model, data, int(model.geom_matid[geom]), rgba)
+    if kind == _GEOM.mjGEOM_HFIELD:
+        rows, columns, first = (int(v[data]) for v in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+        x, y, high, _ = model.hfield_size[data]
+        height_m = high * model.hfield_data[first : first + rows * columns].reshape(rows, columns).astype(float)
+        return _plain(*height_field(height_m, (x, y)), rgba)
     if kind == _GEOM.mjGEOM_PLANE:
         x, y = (v if v > 0 else span_m for v in size[:2])
-        solid = trimesh.Trimesh([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], [(0, 1, 2), (0, 2, 3)], process=False)
-    elif kind == _GEOM.mjGEOM_BOX:
-        solid = trimesh.creation.box(2 * size)
-    elif kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID):
-        solid = trimesh.creation.icosphere(2)
-        solid.apply_scale(size if kind == _GEOM.mjGEOM_ELLIPSOID else size[0])
-    elif kind == _GEOM.mjGEOM_CYLINDER:
-        solid = trimesh.creation.cylinder(size[0], 2 * size[1], sections=16)
-    elif kind == _GEOM.mjGEOM_CAPSULE:
-        solid = trimesh.creation.capsule(2 * size[1], size[0], count=(12, 12))
-    else:
+        corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], float)
+        return _plain(corners, np.array([(0, 1, 2), (0, 2, 3)]), rgba)
+    name = kind.name[7:].lower()
+    if name not in SHAPES:
         return None
+    sizes = {"box": 2 * size, "sphere": size[:1], "ellipsoid": size}.get(name, size[:2] * [1.0, 2.0])
+    solid = SHAPES[name][1](sizes)
     return _plain(np.asarray(solid.vertices, float), np.asarray(solid.faces, np.int64), rgba)
+
+
+def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Return a geom's colour: its own if it has one, or else its material's."""
+    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    return own if material < 0 or not np.allclose(own, DEFAULT_RGBA) else model.mat_rgba[material]
 
 
 def _plain(vertices: np.ndarray, faces: np.ndarray, rgba: np.ndarray) -> TexturedMesh:
@@ -335,4 +344,5 @@ def _of_mesh(model: mujoco.MjModel, mesh: int, material: int, rgba: np.ndarray) 
     at = model.tex_adr[texture]
     image = np.array(model.tex_data[at : at + height * width * channels], np.uint8).reshape(height, width, channels)
     # MuJoCo keeps images with their first row at the top and texture coordinates from there.
-    return TexturedMesh(vertices, faces, uv * [1.0, -1.0] + [0.0, 1.0], np.ascontiguousarray(image[..., :3]))
+    image = np.clip(image[..., :3] * rgba[:3], 0, 255).astype(np.uint8)
+    return TexturedMesh(vertices, faces, uv * [1.0, -1.0] + [0.0, 1.0], image)

@@ -57,6 +57,8 @@ HEAVY = 10.0
 """A mass that many times the greatest of its category is no placeholder: the part is something else."""
 MOST_M, MOST_KG = (4.0, 3.0), 300.0
 """Greatest horizontal side, height and mass of what is moved."""
+LEVEL = 0.9999
+"""Least cosine between the normal of a level plane and the upright."""
 PLINTH_M, FLOOR_SHARE = 0.4, 0.25
 """The floor of a home on a plane lies up to the first above it, over at least the second of the home's extent."""
 

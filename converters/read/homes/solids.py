@@ -1,4 +1,4 @@
-"""Build meshes of outlines in plan and of height fields."""
+"""Build meshes of polygons in plan and of height fields."""
 
 from typing import Any
 
@@ -13,19 +13,6 @@ def flat(region: Any) -> tuple[np.ndarray, np.ndarray]:
     corners = [shapely.get_coordinates(shapely.orient_polygons(t))[:3] for t in triangles if shapely.area(t) > 1e-9]
     plan = np.array(corners).reshape(-1, 2)
     return np.column_stack([plan, np.zeros(len(plan))]), np.arange(len(plan)).reshape(-1, 3)
-
-
-def extruded(region: Any, height_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices and faces of the solid that rises from polygons in plan."""
-    low, faces = flat(region)
-    vertices, count = [low, low + [0.0, 0.0, height_m]], len(low)
-    every = [faces[:, ::-1], faces + count]
-    for ring in shapely.get_parts(shapely.boundary(shapely.orient_polygons(region))):
-        points = shapely.get_coordinates(ring)
-        for a, b in zip(points[:-1], points[1:], strict=True):
-            every.append(np.array([(0, 1, 2), (0, 2, 3)]) + sum(map(len, vertices)))
-            vertices.append(np.array([(*a, 0.0), (*b, 0.0), (*b, height_m), (*a, height_m)]))
-    return np.vstack(vertices), np.vstack(every)
 
 
 def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

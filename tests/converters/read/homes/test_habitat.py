@@ -103,6 +103,13 @@ def test_where_things_stand_and_what_they_are(source):
     assert "1 x default_lighting" in told and "1 x articulated object" in told and "placeholder" in told
 
 
+def test_keys_that_are_not_read_are_counted(tmp_path):
+    odd = [{**SCENE_OBJECTS[0], "initial_joint_pose": [1], "mass_scale": 2}, {**SCENE_OBJECTS[0], "mass_scale": 3}]
+    told = read_habitat(write_home(tmp_path / "home", odd)).warnings
+    for count, key in ((2, "mass_scale"), (1, "initial_joint_pose")):
+        assert f"apt_0{SCENE}: {count} x {key} (not read)" in told
+
+
 def test_the_stage_is_floor_and_walls(source):
     raw = read_habitat(source)
     labels = face_labels(raw.scan.labels, raw.scan.faces)

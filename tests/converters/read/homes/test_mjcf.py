@@ -43,11 +43,11 @@ MORE = """<mujocoinclude>
 </mujocoinclude>"""
 
 
-def write_room(root: Path) -> Path:
+def write_room(root: Path, assets: str = "</asset>") -> Path:
     (root / "parts").mkdir(parents=True)
     trimesh.creation.box((0.8, 0.6, 0.7)).export(root / "parts" / "top.obj")
     (root / "more.xml").write_text(MORE)
-    (root / "home.xml").write_text(ROOM)
+    (root / "home.xml").write_text(ROOM.replace("</asset>", assets))
     return root
 
 
@@ -67,9 +67,45 @@ def test_free_bodies_and_named_furniture_move_and_the_rest_is_structure(tmp_path
     top = raw.cads[table.cad_id].vertices @ table.pose[:3, :3].T + table.pose[:3, 3]
     np.testing.assert_allclose([top.min(0), top.max(0)], [[0.5, 0.1, 0], [1.3, 0.7, 0.9]], atol=1e-5)  # with its vase
     area = face_areas(raw.scan.vertices, raw.scan.faces)
-    assert area[face_labels(raw.scan.labels, raw.scan.faces) == FLOOR].sum() == pytest.approx(12.0, rel=0.03)
+    assert area[face_labels(raw.scan.labels, raw.scan.faces) == FLOOR].sum() == pytest.approx(4.2 * 3.2, rel=0.03)
     assert any("1 x slide joint" in w for w in raw.warnings)
     assert set(raw.sources) == {"home.xml", "more.xml", "parts/top.obj"}
+
+
+HFIELD = '<hfield name="h" nrow="3" ncol="3" size="2.1 1.6 0.5 0.1" elevation="0 0 0 0 0 0 0 0 0"/></asset>'
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        (('size="2 1.5 0.1"', 'size="0 0 1"'),),
+        (('size="2 1.5 0.1"', 'size="50 50 1"'),),
+        (('type="plane" size="2 1.5 0.1"', 'type="hfield" hfield="h"'), ("</asset>", HFIELD)),
+    ],
+    ids=["no end", "large", "height field"],
+)  # fmt: skip
+def test_planes_and_height_fields_are_floor(tmp_path, changes):
+    root = write_room(tmp_path / "home")
+    change(root, *changes)
+    raw = read_mjcf(root)
+    assert raw.floor_height_m == pytest.approx(0.0, abs=1e-5) and "hfield" not in " ".join(raw.warnings)
+    area = face_areas(raw.scan.vertices, raw.scan.faces)
+    assert area[face_labels(raw.scan.labels, raw.scan.faces) == FLOOR].sum() == pytest.approx(4.2 * 3.2, rel=0.03)
+    assert {a.category for a in raw.annotations} == {"chair", "table"}
+
+
+@pytest.mark.parametrize(
+    ("geom", "colour"),
+    [('material="m"', (255, 0, 0)), ('material="m" rgba="0 0 1 1"', (0, 0, 255)), ('rgba="0 1 0 1"', (0, 255, 0))],
+)
+def test_a_geoms_own_colour_takes_the_place_of_its_materials(tmp_path, geom, colour):
+    root = write_room(tmp_path / "home")
+    change(
+        root, ("</asset>", '<material name="m" rgba="1 0 0 1"/></asset>'), ('mesh="top" pos', f'mesh="top" {geom} pos')
+    )
+    raw = read_mjcf(root)
+    (table,) = (raw.cads[a.cad_id] for a in raw.annotations if a.category == "table")
+    assert (table.face_colours == colour).all(axis=1).any()
 
 
 def test_a_room_becomes_a_scene_that_passes_its_gates(tmp_path, hull_cache):

@@ -274,6 +274,18 @@ def test_poses_are_resolved_as_gazebo_does(tmp_path, things, expected):
     assert places(read_sdf(write_world(tmp_path / "home", [*ROOM, *things]))) == expected
 
 
+MORE = [
+    "<include><uri>model://ground_plane</uri><pose>0 0 -0.5 0 0 0</pose></include><frame name='g'/>",
+    f"<include><name>stool</name><uri>{FUEL}/Chair A/3</uri><pose relative_to='g'>1.5 -1 0 0 0 1</pose></include>",
+    model("pouf_1", shape("capsule", "<radius>0.2</radius><length>0.1</length>"), "", False).replace(
+        "<pose>", "<pose rotation_format='quat_xyzw' relative_to='stool::l'>-1 0 -0.15 0 0 0 1", 1
+    ),
+    "<state><model name='Crate'><pose>-1.5 -1 0.15 0 0 0</pose><scale>1 2 1</scale>"
+    "<link name='link'><pose>-1.5 -1 0.15 0 0 1</pose></link></model><deletions><name>Vase</name></deletions></state>",
+]
+"""Frames, a saved state, a plane, shapes."""
+
+
 def test_a_saved_state_scales_and_moves_links(tmp_path):
     state = (
         "<state><model name='chair_1'><pose>0 0 0.2 0 0 0</pose><scale>2 1 0.5</scale>"
@@ -292,15 +304,10 @@ def test_a_saved_state_scales_and_moves_links(tmp_path):
         ("capsule", "<radius>0.2</radius><length>0.4</length>", (0.4, 0.4, 0.8)),
         ("ellipsoid", "<radii>0.2 0.3 0.4</radii>", (0.4, 0.6, 0.8)),
         ("cone", "<radius>0.2</radius><length>0.8</length>", (0.4, 0.4, 0.8)),
-        ("polyline", "<height>0.8</height>" + "".join(f"<point>{p}</point>" for p in ("0 0", ".5 0", ".5 .4", "0 .4")),
-         (0.5, 0.4, 0.8)),
     ],
 )  # fmt: skip
 def test_shapes_have_their_sizes(tmp_path, kind, text, size):
-    base = 0.0 if kind == "polyline" else 0.4
-    raw = read_sdf(
-        write_world(tmp_path / "home", [*ROOM, model("chair_1", shape(kind, text), f"0 0 {base} 0 0 0", False)])
-    )
+    raw = read_sdf(write_world(tmp_path / "home", [*ROOM, model("chair_1", shape(kind, text), "0 0 0.4 0 0 0", False)]))
     np.testing.assert_allclose(np.ptp(raw.cads["chair_1"].vertices, axis=0), size, rtol=0.02)
     assert trimesh.Trimesh(raw.cads["chair_1"].vertices, raw.cads["chair_1"].faces).volume > 0.03
 
