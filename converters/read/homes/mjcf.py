@@ -189,13 +189,13 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
     if not (np.abs(data.geom_xpos) < FARTHEST_M).all():  # NaN too
         raise SceneRejected(f"{path}: a geom stands at no usable place, expected all within {FARTHEST_M:g} m")
     categories = [category_of(model.body(body).name) for body in range(model.nbody)]
-    top = _tops(model, categories)
+    top, planes = _tops(model, categories), _planes(model, data)
     built_in = [category is not None and not category.is_object for category in categories]
     for body in range(model.nbody - 1, 0, -1):
         built_in[model.body_parentid[body]] |= built_in[body]
     dropped = _unread(model, top, categories)
     span = float(2.0 * max(np.abs(data.geom_xpos).max(initial=0.0), 2.0))
-    parts = []
+    parts = list(planes.values())
     for body in range(model.nbody):
         if top[body] != body:
             continue
@@ -203,19 +203,13 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         pose = _matrix(data.xpos[body], data.xquat[body])
         back = np.linalg.inv(pose)
         seen, solid = [], []
-        for geom in np.flatnonzero(np.isin(model.geom_bodyid, members)):
+        for geom in np.flatnonzero(np.isin(model.geom_bodyid, members) & ~np.isin(range(model.ngeom), list(planes))):
             mesh = _mesh(model, int(geom), span)
             if mesh is None:
                 dropped[f"{_GEOM(model.geom_type[geom]).name[7:].lower()}: dropped"] += 1
                 continue
-            place = _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
-            at = back @ place
+            at = back @ _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
             collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-            is_plane = model.geom_type[geom] == _GEOM.mjGEOM_PLANE
-            if is_plane and place[2, 2] > LEVEL and (collides or not model.geom_size[geom, :2].all()):
-                # Planes collide without an end, whatever the size that they are drawn in.
-                parts.append(Part(model.body(body).name or "plane", place, mesh, None, True, held=True, endless=True))
-                continue
             if collides:
                 solid.append((placed(mesh, at), float(model.geom_friction[geom, 0])))
             if model.geom_group[geom] < 3 and _rgba(model, int(geom))[3] > 0:
@@ -232,21 +226,25 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         jointed = model.body_jntnum[body] > 0 and categories[body] is not DOOR
         held = not free and bool(built_in[body] or jointed or categories[body] is CATEGORIES["box"])
         friction = max((f for _, f in solid), default=0.0)
-        parts.append(
-            Part(
-                model.body(body).name or f"body_{body}",
-                pose,
-                surface,
-                joined([m for m, _ in solid]),
-                not free,
-                float(model.body_mass[members].sum()) or None,
-                friction if 0 < friction <= 2 else None,
-                held,
-            )
-        )
+        name, mass = model.body(body).name or f"body_{body}", float(model.body_mass[members].sum()) or None
+        friction = friction if 0 < friction <= 2 else None
+        parts.append(Part(name, pose, surface, joined([m for m, _ in solid]), not free, mass, friction, held))
     for kind, count in sorted((+dropped).items()):
         source.note(f"{path.name}: {count} x {kind}")
     return parts
+
+
+def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, Part]:
+    """Return the level planes, which collide without an end whatever the size that they are drawn in, by their geom."""
+    planes = {}
+    for geom in np.flatnonzero(model.geom_type == int(_GEOM.mjGEOM_PLANE)):
+        at = _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
+        collides = model.geom_contype[geom] or model.geom_conaffinity[geom] or not model.geom_size[geom, :2].all()
+        if at[2, 2] > LEVEL and collides:
+            mesh = _mesh(model, int(geom), 1.0)
+            assert mesh is not None
+            planes[int(geom)] = Part("plane", at, mesh, None, True, held=True, endless=True)
+    return planes
 
 
 def _unread(model: mujoco.MjModel, top: np.ndarray, categories: list[Category | None]) -> collections.Counter[str]:
